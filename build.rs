@@ -1,0 +1,2 @@
+//! Finds Embree and generates the ray/hit bindings.
+fn main() {}

@@ -1,0 +1,355 @@
+//! A scalar volume as its file gives it: a regular lattice placed in the world, and samples in their source type.
+//! Readers live below, one per format; generators make volumes with exact value and gradient.
+
+use crate::error::{Error, Result};
+use glam::{DMat3, DVec3};
+
+/// A regular lattice of `dims` samples, vertex-centred: sample (i, j, k) stands at `origin + axes · (i, j, k)`.
+///
+/// Index space is the space of (i, j, k); x runs fastest in memory. The axes may be oblique or flipped,
+/// but not degenerate.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Lattice {
+    dims: [usize; 3],
+    origin: DVec3,
+    axes: DMat3,
+    inverse: DMat3,
+}
+
+impl Lattice {
+    /// Builds a lattice. Column a of `axes` is the world step of one index along axis a.
+    ///
+    /// # Errors
+    /// `Invalid` if a dimension is below 2, the sample count overflows, or the axes are singular or not finite.
+    pub fn new(dims: [usize; 3], origin: DVec3, axes: DMat3) -> Result<Self> {
+        if dims.iter().any(|&n| n < 2) {
+            return Err(Error::Invalid(format!(
+                "lattice of {}×{}×{} samples: every dimension must be at least 2 to hold a cell",
+                dims[0], dims[1], dims[2]
+            )));
+        }
+        if dims.iter().try_fold(1usize, |n, &d| n.checked_mul(d)).is_none_or(|n| n > isize::MAX as usize / 16) {
+            return Err(Error::Invalid(format!(
+                "lattice of {}×{}×{} samples: too large for this machine's address space",
+                dims[0], dims[1], dims[2]
+            )));
+        }
+        let size: f64 = (0..3).map(|a| axes.col(a).length()).product();
+        let inverse = axes.inverse();
+        let determinant = axes.determinant();
+        if !origin.is_finite() || !axes.is_finite() || !(determinant.abs() > 1e-9 * size) || !inverse.is_finite() {
+            return Err(Error::Invalid(format!(
+                "lattice axes {:?}, {:?}, {:?} with origin {origin}: they must be finite and linearly independent",
+                axes.x_axis, axes.y_axis, axes.z_axis
+            )));
+        }
+        Ok(Self { dims, origin, axes, inverse })
+    }
+
+    /// A lattice with axes along the world's, `spacing` apart.
+    ///
+    /// # Errors
+    /// As [`Lattice::new`].
+    pub fn aligned(dims: [usize; 3], origin: DVec3, spacing: DVec3) -> Result<Self> {
+        Self::new(dims, origin, DMat3::from_diagonal(spacing))
+    }
+
+    /// Samples along each axis, each at least 2.
+    pub fn dims(&self) -> [usize; 3] {
+        self.dims
+    }
+
+    /// Cells along each axis: one fewer than the samples.
+    pub fn cells(&self) -> [usize; 3] {
+        self.dims.map(|n| n - 1)
+    }
+
+    /// World position of sample (0, 0, 0).
+    pub fn origin(&self) -> DVec3 {
+        self.origin
+    }
+
+    /// World steps per index, one column per axis.
+    pub fn axes(&self) -> DMat3 {
+        self.axes
+    }
+
+    /// World length of one index step along each axis.
+    pub fn spacing(&self) -> DVec3 {
+        DVec3::new(self.axes.x_axis.length(), self.axes.y_axis.length(), self.axes.z_axis.length())
+    }
+
+    /// World volume of one cell.
+    pub fn cell_volume(&self) -> f64 {
+        self.axes.determinant().abs()
+    }
+
+    /// World volume of Ω, the whole lattice.
+    pub fn world_volume(&self) -> f64 {
+        self.cell_volume() * self.cells().iter().map(|&n| n as f64).product::<f64>()
+    }
+
+    /// Number of samples.
+    #[allow(clippy::len_without_is_empty, reason = "a lattice always holds at least 8 samples")]
+    pub fn len(&self) -> usize {
+        self.dims.iter().product()
+    }
+
+    /// Position in memory of sample (i, j, k).
+    #[inline]
+    pub fn offset(&self, i: usize, j: usize, k: usize) -> usize {
+        (k * self.dims[1] + j) * self.dims[0] + i
+    }
+
+    /// Sample (i, j, k) at a position in memory.
+    #[inline]
+    pub fn ijk(&self, offset: usize) -> [usize; 3] {
+        let [nx, ny, _] = self.dims;
+        [offset % nx, offset / nx % ny, offset / (nx * ny)]
+    }
+
+    /// Index coordinates to world coordinates.
+    #[inline]
+    pub fn to_world(&self, p: DVec3) -> DVec3 {
+        self.origin + self.axes * p
+    }
+
+    /// World coordinates to index coordinates.
+    #[inline]
+    pub fn to_index(&self, x: DVec3) -> DVec3 {
+        self.inverse * (x - self.origin)
+    }
+
+    /// A world direction in index space (not normalised, so that a ray's t stays in world units).
+    #[inline]
+    pub fn direction_to_index(&self, d: DVec3) -> DVec3 {
+        self.inverse * d
+    }
+
+    /// An index-space gradient in the world: the inverse transpose of the axes.
+    #[inline]
+    pub fn gradient_to_world(&self, g: DVec3) -> DVec3 {
+        self.inverse.transpose() * g
+    }
+
+    /// The index coordinates of Ω's far corner.
+    pub fn far(&self) -> DVec3 {
+        DVec3::from_array(self.cells().map(|n| n as f64))
+    }
+}
+
+/// Samples in the type of the file. x fastest.
+#[derive(Clone, Debug, PartialEq)]
+#[allow(missing_docs, reason = "the variants are the element types")]
+pub enum Samples {
+    U8(Vec<u8>),
+    I8(Vec<i8>),
+    U16(Vec<u16>),
+    I16(Vec<i16>),
+    U32(Vec<u32>),
+    I32(Vec<i32>),
+    U64(Vec<u64>),
+    I64(Vec<i64>),
+    F32(Vec<f32>),
+    F64(Vec<f64>),
+}
+
+/// The element type of [`Samples`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs, reason = "the variants are the element types")]
+pub enum ElementType {
+    U8,
+    I8,
+    U16,
+    I16,
+    U32,
+    I32,
+    U64,
+    I64,
+    F32,
+    F64,
+}
+
+/// Byte order of a file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs, reason = "the variants say it")]
+pub enum Endian {
+    Little,
+    Big,
+}
+
+/// Runs `$body` with `$v` bound to the vector inside a [`Samples`].
+macro_rules! each_sample_type {
+    ($samples:expr, $v:ident => $body:expr) => {
+        match $samples {
+            Samples::U8($v) => $body,
+            Samples::I8($v) => $body,
+            Samples::U16($v) => $body,
+            Samples::I16($v) => $body,
+            Samples::U32($v) => $body,
+            Samples::I32($v) => $body,
+            Samples::U64($v) => $body,
+            Samples::I64($v) => $body,
+            Samples::F32($v) => $body,
+            Samples::F64($v) => $body,
+        }
+    };
+}
+
+impl ElementType {
+    /// Bytes per element.
+    pub fn size(self) -> usize {
+        match self {
+            ElementType::U8 | ElementType::I8 => 1,
+            ElementType::U16 | ElementType::I16 => 2,
+            ElementType::U32 | ElementType::I32 | ElementType::F32 => 4,
+            ElementType::U64 | ElementType::I64 | ElementType::F64 => 8,
+        }
+    }
+
+    /// The name used on the command line and in messages: `u8`, `i16`, `f32` …
+    pub fn name(self) -> &'static str {
+        match self {
+            ElementType::U8 => "u8",
+            ElementType::I8 => "i8",
+            ElementType::U16 => "u16",
+            ElementType::I16 => "i16",
+            ElementType::U32 => "u32",
+            ElementType::I32 => "i32",
+            ElementType::U64 => "u64",
+            ElementType::I64 => "i64",
+            ElementType::F32 => "f32",
+            ElementType::F64 => "f64",
+        }
+    }
+
+    /// The type of a [`ElementType::name`].
+    pub fn from_name(name: &str) -> Option<Self> {
+        use ElementType as T;
+        [T::U8, T::I8, T::U16, T::I16, T::U32, T::I32, T::U64, T::I64, T::F32, T::F64]
+            .into_iter()
+            .find(|t| t.name() == name)
+    }
+}
+
+impl Samples {
+    /// Decodes raw bytes. `bytes.len()` must be a multiple of the element size; the rest is ignored.
+    pub fn from_bytes(bytes: &[u8], element: ElementType, endian: Endian) -> Self {
+        macro_rules! decode {
+            ($t:ty) => {
+                bytes
+                    .chunks_exact(std::mem::size_of::<$t>())
+                    .map(|b| {
+                        let b = b.try_into().expect("chunks_exact gives whole elements");
+                        match endian {
+                            Endian::Little => <$t>::from_le_bytes(b),
+                            Endian::Big => <$t>::from_be_bytes(b),
+                        }
+                    })
+                    .collect()
+            };
+        }
+        match element {
+            ElementType::U8 => Samples::U8(bytes.to_vec()),
+            ElementType::I8 => Samples::I8(decode!(i8)),
+            ElementType::U16 => Samples::U16(decode!(u16)),
+            ElementType::I16 => Samples::I16(decode!(i16)),
+            ElementType::U32 => Samples::U32(decode!(u32)),
+            ElementType::I32 => Samples::I32(decode!(i32)),
+            ElementType::U64 => Samples::U64(decode!(u64)),
+            ElementType::I64 => Samples::I64(decode!(i64)),
+            ElementType::F32 => Samples::F32(decode!(f32)),
+            ElementType::F64 => Samples::F64(decode!(f64)),
+        }
+    }
+
+    /// Number of samples.
+    pub fn len(&self) -> usize {
+        each_sample_type!(self, v => v.len())
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Sample `i` as f64 (64-bit integers beyond 2⁵³ round to nearest).
+    #[inline]
+    #[allow(clippy::unnecessary_cast, reason = "the macro's f64 arm casts to itself")]
+    pub fn get(&self, i: usize) -> f64 {
+        each_sample_type!(self, v => v[i] as f64)
+    }
+
+    /// The element type.
+    pub fn element_type(&self) -> ElementType {
+        match self {
+            Samples::U8(_) => ElementType::U8,
+            Samples::I8(_) => ElementType::I8,
+            Samples::U16(_) => ElementType::U16,
+            Samples::I16(_) => ElementType::I16,
+            Samples::U32(_) => ElementType::U32,
+            Samples::I32(_) => ElementType::I32,
+            Samples::U64(_) => ElementType::U64,
+            Samples::I64(_) => ElementType::I64,
+            Samples::F32(_) => ElementType::F32,
+            Samples::F64(_) => ElementType::F64,
+        }
+    }
+}
+
+/// A scalar volume: samples on a lattice.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Volume {
+    /// What to call it in messages: the file's path or the generator's name.
+    pub name: String,
+    /// Where the samples stand.
+    pub lattice: Lattice,
+    samples: Samples,
+}
+
+impl Volume {
+    /// Joins samples and lattice.
+    ///
+    /// # Errors
+    /// `Invalid` if the counts differ.
+    pub fn new(name: impl Into<String>, lattice: Lattice, samples: Samples) -> Result<Self> {
+        let name = name.into();
+        if samples.len() != lattice.len() {
+            let [nx, ny, nz] = lattice.dims();
+            return Err(Error::Invalid(format!(
+                "{name}: {nx}×{ny}×{nz} = {} samples promised, {} found",
+                lattice.len(),
+                samples.len()
+            )));
+        }
+        Ok(Self { name, lattice, samples })
+    }
+
+    /// The samples, x fastest.
+    pub fn samples(&self) -> &Samples {
+        &self.samples
+    }
+
+    /// Sample at a position in memory, in source units.
+    #[inline]
+    pub fn value(&self, offset: usize) -> f64 {
+        self.samples.get(offset)
+    }
+
+    /// Least and greatest finite sample; `None` if no sample is finite.
+    pub fn range(&self) -> Option<(f64, f64)> {
+        (0..self.samples.len())
+            .map(|i| self.value(i))
+            .filter(|v| v.is_finite())
+            .fold(None, |r, v| Some(r.map_or((v, v), |(lo, hi): (f64, f64)| (lo.min(v), hi.max(v)))))
+    }
+
+    /// Number of NaN and infinite samples.
+    pub fn non_finite(&self) -> usize {
+        match &self.samples {
+            Samples::F32(v) => v.iter().filter(|v| !v.is_finite()).count(),
+            Samples::F64(v) => v.iter().filter(|v| !v.is_finite()).count(),
+            _ => 0,
+        }
+    }
+}
