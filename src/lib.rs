@@ -6,5 +6,21 @@
 //! Isosurface Generation Using 4D Light Transport", IEEE TVCG 15(6), 2009; the other tags are listed in
 //! `docs/references.md`.
 
+// Numerics, no knowledge of volumes.
 pub mod error;
+pub mod rng;
+pub mod stats;
+pub mod warp;
+pub mod cubic;
+// Samples, value, gradient, range.
 pub mod volume;
+pub mod field;
+// Rays of R⁴; one hexahedron; the min/max hierarchy and its walk.
+pub mod flattened;
+pub mod cell;
+pub mod pyramid;
+// What a hyperplane contains.
+pub mod brdf;
+pub mod polygon;
+pub mod luminaire;
+pub mod scene;

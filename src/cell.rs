@@ -1,0 +1,126 @@
+//! One hexahedron of the graph: 8 samples, the cubic along a ray, and signs on its faces that neighbours share.
+
+use crate::cubic::Cubic;
+use glam::DVec3;
+
+/// The 8 samples of a cell; bit a of the position says which end along axis a.
+#[derive(Clone, Copy, Debug)]
+pub struct Cell {
+    /// Samples in units of the sweep.
+    pub s: [f32; 8],
+}
+
+impl Cell {
+    /// Whether the cell holds a piece of L(h, c): some corner is inside (h ≥ c), some is not. False if a corner is NaN.
+    #[inline]
+    pub fn straddles(&self, c: f64) -> bool {
+        let (mut lo, mut hi) = (f32::INFINITY, f32::NEG_INFINITY);
+        let mut sum = 0.0;
+        for s in self.s {
+            lo = lo.min(s);
+            hi = hi.max(s);
+            sum += s;
+        }
+        f64::from(lo) < c && f64::from(hi) >= c && !sum.is_nan()
+    }
+
+    /// h at cell-local `p` in [0, 1]³.
+    #[inline]
+    pub fn value(&self, p: DVec3) -> f64 {
+        let s = self.s.map(f64::from);
+        let x = |a: usize| s[a] + p.x * (s[a + 1] - s[a]);
+        let (y0, y1) = (x(0) + p.y * (x(2) - x(0)), x(4) + p.y * (x(6) - x(4)));
+        y0 + p.z * (y1 - y0)
+    }
+
+    /// h − c along p + t d as a cubic in t, by 37-operation coefficients: h = P(x,y) + z Q(x,y), each restricted to the
+    /// ray. [HSEAM22, after Parker99]
+    #[inline]
+    pub fn cubic(&self, c: f64, p: DVec3, d: DVec3) -> Cubic {
+        let s = self.s.map(f64::from);
+        // P = k0 + k1 x + k2 y + k3 xy on the face z = 0, Q likewise is the rise to z = 1.
+        let (k0, k1, k2) = (s[0], s[1] - s[0], s[2] - s[0]);
+        let k3 = s[3] - s[2] - k1;
+        let (k4, a) = (s[4] - s[0], s[5] - s[4]);
+        let k5 = a - k1;
+        let k6 = s[6] - s[4] - k2;
+        let k7 = s[7] - s[6] - a - k3;
+        let (m0, m1, m2) = (p.x * p.y, d.x * d.y, p.x * d.y + p.y * d.x);
+        let (p0, p1, p2) = ((k0 - c) + k1 * p.x + k2 * p.y + k3 * m0, k1 * d.x + k2 * d.y + k3 * m2, k3 * m1);
+        let (q0, q1, q2) = (k4 + k5 * p.x + k6 * p.y + k7 * m0, k5 * d.x + k6 * d.y + k7 * m2, k7 * m1);
+        Cubic { c: [p0 + p.z * q0, p1 + p.z * q1 + d.z * q0, p2 + p.z * q2 + d.z * q1, d.z * q2] }
+    }
+
+    /// Whether h ≥ c at (u, v) on the face across `axis` at its near (`far` = false) or far end; u and v run along the
+    /// next two axes in cyclic order. Bit for bit the same from both cells that share the face: it uses the face's own
+    /// corners only, and equal signs of all four decide without arithmetic.
+    #[inline]
+    pub fn face_inside(&self, axis: usize, far: bool, c: f64, u: f64, v: f64) -> bool {
+        let (b, d) = (1 << ((axis + 1) % 3), 1 << ((axis + 2) % 3));
+        let base = usize::from(far) << axis;
+        let [s00, s10, s01, s11] = [0, b, d, b + d].map(|o| f64::from(self.s[base + o]));
+        let count = u8::from(s00 >= c) + u8::from(s10 >= c) + u8::from(s01 >= c) + u8::from(s11 >= c);
+        match count {
+            0 => false,
+            4 => true,
+            _ => {
+                let (f0, f1) = (s00 + u * (s10 - s00), s01 + u * (s11 - s01));
+                f0 + v * (f1 - f0) >= c
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rng::{Rng, Stage};
+
+    fn random_cell(rng: &mut Rng) -> Cell {
+        Cell { s: std::array::from_fn(|_| rng.unit() as f32) }
+    }
+
+    #[test]
+    fn the_cubic_is_h_along_the_ray() {
+        let mut rng = Rng::stream(1, Stage::Test, 0);
+        for _ in 0..10_000 {
+            let cell = random_cell(&mut rng);
+            let p = DVec3::new(rng.unit(), rng.unit(), rng.unit());
+            let d = DVec3::new(rng.unit() - 0.5, rng.unit() - 0.5, rng.unit() - 0.5);
+            let cubic = cell.cubic(0.4, p, d);
+            for t in [0.0, 0.3, 1.0] {
+                assert!((cubic.value(t) - (cell.value(p + d * t) - 0.4)).abs() < 1e-14);
+            }
+        }
+    }
+
+    #[test]
+    fn neighbours_agree_on_shared_faces() {
+        let mut rng = Rng::stream(1, Stage::Test, 1);
+        for round in 0..100_000 {
+            let axis = round % 3;
+            let (a, mut b) = (random_cell(&mut rng), random_cell(&mut rng));
+            for corner in 0..8usize {
+                if corner >> axis & 1 == 0 {
+                    b.s[corner] = a.s[corner | 1 << axis];
+                }
+            }
+            let (u, v) = (rng.unit(), rng.unit());
+            // c on a corner, on the face's own interpolated value, or anywhere.
+            let c = match round % 5 {
+                0 => f64::from(a.s[1 << axis]),
+                1 => b.value(match axis { 0 => DVec3::new(0.0, u, v), 1 => DVec3::new(v, 0.0, u), _ => DVec3::new(u, v, 0.0) }),
+                _ => rng.unit(),
+            };
+            assert_eq!(a.face_inside(axis, true, c, u, v), b.face_inside(axis, false, c, u, v));
+        }
+    }
+
+    #[test]
+    fn inside_includes_equality_and_nan_holds_no_surface() {
+        let mut cell = Cell { s: [0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0] };
+        assert!(cell.straddles(1.0) && cell.straddles(0.5) && !cell.straddles(0.0));
+        cell.s[3] = f32::NAN;
+        assert!(!cell.straddles(0.5));
+    }
+}

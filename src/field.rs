@@ -1,0 +1,333 @@
+//! The function h whose graph is illuminated: a volume's samples mapped so that the sweep is [0, 1], trilinear in
+//! every cell, with its gradient and the one receiver normal that every engine shares.
+
+use crate::error::{Error, Result};
+use crate::volume::{Lattice, Volume};
+use glam::{DVec3, Vec3};
+use rayon::prelude::*;
+
+/// The sweep's isovalue range I = [lo, hi] in source units, mapped affinely to [0, 1].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Sweep {
+    lo: f64,
+    hi: f64,
+}
+
+impl Sweep {
+    /// The range [lo, hi].
+    ///
+    /// # Errors
+    /// `Invalid` unless both are finite and lo < hi.
+    pub fn new(lo: f64, hi: f64) -> Result<Self> {
+        if lo.is_finite() && hi.is_finite() && lo < hi && (hi - lo).is_finite() {
+            Ok(Self { lo, hi })
+        } else {
+            Err(Error::Invalid(format!("isovalues {lo} {hi}: the sweep needs two finite numbers, the lower first")))
+        }
+    }
+
+    /// Lower end, source units.
+    pub fn lo(&self) -> f64 {
+        self.lo
+    }
+
+    /// Upper end, source units.
+    pub fn hi(&self) -> f64 {
+        self.hi
+    }
+
+    /// Source units to [0, 1].
+    #[inline]
+    pub fn to_unit(&self, value: f64) -> f64 {
+        (value - self.lo) / (self.hi - self.lo)
+    }
+
+    /// [0, 1] to source units.
+    #[inline]
+    pub fn from_unit(&self, s: f64) -> f64 {
+        self.lo + s * (self.hi - self.lo)
+    }
+
+    /// The unit isovalue of a source value exactly as samples are stored, so that a sample equal to `value` compares
+    /// equal to it.
+    #[inline]
+    #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32 wherever they meet samples")]
+    pub fn isovalue(&self, value: f64) -> f32 {
+        self.to_unit(value) as f32
+    }
+}
+
+/// h in units of the sweep. Positions are index coordinates of the lattice, clamped to Ω.
+#[derive(Clone, Debug)]
+pub struct Field {
+    lattice: Lattice,
+    sweep: Sweep,
+    samples: Vec<f32>,
+}
+
+impl Field {
+    /// Maps a volume's samples to the sweep's units, in f64, and stores f32. Non-finite samples become NaN.
+    ///
+    /// # Errors
+    /// `Invalid` if no sample is finite, if the sweep does not overlap the data, or if the samples in units of the
+    /// sweep do not fit f32.
+    #[allow(clippy::cast_possible_truncation, reason = "storage is f32; overflow is checked")]
+    pub fn new(volume: &Volume, sweep: Sweep) -> Result<Self> {
+        let name = &volume.name;
+        let Some((min, max)) = volume.range() else {
+            return Err(Error::Invalid(format!("{name}: none of its {} samples is finite", volume.samples().len())));
+        };
+        if sweep.hi() <= min || sweep.lo() >= max {
+            return Err(Error::Invalid(format!(
+                "{name}: the sweep {} … {} lies outside the data, which span {min} … {max}; choose --isovalues inside",
+                sweep.lo(),
+                sweep.hi()
+            )));
+        }
+        if ![min, max].iter().all(|&v| (sweep.to_unit(v) as f32).is_finite()) {
+            return Err(Error::Invalid(format!(
+                "{name}: data {min} … {max} in units of the sweep {} … {} do not fit 32-bit floats; widen the sweep",
+                sweep.lo(),
+                sweep.hi()
+            )));
+        }
+        let samples = (0..volume.samples().len())
+            .into_par_iter()
+            .with_min_len(1 << 14)
+            .map(|i| {
+                let v = volume.value(i);
+                if v.is_finite() { sweep.isovalue(v) } else { f32::NAN }
+            })
+            .collect();
+        Ok(Self { lattice: volume.lattice.clone(), sweep, samples })
+    }
+
+    /// Where the samples stand.
+    pub fn lattice(&self) -> &Lattice {
+        &self.lattice
+    }
+
+    /// The sweep whose range is [0, 1] here.
+    pub fn sweep(&self) -> Sweep {
+        self.sweep
+    }
+
+    /// Samples in units of the sweep, x fastest; NaN where the source is not finite.
+    pub fn samples(&self) -> &[f32] {
+        &self.samples
+    }
+
+    /// The cell that holds `p`, and `p` inside it in [0, 1]³.
+    #[inline]
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
+    pub fn locate(&self, p: DVec3) -> ([usize; 3], DVec3) {
+        let mut cell = [0usize; 3];
+        let mut local = DVec3::ZERO;
+        for a in 0..3 {
+            let last = self.lattice.dims()[a] - 2;
+            cell[a] = (p[a].max(0.0) as usize).min(last);
+            local[a] = (p[a] - cell[a] as f64).clamp(0.0, 1.0);
+        }
+        (cell, local)
+    }
+
+    /// The 8 samples of a cell; bit a of the position says which end along axis a.
+    #[inline]
+    pub fn corners(&self, [i, j, k]: [usize; 3]) -> [f32; 8] {
+        let [nx, ny, _] = self.lattice.dims();
+        let s = &self.samples[(k * ny + j) * nx + i..];
+        let (y, z) = (nx, nx * ny);
+        [s[0], s[1], s[y], s[y + 1], s[z], s[z + 1], s[z + y], s[z + y + 1]]
+    }
+
+    /// h at `p` (trilinear); NaN in a cell that holds no surface.
+    pub fn value(&self, p: DVec3) -> f64 {
+        let (cell, u) = self.locate(p);
+        let s = self.corners(cell).map(f64::from);
+        let x = |a: usize| s[a] + u.x * (s[a + 1] - s[a]);
+        let (y0, y1) = (x(0) + u.y * (x(2) - x(0)), x(4) + u.y * (x(6) - x(4)));
+        y0 + u.z * (y1 - y0)
+    }
+
+    /// ∇h at `p` of the trilinear cell, per world unit. Jumps at cell faces: it serves sides and |∇h|, not cosines.
+    pub fn gradient(&self, p: DVec3) -> DVec3 {
+        let (cell, u) = self.locate(p);
+        let s = self.corners(cell).map(f64::from);
+        let lerp = |t: f64, a: f64, b: f64| a + t * (b - a);
+        let gx = lerp(u.z, lerp(u.y, s[1] - s[0], s[3] - s[2]), lerp(u.y, s[5] - s[4], s[7] - s[6]));
+        let gy = lerp(u.z, lerp(u.x, s[2] - s[0], s[3] - s[1]), lerp(u.x, s[6] - s[4], s[7] - s[5]));
+        let gz = lerp(u.y, lerp(u.x, s[4] - s[0], s[5] - s[1]), lerp(u.x, s[6] - s[2], s[7] - s[3]));
+        self.lattice.gradient_to_world(DVec3::new(gx, gy, gz))
+    }
+
+    /// Central-difference gradient at a node, per world unit: one-sided at Ω's faces and beside non-finite samples,
+    /// 0 along an axis without a finite neighbour.
+    pub fn node_gradient(&self, [i, j, k]: [usize; 3]) -> DVec3 {
+        let dims = self.lattice.dims();
+        let strides = [1, dims[0], dims[0] * dims[1]];
+        let at = self.lattice.offset(i, j, k);
+        let mut g = DVec3::ZERO;
+        for (a, n) in [i, j, k].into_iter().enumerate() {
+            let here = self.samples[at];
+            let finite = |s: f32| s.is_finite().then_some(f64::from(s));
+            let before = if n > 0 { finite(self.samples[at - strides[a]]) } else { None };
+            let after = if n + 1 < dims[a] { finite(self.samples[at + strides[a]]) } else { None };
+            g[a] = match (before, finite(here), after) {
+                (Some(b), _, Some(c)) => 0.5 * (c - b),
+                (Some(b), Some(h), None) => h - b,
+                (None, Some(h), Some(c)) => c - h,
+                _ => 0.0,
+            };
+        }
+        self.lattice.gradient_to_world(g)
+    }
+
+    /// The receiver gradient at `p`: central differences at the nodes, interpolated trilinearly, per world unit.
+    /// Continuous; its direction is the normal of every cosine in every engine.
+    pub fn receiver_gradient(&self, p: DVec3) -> DVec3 {
+        let (cell, u) = self.locate(p);
+        let dims = self.lattice.dims();
+        let interior = (0..3).all(|a| cell[a] > 0 && cell[a] + 2 < dims[a]);
+        if interior {
+            let g = self.interior_receiver_gradient(cell, u);
+            if g.is_finite() {
+                return self.lattice.gradient_to_world(g);
+            }
+        }
+        let mut g = DVec3::ZERO;
+        for corner in 0..8 {
+            let [x, y, z] = [corner & 1, corner >> 1 & 1, corner >> 2];
+            let w = if x == 1 { u.x } else { 1.0 - u.x }
+                * if y == 1 { u.y } else { 1.0 - u.y }
+                * if z == 1 { u.z } else { 1.0 - u.z };
+            g += w * self.node_gradient([cell[0] + x, cell[1] + y, cell[2] + z]);
+        }
+        g
+    }
+
+    /// [`Field::receiver_gradient`] in index space where all 32 samples exist; NaN spreads.
+    #[inline]
+    fn interior_receiver_gradient(&self, [i, j, k]: [usize; 3], u: DVec3) -> DVec3 {
+        let [nx, ny, _] = self.lattice.dims();
+        let stride = [1, nx, nx * ny];
+        let at = (k * ny + j) * nx + i;
+        let mut g = DVec3::ZERO;
+        for a in 0..3 {
+            let (b, c) = ((a + 1) % 3, (a + 2) % 3);
+            // Along axis a four samples −1 … 2 give the two node differences; bilinear across the other axes.
+            let line = |o: usize| {
+                let s = |n: usize| f64::from(self.samples[o + n * stride[a] - stride[a]]);
+                0.5 * ((1.0 - u[a]) * (s(2) - s(0)) + u[a] * (s(3) - s(1)))
+            };
+            let (l00, l10) = (line(at), line(at + stride[b]));
+            let (l01, l11) = (line(at + stride[c]), line(at + stride[b] + stride[c]));
+            let (l0, l1) = (l00 + u[b] * (l10 - l00), l01 + u[b] * (l11 - l01));
+            g[a] = l0 + u[c] * (l1 - l0);
+        }
+        g
+    }
+
+    /// Unit normal of the level set at `p`, towards falling h (the lower side); `None` where ∇h vanishes or no value
+    /// is finite. [BB09 §2.3: N♭]
+    #[inline]
+    pub fn falling_normal(&self, p: DVec3) -> Option<DVec3> {
+        unit(-self.receiver_gradient(p))
+    }
+
+    /// Index coordinates as stored in rays.
+    #[inline]
+    pub fn position(p: Vec3) -> DVec3 {
+        p.as_dvec3()
+    }
+}
+
+/// `v` normalised, also for lengths whose square under- or overflows; `None` for 0 and non-finite.
+#[inline]
+fn unit(v: DVec3) -> Option<DVec3> {
+    let scale = v.abs().max_element();
+    if scale > 0.0 && scale.is_finite() { Some((v / scale).normalize()) } else { None }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::volume::Samples;
+    use glam::DMat3;
+
+    /// 5×4×6 samples of a trilinear function on an oblique, flipped lattice.
+    fn oblique(f: impl Fn(DVec3) -> f64) -> Field {
+        let axes = DMat3::from_cols(DVec3::new(-0.5, 0.1, 0.0), DVec3::new(0.2, 0.7, 0.0), DVec3::new(0.0, 0.3, 2.0));
+        let lattice = Lattice::new([5, 4, 6], DVec3::new(10.0, -3.0, 1e3), axes).unwrap();
+        let samples = (0..lattice.len())
+            .map(|o| {
+                let [i, j, k] = lattice.ijk(o);
+                f(lattice.to_world(DVec3::new(i as f64, j as f64, k as f64)))
+            })
+            .collect();
+        Field::new(&Volume::new("test", lattice, Samples::F64(samples)).unwrap(), Sweep::new(0.0, 1.0).unwrap()).unwrap()
+    }
+
+    #[test]
+    fn gradients_are_world_gradients_on_oblique_axes() {
+        let slope = DVec3::new(0.3, -0.2, 0.05);
+        let f = oblique(|x| slope.dot(x - DVec3::new(10.0, -3.0, 1e3)));
+        for p in [DVec3::new(2.3, 1.7, 3.1), DVec3::new(0.1, 0.2, 0.3), DVec3::new(4.0, 3.0, 5.0)] {
+            assert!((f.gradient(p) - slope).length() < 1e-5, "{p}");
+            assert!((f.receiver_gradient(p) - slope).length() < 1e-5, "{p}");
+            let expected = slope.dot(f.lattice().axes() * p);
+            assert!((f.value(p) - expected).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn receiver_gradient_is_continuous_and_the_same_on_both_paths() {
+        let f = oblique(|x| (3.0 * x.x).sin() + (x.y * x.z * 0.002).cos());
+        let slow = |p: DVec3| {
+            let (cell, u) = f.locate(p);
+            (0..8)
+                .map(|n| {
+                    let o = [n & 1, n >> 1 & 1, n >> 2];
+                    let w: f64 = (0..3).map(|a| if o[a] == 1 { u[a] } else { 1.0 - u[a] }).product();
+                    w * f.node_gradient([cell[0] + o[0], cell[1] + o[1], cell[2] + o[2]])
+                })
+                .sum::<DVec3>()
+        };
+        for p in [DVec3::new(1.5, 1.25, 2.75), DVec3::new(2.999, 1.001, 1.5)] {
+            assert!((f.receiver_gradient(p) - slow(p)).length() < 1e-12, "{p}");
+        }
+        let (a, b) = (DVec3::new(2.0 - 1e-9, 1.5, 2.5), DVec3::new(2.0 + 1e-9, 1.5, 2.5));
+        assert!((f.receiver_gradient(a) - f.receiver_gradient(b)).length() < 1e-6);
+    }
+
+    #[test]
+    fn a_sample_equal_to_the_isovalue_compares_equal() {
+        let sweep = Sweep::new(15.0, 200.0).unwrap();
+        let lattice = Lattice::aligned([2, 2, 64], DVec3::ZERO, DVec3::ONE).unwrap();
+        let samples = (0..=255u8).collect();
+        let f = Field::new(&Volume::new("test", lattice, Samples::U8(samples)).unwrap(), sweep).unwrap();
+        for v in 0..=255u8 {
+            assert_eq!(f.samples()[v as usize].to_bits(), sweep.isovalue(f64::from(v)).to_bits());
+        }
+    }
+
+    #[test]
+    fn non_finite_samples_stay_out_of_gradients() {
+        let lattice = Lattice::aligned([4, 4, 4], DVec3::ZERO, DVec3::ONE).unwrap();
+        let mut samples: Vec<f32> = (0..64).map(|o| (o % 4) as f32 / 4.0).collect();
+        samples[0] = f32::NAN;
+        let f = Field::new(&Volume::new("t", lattice, Samples::F32(samples)).unwrap(), Sweep::new(0.0, 1.0).unwrap())
+            .unwrap();
+        assert_eq!(f.node_gradient([1, 0, 0]), DVec3::new(0.25, 0.0, 0.0));
+        assert!(f.falling_normal(DVec3::new(1.5, 0.5, 0.5)).unwrap().is_finite());
+    }
+
+    #[test]
+    fn clear_errors() {
+        let lattice = Lattice::aligned([2, 2, 2], DVec3::ZERO, DVec3::ONE).unwrap();
+        let v = |x: f32| Volume::new("v", lattice.clone(), Samples::F32(vec![x; 8])).unwrap();
+        let sweep = Sweep::new(0.0, 1.0).unwrap();
+        assert!(Field::new(&v(f32::NAN), sweep).unwrap_err().to_string().contains("finite"));
+        assert!(Field::new(&v(7.0), sweep).unwrap_err().to_string().contains("outside"));
+        assert!(Sweep::new(3.0, 3.0).is_err() && Sweep::new(f64::NAN, 1.0).is_err());
+    }
+}

@@ -1,0 +1,148 @@
+//! Flattened rays and hits: a ray of R⁴ that never leaves its hyperplane h = c. [BB09 §2.3]
+//!
+//! Space is the *local frame*: index coordinates of the scene's lattice. It keeps f32 fine-grained wherever the data
+//! stand in the world, and t is the same number in every affine frame.
+
+use glam::{DVec3, Vec3};
+
+/// Which side of a level set: the side where h < c or the one where h ≥ c.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Side {
+    /// Where h < c; a surface's normal on this side points along −∇h.
+    Lower,
+    /// Where h ≥ c; the normal points along ∇h.
+    Higher,
+}
+
+impl Side {
+    /// The other side.
+    #[inline]
+    pub fn opposite(self) -> Self {
+        match self {
+            Side::Lower => Side::Higher,
+            Side::Higher => Side::Lower,
+        }
+    }
+
+    /// 0 for lower, 1 for higher: an index into pairs.
+    #[inline]
+    pub fn index(self) -> usize {
+        usize::from(self == Side::Higher)
+    }
+}
+
+/// What a ray starts on, and therefore must not find at t = 0.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Departure {
+    /// Nothing: a point of space.
+    Free,
+    /// The level set itself, leaving into `Side`. The ray's isovalue is then h at its origin, in f64, and the known
+    /// root t = 0 is divided out: no epsilon. A direction that goes to the other side meets the surface at t = 0.
+    Surface(Side),
+    /// A polygon of the scene, by number.
+    Polygon(u32),
+}
+
+/// A ray confined to the hyperplane at height `isovalue`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FlattenedRay {
+    /// Start, local frame.
+    pub origin: Vec3,
+    /// Direction, local frame; t counts in its lengths (world units if it stands for a unit world vector).
+    pub direction: Vec3,
+    /// The hyperplane's height c in units of the sweep, [0, 1].
+    pub isovalue: f32,
+    /// Hits beyond this t do not count; may be infinite.
+    pub reach: f32,
+    /// What the ray starts on.
+    pub departure: Departure,
+    /// The polygon the ray ends on, which must not block it.
+    pub target: Option<u32>,
+}
+
+/// Polygons that can be a ray's departure: numbers below this.
+pub const MAX_POLYGONS: u32 = 1 << 16;
+/// Polygons that can be a ray's target: numbers below this.
+pub const MAX_TARGETS: u32 = (1 << 12) - 1;
+
+impl FlattenedRay {
+    /// A ray from a point of space, of infinite reach.
+    pub fn free(origin: Vec3, direction: Vec3, isovalue: f32) -> Self {
+        Self { origin, direction, isovalue, reach: f32::INFINITY, departure: Departure::Free, target: None }
+    }
+
+    /// Departure and target in 32 bits, for the spare word of an Embree ray: 2 bits of kind, 1 of side or 17 of polygon,
+    /// 12 of target + 1.
+    #[inline]
+    pub fn pack_ends(&self) -> u32 {
+        let departure = match self.departure {
+            Departure::Free => 0,
+            Departure::Surface(Side::Lower) => 1,
+            Departure::Surface(Side::Higher) => 1 | 1 << 2,
+            Departure::Polygon(id) => 2 | id << 2,
+        };
+        departure | self.target.map_or(0, |id| id + 1) << 20
+    }
+
+    /// The inverse of [`FlattenedRay::pack_ends`].
+    #[inline]
+    pub fn unpack_ends(bits: u32) -> (Departure, Option<u32>) {
+        let payload = bits >> 2 & 0x3_ffff;
+        let departure = match bits & 3 {
+            0 => Departure::Free,
+            1 if payload & 1 == 0 => Departure::Surface(Side::Lower),
+            1 => Departure::Surface(Side::Higher),
+            _ => Departure::Polygon(payload),
+        };
+        (departure, (bits >> 20).checked_sub(1))
+    }
+
+    /// The point at `t`, evaluated in f64.
+    #[inline]
+    pub fn at(&self, t: f32) -> DVec3 {
+        self.origin.as_dvec3() + self.direction.as_dvec3() * f64::from(t)
+    }
+}
+
+/// What a flattened ray met.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Target {
+    /// The level set, from `Side`.
+    Surface(Side),
+    /// A face of Ω with h ≥ c behind it, seen from outside or inside ([`crate::scene::Boundary::Capped`] only):
+    /// axis + 3 · (far end), and the side it was met from.
+    Cap(u8, Side),
+    /// A polygon's front, or a luminaire's back.
+    Polygon(u32),
+}
+
+/// The nearest hit of a ray.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FlattenedHit {
+    /// Distance in lengths of the ray's direction; 0 ≤ t ≤ reach.
+    pub t: f32,
+    /// What was met.
+    pub target: Target,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ends_survive_packing() {
+        let departures = [
+            Departure::Free,
+            Departure::Surface(Side::Lower),
+            Departure::Surface(Side::Higher),
+            Departure::Polygon(0),
+            Departure::Polygon(MAX_POLYGONS - 1),
+        ];
+        for departure in departures {
+            for target in [None, Some(0), Some(7), Some(MAX_TARGETS - 1)] {
+                let ray = FlattenedRay { departure, target, ..FlattenedRay::free(Vec3::ZERO, Vec3::X, 0.5) };
+                assert_eq!(FlattenedRay::unpack_ends(ray.pack_ends()), (departure, target));
+            }
+        }
+    }
+}

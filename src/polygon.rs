@@ -1,0 +1,300 @@
+//! Planar convex polygons of R³: walls and luminaires, extruded over the sweep's isovalue range by standing in every
+//! hyperplane alike. [BB09 §2.3: p × I]
+
+use crate::error::{Error, Result};
+use crate::flattened::{Departure, FlattenedRay};
+use crate::volume::Lattice;
+use glam::{DVec2, DVec3};
+
+/// A planar convex polygon in world coordinates, counter-clockwise seen from its front.
+///
+/// Walls are seen, lit and light from the front only; from behind they are not there. A luminaire (`emission` ≠ 0 and
+/// `opaque_back`) blocks light from both sides and emits from its front.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Polygon {
+    /// Name of the wall, the `o`, `g` or material of an OBJ file.
+    pub name: String,
+    vertices: Vec<DVec3>,
+    normal: DVec3,
+    area: f64,
+    corner: DVec3,
+    edges: [DVec3; 2],
+    /// Diffuse reflectance per channel, [0, 1].
+    pub albedo: DVec3,
+    /// Emitted radiance L_e per channel.
+    pub emission: DVec3,
+    /// Whether the back blocks light.
+    pub opaque_back: bool,
+}
+
+impl Polygon {
+    /// A polygon of at least three vertices; `albedo` in [0, 1], `emission` ≥ 0. Emitters block light from both sides.
+    ///
+    /// # Errors
+    /// `Invalid` if it has no area, is not planar (1e-5 of its size), not convex, or a coefficient is out of range.
+    pub fn new(name: &str, vertices: Vec<DVec3>, albedo: DVec3, emission: DVec3) -> Result<Self> {
+        let fail = |what: String| Err(Error::Invalid(format!("polygon '{name}': {what}")));
+        if vertices.len() < 3 || !vertices.iter().all(|v| v.is_finite()) {
+            return fail(format!("{} vertices; it needs at least 3 finite ones", vertices.len()));
+        }
+        // Twice the vector area: independent of which vertex comes first.
+        let n = vertices.len();
+        let base = vertices[0];
+        let twice: DVec3 = (1..n - 1).map(|i| (vertices[i] - base).cross(vertices[i + 1] - base)).sum();
+        let size = vertices.iter().map(|&v| (v - base).length()).fold(0.0, f64::max);
+        let area = 0.5 * twice.length();
+        if !(area > 1e-12 * size * size) {
+            return fail(format!("area {area:.3e} for a size of {size:.3e}; its vertices coincide or stand in one line"));
+        }
+        let normal = twice.normalize();
+        if let Some(i) = (0..n).find(|&i| (vertices[i] - base).dot(normal).abs() > 1e-5 * size) {
+            return fail(format!("vertex {} leaves the plane of the others; split it into triangles", i + 1));
+        }
+        let turn = |i: usize| {
+            let (a, b, c) = (vertices[i], vertices[(i + 1) % n], vertices[(i + 2) % n]);
+            (b - a).cross(c - b).dot(normal)
+        };
+        if let Some(i) = (0..n).find(|&i| turn(i) < -1e-9 * size * size) {
+            return fail(format!("not convex at vertex {}; split it into triangles", (i + 1) % n + 1));
+        }
+        if !(albedo.cmpge(DVec3::ZERO).all() && albedo.cmple(DVec3::ONE).all()) {
+            return fail(format!("albedo {albedo} must lie in [0, 1]"));
+        }
+        if !(emission.cmpge(DVec3::ZERO).all() && emission.is_finite()) {
+            return fail(format!("emission {emission} must be finite and not negative"));
+        }
+        let (corner, edges) = parametrise(&vertices, normal);
+        let opaque_back = emission != DVec3::ZERO;
+        Ok(Self { name: name.to_owned(), vertices, normal, area, corner, edges, albedo, emission, opaque_back })
+    }
+
+    /// Vertices, counter-clockwise from the front.
+    pub fn vertices(&self) -> &[DVec3] {
+        &self.vertices
+    }
+
+    /// Unit normal of the front.
+    pub fn normal(&self) -> DVec3 {
+        self.normal
+    }
+
+    /// World area.
+    pub fn area(&self) -> f64 {
+        self.area
+    }
+
+    /// World position of texture coordinates (u, v) ∈ [0, 1]²: along the edges of a parallelogram, along the first edge
+    /// and across it over the bounding rectangle of any other polygon.
+    #[inline]
+    pub fn at(&self, [u, v]: [f64; 2]) -> DVec3 {
+        self.corner + u * self.edges[0] + v * self.edges[1]
+    }
+
+    /// The vectors of u and v.
+    pub fn texture_edges(&self) -> [DVec3; 2] {
+        self.edges
+    }
+
+    /// Texture coordinates of a point of the plane.
+    #[inline]
+    pub fn texture(&self, x: DVec3) -> [f64; 2] {
+        let [e, f] = self.edges;
+        let d = x - self.corner;
+        // Gram system of the two edges, which need not be perpendicular.
+        let (ee, ef, ff) = (e.dot(e), e.dot(f), f.dot(f));
+        let (de, df) = (d.dot(e), d.dot(f));
+        let det = ee * ff - ef * ef;
+        [(de * ff - df * ef) / det, (df * ee - de * ef) / det]
+    }
+
+    /// A point uniform over the area from two uniforms: straight through (u, v) for parallelograms, which keeps strata
+    /// whole, by the triangle fan otherwise.
+    pub fn sample(&self, u: [f64; 2]) -> DVec3 {
+        if self.is_parallelogram() {
+            return self.at(u);
+        }
+        let fan = |i: usize| {
+            let [a, b, c] = [0, i + 1, i + 2].map(|k| self.vertices[k]);
+            (a, b - a, c - a, 0.5 * (b - a).cross(c - a).length())
+        };
+        let mut rest = u[0] * self.area;
+        let last = self.vertices.len() - 3;
+        for i in 0..=last {
+            let (a, e, f, area) = fan(i);
+            if rest < area || i == last {
+                let [s, t] = crate::warp::triangle([(rest / area).min(1.0), u[1]]);
+                return a + s * e + t * f;
+            }
+            rest -= area;
+        }
+        unreachable!("the last triangle takes the rest")
+    }
+
+    /// Whether texture coordinates cover the polygon exactly.
+    pub fn is_parallelogram(&self) -> bool {
+        let v = &self.vertices;
+        v.len() == 4 && (v[0] + v[2] - v[1] - v[3]).length() <= 1e-12 * (v[2] - v[0]).length()
+    }
+}
+
+/// Corner and edges of the texture of a planar polygon.
+fn parametrise(v: &[DVec3], normal: DVec3) -> (DVec3, [DVec3; 2]) {
+    if v.len() == 4 && (v[0] + v[2] - v[1] - v[3]).length() <= 1e-12 * (v[2] - v[0]).length() {
+        return (v[0], [v[1] - v[0], v[3] - v[0]]);
+    }
+    let s = (v[1] - v[0]).normalize();
+    let t = normal.cross(s);
+    let (mut lo, mut hi) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
+    for &x in v {
+        let p = DVec2::new((x - v[0]).dot(s), (x - v[0]).dot(t));
+        (lo, hi) = (lo.min(p), hi.max(p));
+    }
+    (v[0] + lo.x * s + lo.y * t, [(hi.x - lo.x) * s, (hi.y - lo.y) * t])
+}
+
+/// A polygon in the local frame, ready to be met by rays: plane and edges in f64.
+#[derive(Clone, Debug)]
+pub struct LocalPolygon {
+    normal: DVec3,
+    offset: f64,
+    /// How far behind the plane a start may lie by the rounding of f32 coordinates and still count as on it.
+    slack: f64,
+    /// Inside is where every edge's plane is not negative: (normal of the edge in the polygon's plane, offset).
+    edges: Vec<(DVec3, f64)>,
+    lo: DVec3,
+    hi: DVec3,
+    opaque_back: bool,
+}
+
+impl LocalPolygon {
+    /// `polygon` in the index coordinates of `lattice`.
+    pub fn new(polygon: &Polygon, lattice: &Lattice) -> Self {
+        let v: Vec<DVec3> = polygon.vertices.iter().map(|&x| lattice.to_index(x)).collect();
+        // The world normal's plane in local coordinates; flipped axes turn the winding, not the plane.
+        let axes = lattice.axes();
+        let normal = (axes.transpose() * polygon.normal).normalize();
+        let (mut lo, mut hi) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+        for &p in &v {
+            (lo, hi) = (lo.min(p), hi.max(p));
+        }
+        let centre = v.iter().sum::<DVec3>() / v.len() as f64;
+        let size = (hi - lo).length();
+        let edges = (0..v.len())
+            .map(|i| {
+                let (a, b) = (v[i], v[(i + 1) % v.len()]);
+                let mut e = normal.cross(b - a).normalize();
+                if e.dot(centre - a) < 0.0 {
+                    e = -e;
+                }
+                // 1e-9 of the size: two walls that share an edge leave no slit between them.
+                (e, e.dot(a) - 1e-9 * size)
+            })
+            .collect();
+        let reach = lo.abs().max(hi.abs()).max_element().max(1.0);
+        let slack = 8.0 * f64::from(f32::EPSILON) * reach;
+        Self { normal, offset: normal.dot(v[0]), slack, edges, lo, hi, opaque_back: polygon.opaque_back }
+    }
+
+    /// Bounds in the local frame.
+    pub fn bounds(&self) -> (DVec3, DVec3) {
+        (self.lo, self.hi)
+    }
+
+    /// t at which `ray` meets polygon number `id` (this one) with 0 ≤ t ≤ `reach`. Fronts only, unless the back is
+    /// opaque. A ray that departs from it or ends on it does not meet it; one that starts on the plane (within the
+    /// rounding of f32 coordinates) and goes into it meets it at 0.
+    #[inline]
+    pub fn intersect(&self, id: u32, ends: (Departure, Option<u32>), o: DVec3, d: DVec3, reach: f64) -> Option<f64> {
+        let slope = self.normal.dot(d);
+        if slope == 0.0 || (slope > 0.0 && !self.opaque_back) || ends.0 == Departure::Polygon(id) || ends.1 == Some(id) {
+            return None;
+        }
+        let height = self.normal.dot(o) - self.offset;
+        let before = if slope < 0.0 { height } else { -height };
+        if before < -self.slack {
+            return None;
+        }
+        let t = (before / slope.abs()).max(0.0);
+        if !(t <= reach) {
+            return None;
+        }
+        let p = o + t * d;
+        self.edges.iter().all(|&(e, offset)| e.dot(p) >= offset).then_some(t)
+    }
+
+    /// [`LocalPolygon::intersect`] for a whole ray.
+    pub fn meet(&self, id: u32, ray: &FlattenedRay) -> Option<f64> {
+        let (o, d) = (ray.origin.as_dvec3(), ray.direction.as_dvec3());
+        self.intersect(id, (ray.departure, ray.target), o, d, f64::from(ray.reach))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DMat3;
+
+    fn square() -> Polygon {
+        let v = [(0., 0.), (2., 0.), (2., 1.), (0., 1.)].map(|(x, y)| DVec3::new(x, y, 3.0)).to_vec();
+        Polygon::new("s", v, DVec3::ONE, DVec3::ZERO).unwrap()
+    }
+
+    #[test]
+    fn geometry_of_a_rectangle() {
+        let s = square();
+        assert_eq!((s.area(), s.normal()), (2.0, DVec3::Z));
+        assert_eq!(s.at([0.5, 1.0]), DVec3::new(1.0, 1.0, 3.0));
+        assert_eq!(s.texture(DVec3::new(1.0, 1.0, 3.0)), [0.5, 1.0]);
+    }
+
+    #[test]
+    fn samples_are_uniform_over_a_pentagon() {
+        let v: Vec<DVec3> = (0..5)
+            .map(|i| {
+                let a = f64::from(i) * std::f64::consts::TAU / 5.0;
+                DVec3::new(a.cos(), a.sin(), 0.0)
+            })
+            .collect();
+        let p = Polygon::new("p", v, DVec3::ONE, DVec3::ZERO).unwrap();
+        let n = 256;
+        let mean: DVec3 = (0..n * n)
+            .map(|i| p.sample([(f64::from(i % n) + 0.5) / f64::from(n), (f64::from(i / n) + 0.5) / f64::from(n)]))
+            .sum::<DVec3>()
+            / f64::from(n * n);
+        assert!(mean.length() < 1e-3, "{mean}: the centroid of a regular pentagon is its centre");
+    }
+
+    #[test]
+    fn rejects_what_is_no_polygon() {
+        let p = |v: &[(f64, f64, f64)]| {
+            Polygon::new("x", v.iter().map(|&(x, y, z)| DVec3::new(x, y, z)).collect(), DVec3::ONE, DVec3::ZERO)
+        };
+        for (vertices, word) in [
+            (vec![(0., 0., 0.), (1., 0., 0.)], "vertices"),
+            (vec![(0., 0., 0.), (1., 0., 0.), (2., 0., 0.)], "area"),
+            (vec![(0., 0., 0.), (1., 0., 0.), (1., 1., 0.1), (0., 1., 0.)], "plane"),
+            (vec![(0., 0., 0.), (2., 0., 0.), (0.5, 0.5, 0.), (0., 2., 0.)], "convex"),
+        ] {
+            assert!(p(&vertices).unwrap_err().to_string().contains(word), "{word}");
+        }
+    }
+
+    #[test]
+    fn fronts_backs_starts_and_ends() {
+        let axes = DMat3::from_cols(-DVec3::X, DVec3::Y, 2.0 * DVec3::Z);
+        let lattice = Lattice::new([4, 4, 4], DVec3::new(1.0, 0.0, 0.0), axes).unwrap();
+        let wall = LocalPolygon::new(&square(), &lattice);
+        let local = |x: f64, y: f64, z: f64| lattice.to_index(DVec3::new(x, y, z)).as_vec3();
+        let down = lattice.direction_to_index(-DVec3::Z).as_vec3();
+        let ray = FlattenedRay::free(local(1.5, 0.5, 5.0), down, 0.0);
+        assert_eq!(wall.meet(0, &ray), Some(2.0), "t is in world units");
+        let behind = FlattenedRay::free(local(1.5, 0.5, 1.0), -down, 0.0);
+        assert_eq!(wall.meet(0, &behind), None, "seen from the front only");
+        let on = FlattenedRay::free(local(1.5, 0.5, 3.0), down, 0.0);
+        assert_eq!(wall.meet(0, &on), Some(0.0), "a start on the plane sees it at 0");
+        assert_eq!(wall.meet(0, &FlattenedRay { departure: Departure::Polygon(0), ..on }), None);
+        assert_eq!(wall.meet(0, &FlattenedRay { target: Some(0), ..ray }), None);
+        assert_eq!(wall.meet(1, &FlattenedRay { target: Some(0), ..ray }), Some(2.0));
+        assert_eq!(wall.meet(0, &FlattenedRay::free(local(2.5, 0.5, 5.0), down, 0.0)), None);
+    }
+}

@@ -1,0 +1,302 @@
+//! What one hyperplane contains: the level set, walls, luminaires; and the Cornell box that fits itself around any
+//! volume.
+
+mod obj;
+
+pub use obj::read_obj;
+
+use crate::error::{Error, Result};
+use crate::field::Field;
+use crate::flattened::{Departure, FlattenedRay, MAX_POLYGONS, MAX_TARGETS, Side};
+use crate::luminaire::unoccluded;
+use crate::polygon::Polygon;
+use crate::volume::Lattice;
+use glam::{DVec3, Vec3};
+
+/// What the faces of Ω do to a level set that runs into them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Boundary {
+    /// They cut it open, as extraction tools do.
+    Open,
+    /// They close it: outside Ω counts as below every isovalue.
+    Capped,
+}
+
+/// The isosurfaces' material and sides; the same for every isovalue.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Surface {
+    /// Diffuse reflectance per channel on both sides, [0, 1].
+    pub albedo: DVec3,
+    /// Emitted radiance per channel, from both sides; 0 for ordinary surfaces.
+    pub emission: DVec3,
+    /// The side whose radiance is stored first.
+    pub outside: Side,
+    /// Whether the other side is stored too.
+    pub both_sides: bool,
+}
+
+impl Default for Surface {
+    fn default() -> Self {
+        Self { albedo: DVec3::splat(0.75), emission: DVec3::ZERO, outside: Side::Lower, both_sides: false }
+    }
+}
+
+impl Surface {
+    /// The sides whose radiance is stored.
+    pub fn stored_sides(&self) -> Vec<Side> {
+        if self.both_sides { vec![self.outside, self.outside.opposite()] } else { vec![self.outside] }
+    }
+}
+
+/// A scene: {graph of h, walls × I, luminaires × I}. [BB09 §2.3]
+#[derive(Clone, Debug)]
+pub struct Scene {
+    /// h, its lattice and the sweep.
+    pub field: Field,
+    /// Material and sides of the isosurfaces.
+    pub surface: Surface,
+    /// What Ω's faces do.
+    pub boundary: Boundary,
+    polygons: Vec<Polygon>,
+    luminaires: Vec<u32>,
+    interior: [DVec3; 2],
+}
+
+impl Scene {
+    /// Puts a scene together; polygons that emit are its luminaires. Luminaires are numbered first.
+    ///
+    /// # Errors
+    /// `Invalid` for an albedo outside [0, 1], a negative emission, too many polygons, or capped faces that touch a wall.
+    pub fn new(field: Field, surface: Surface, boundary: Boundary, polygons: Vec<Polygon>) -> Result<Self> {
+        let fail = |what: String| Err(Error::Invalid(what));
+        if !(surface.albedo.cmpge(DVec3::ZERO).all() && surface.albedo.cmple(DVec3::ONE).all()) {
+            return fail(format!("surface albedo {}: every channel must lie in [0, 1]", surface.albedo));
+        }
+        if !(surface.emission.cmpge(DVec3::ZERO).all() && surface.emission.is_finite()) {
+            return fail(format!("surface emission {}: must be finite and not negative", surface.emission));
+        }
+        let (mut polygons, walls): (Vec<_>, Vec<_>) = polygons.into_iter().partition(|p| p.emission != DVec3::ZERO);
+        let count = polygons.len();
+        polygons.extend(walls);
+        if count > MAX_TARGETS as usize || polygons.len() > MAX_POLYGONS as usize {
+            return fail(format!(
+                "{count} luminaires among {} polygons: at most {MAX_TARGETS} among {MAX_POLYGONS} are possible",
+                polygons.len()
+            ));
+        }
+        let lattice = field.lattice();
+        if boundary == Boundary::Capped {
+            // A cap is a surface of its own: a wall in the same plane would hide it or be hidden.
+            let far = lattice.far();
+            for p in &polygons {
+                let local: Vec<DVec3> = p.vertices().iter().map(|&x| lattice.to_index(x)).collect();
+                for a in 0..3 {
+                    for plane in [0.0, far[a]] {
+                        if local.iter().all(|v| (v[a] - plane).abs() < 1e-6 * far[a]) {
+                            return fail(format!(
+                                "boundary = \"capped\": polygon '{}' lies in a face of the volume; give the box a margin",
+                                p.name
+                            ));
+                        }
+                    }
+                }
+            }
+        }
+        let mut lo = DVec3::INFINITY;
+        let mut hi = DVec3::NEG_INFINITY;
+        let corners = (0..8).map(|n| lattice.to_world(lattice.far() * DVec3::from_array([n & 1, n >> 1 & 1, n >> 2].map(f64::from))));
+        for x in corners.chain(polygons.iter().flat_map(|p| p.vertices().iter().copied())) {
+            (lo, hi) = (lo.min(x), hi.max(x));
+        }
+        let luminaires = (0..u32::try_from(count).expect("checked above")).collect();
+        Ok(Self { field, surface, boundary, polygons, luminaires, interior: [lo, hi] })
+    }
+
+    /// Walls and luminaires; luminaires come first.
+    pub fn polygons(&self) -> &[Polygon] {
+        &self.polygons
+    }
+
+    /// Numbers of the polygons that emit.
+    pub fn luminaires(&self) -> &[u32] {
+        &self.luminaires
+    }
+
+    /// World bounds of everything.
+    pub fn bounds(&self) -> [DVec3; 2] {
+        self.interior
+    }
+
+    /// The lattice, whose index coordinates are the local frame.
+    pub fn lattice(&self) -> &Lattice {
+        self.field.lattice()
+    }
+
+    /// Unit normal of `side` of the level set through local `p`, in the world; `None` where ∇h vanishes.
+    #[inline]
+    pub fn normal(&self, p: DVec3, side: Side) -> Option<DVec3> {
+        let n = self.field.falling_normal(p)?;
+        Some(if side == Side::Lower { n } else { -n })
+    }
+
+    /// A ray from local `origin` along the world direction `direction`; t counts in lengths of it.
+    #[inline]
+    pub fn ray(&self, origin: Vec3, direction: DVec3, isovalue: f32, departure: Departure) -> FlattenedRay {
+        let direction = self.lattice().direction_to_index(direction).as_vec3();
+        FlattenedRay { departure, ..FlattenedRay::free(origin, direction, isovalue) }
+    }
+
+    /// World normal of Ω's face `face` (axis + 3 · far end), pointing out of Ω.
+    pub fn face_normal(&self, face: u8) -> DVec3 {
+        outward_normal(self.lattice(), usize::from(face % 3), face >= 3)
+    }
+
+    /// E₀: the unoccluded irradiance of a patch at the centre of the scene that faces the strongest luminaire; the largest
+    /// channel of the sum over all luminaires. 0 without luminaires.
+    pub fn reference_irradiance(&self) -> f64 {
+        let centre = self.lattice().to_world(0.5 * self.lattice().far());
+        let flux = |p: &Polygon| p.emission.max_element() * p.area();
+        let lights = || self.luminaires.iter().map(|&l| &self.polygons[l as usize]);
+        let Some(strongest) = lights().max_by(|a, b| flux(a).total_cmp(&flux(b))) else { return 0.0 };
+        let aim = strongest.vertices().iter().sum::<DVec3>() / strongest.vertices().len() as f64 - centre;
+        let Some(n) = aim.try_normalize() else { return 0.0 };
+        lights().map(|p| p.emission * unoccluded(p, centre, n)).sum::<DVec3>().max_element()
+    }
+
+    /// Display exposure: rgb = radiance × π / (ρ_max E₀); 1 where that is undefined.
+    pub fn exposure(&self) -> f64 {
+        let scale = self.surface.albedo.max_element() * self.reference_irradiance() / std::f64::consts::PI;
+        if scale > 0.0 { 1.0 / scale } else { 1.0 }
+    }
+}
+
+/// Outward unit normal of the face of Ω across lattice axis `axis` at its near or far end.
+fn outward_normal(lattice: &Lattice, axis: usize, far: bool) -> DVec3 {
+    let axes = lattice.axes();
+    let n = axes.col((axis + 1) % 3).cross(axes.col((axis + 2) % 3)).normalize();
+    if (n.dot(axes.col(axis)) > 0.0) == far { n } else { -n }
+}
+
+/// The lattice axis nearest each world axis, and whether it points the same way: the unique best permutation.
+pub fn nearest_axes(lattice: &Lattice) -> [(usize, bool); 3] {
+    let normal = |axis: usize| outward_normal(lattice, axis, true);
+    let permutations = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
+    let score = |p: &[usize; 3]| (0..3).map(|w| normal(p[w])[w].abs()).sum::<f64>();
+    let best = permutations.into_iter().max_by(|a, b| score(a).total_cmp(&score(b))).expect("six permutations");
+    std::array::from_fn(|w| (best[w], normal(best[w])[w] > 0.0))
+}
+
+/// The default scene's polygons: a Cornell box that coincides with Ω's faces, grown by `margin` × Ω's edge on every
+/// side. x_min red, x_max green, floor, ceiling and y_max white, y_min open; a square luminaire of radiance 1 and side
+/// 0.4 · min(Lx, Ly), 0.001 Lz under the ceiling. x, y, z are the world axes nearest the lattice's.
+///
+/// # Errors
+/// `Invalid` for a margin that is negative or not finite.
+pub fn cornell_box(lattice: &Lattice, margin: f64) -> Result<Vec<Polygon>> {
+    if !(margin >= 0.0 && margin.is_finite()) {
+        return Err(Error::Invalid(format!("box margin {margin}: must be a fraction of the volume's edges, 0 or more")));
+    }
+    let nearest = nearest_axes(lattice);
+    let far = lattice.far();
+    // Box coordinates along world-like axes, 0 … 1 from min to max face.
+    let corner = |x: f64, y: f64, z: f64| {
+        let mut p = DVec3::ZERO;
+        for (w, t) in [x, y, z].into_iter().enumerate() {
+            let (axis, same) = nearest[w];
+            let s = if same { t } else { 1.0 - t };
+            p[axis] = (s * (1.0 + 2.0 * margin) - margin) * far[axis];
+        }
+        lattice.to_world(p)
+    };
+    let length = |w: usize| lattice.axes().col(nearest[w].0).length() * far[nearest[w].0] * (1.0 + 2.0 * margin);
+    let (red, green) = (DVec3::new(0.63, 0.065, 0.05), DVec3::new(0.14, 0.45, 0.091));
+    let white = DVec3::new(0.725, 0.71, 0.68);
+    let (lx, ly, lz) = (length(0), length(1), length(2));
+    let inside = corner(0.5, 0.5, 0.5);
+    let facing_in = |name: &str, v: [DVec3; 4], albedo: DVec3, emission: DVec3| {
+        let mut v = v.to_vec();
+        if (v[1] - v[0]).cross(v[3] - v[0]).dot(inside - v[0]) < 0.0 {
+            v.reverse();
+        }
+        Polygon::new(name, v, albedo, emission)
+    };
+    let ceiling = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)].map(|(x, y)| corner(x, y, 1.0));
+    let down = {
+        let n = (ceiling[1] - ceiling[0]).cross(ceiling[3] - ceiling[0]).normalize();
+        if n.dot(inside - ceiling[0]) < 0.0 { -n } else { n }
+    };
+    let s = (ceiling[1] - ceiling[0]).normalize();
+    let t = down.cross(s);
+    let half = 0.2 * lx.min(ly);
+    let centre = corner(0.5, 0.5, 1.0) + 0.001 * lz * down;
+    let square = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)].map(|(a, b)| centre + half * (a * s + b * t));
+    let none = DVec3::ZERO;
+    [
+        facing_in("luminaire", square, none, DVec3::ONE),
+        facing_in("x_min", [(0., 0.), (1., 0.), (1., 1.), (0., 1.)].map(|(y, z)| corner(0., y, z)), red, none),
+        facing_in("x_max", [(0., 0.), (1., 0.), (1., 1.), (0., 1.)].map(|(y, z)| corner(1., y, z)), green, none),
+        facing_in("z_min", [(0., 0.), (1., 0.), (1., 1.), (0., 1.)].map(|(x, y)| corner(x, y, 0.)), white, none),
+        facing_in("z_max", ceiling, white, none),
+        facing_in("y_max", [(0., 0.), (1., 0.), (1., 1.), (0., 1.)].map(|(x, z)| corner(x, 1., z)), white, none),
+    ]
+    .into_iter()
+    .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::Sweep;
+    use crate::volume::{Samples, Volume};
+    use glam::DMat3;
+
+    fn scene_on(lattice: Lattice, margin: f64, boundary: Boundary) -> Result<Scene> {
+        let samples = (0..lattice.len()).map(|i| i as f32).collect();
+        let volume = Volume::new("test", lattice, Samples::F32(samples)).unwrap();
+        let field = Field::new(&volume, Sweep::new(0.0, volume.range().unwrap().1).unwrap()).unwrap();
+        let polygons = cornell_box(field.lattice(), margin)?;
+        Scene::new(field, Surface::default(), boundary, polygons)
+    }
+
+    #[test]
+    fn the_default_box_of_a_cube() {
+        let lattice = Lattice::aligned([11, 11, 11], DVec3::ZERO, DVec3::splat(0.1)).unwrap();
+        let scene = scene_on(lattice, 0.0, Boundary::Open).unwrap();
+        assert!((scene.reference_irradiance() - 0.53002).abs() < 1e-5, "{}", scene.reference_irradiance());
+        let named = |n: &str| scene.polygons().iter().find(|p| p.name == n).unwrap();
+        assert_eq!(scene.luminaires(), [0]);
+        assert!((named("luminaire").area() - 0.16).abs() < 1e-12);
+        for (name, normal) in [
+            ("x_min", DVec3::X),
+            ("x_max", -DVec3::X),
+            ("y_max", -DVec3::Y),
+            ("z_min", DVec3::Z),
+            ("z_max", -DVec3::Z),
+            ("luminaire", -DVec3::Z),
+        ] {
+            assert!((named(name).normal() - normal).length() < 1e-12, "{name} faces {}", named(name).normal());
+        }
+    }
+
+    #[test]
+    fn flipped_and_permuted_axes_keep_world_names() {
+        // Lattice axis 0 runs along −z, 1 along x, 2 along −y.
+        let axes = DMat3::from_cols(-DVec3::Z, DVec3::X, -DVec3::Y);
+        let lattice = Lattice::new([5, 6, 7], DVec3::new(1.0, 2.0, 3.0), axes).unwrap();
+        assert_eq!(nearest_axes(&lattice), [(1, true), (2, false), (0, false)]);
+        let scene = scene_on(lattice, 0.0, Boundary::Open).unwrap();
+        let red = scene.polygons().iter().find(|p| p.name == "x_min").unwrap();
+        assert!((red.normal() - DVec3::X).length() < 1e-12);
+        assert!(red.vertices().iter().all(|v| (v.x - 1.0).abs() < 1e-12));
+        let ceiling = scene.polygons().iter().find(|p| p.name == "z_max").unwrap();
+        assert!(ceiling.vertices().iter().all(|v| (v.z - 3.0).abs() < 1e-12));
+    }
+
+    #[test]
+    fn caps_need_a_margin() {
+        let lattice = || Lattice::aligned([4, 4, 4], DVec3::ZERO, DVec3::ONE).unwrap();
+        assert!(scene_on(lattice(), 0.0, Boundary::Capped).unwrap_err().to_string().contains("margin"));
+        assert!(scene_on(lattice(), 0.1, Boundary::Capped).is_ok());
+        assert!(scene_on(lattice(), -0.1, Boundary::Open).is_err());
+    }
+}
