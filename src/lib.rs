@@ -6,5 +6,7 @@
 //! Isosurface Generation Using 4D Light Transport", IEEE TVCG 15(6), 2009; the other tags are listed in
 //! `docs/references.md`.
 
+#[allow(unsafe_code, reason = "FFI to Embree: the one place in this crate")]
+pub mod embree;
 pub mod error;
 pub mod volume;
