@@ -109,7 +109,11 @@ mod tests {
             // c on a corner, on the face's own interpolated value, or anywhere.
             let c = match round % 5 {
                 0 => f64::from(a.s[1 << axis]),
-                1 => b.value(match axis { 0 => DVec3::new(0.0, u, v), 1 => DVec3::new(v, 0.0, u), _ => DVec3::new(u, v, 0.0) }),
+                1 => b.value(match axis {
+                    0 => DVec3::new(0.0, u, v),
+                    1 => DVec3::new(v, 0.0, u),
+                    _ => DVec3::new(u, v, 0.0),
+                }),
                 _ => rng.unit(),
             };
             assert_eq!(a.face_inside(axis, true, c, u, v), b.face_inside(axis, false, c, u, v));

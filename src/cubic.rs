@@ -74,7 +74,8 @@ impl Cubic {
     fn bracketed_root(&self, mut lo: f64, mut hi: f64, inside_lo: bool) -> f64 {
         let (f_lo, f_hi) = (self.value(lo), self.value(hi));
         // A secant start; rounding may have left both values on one side, then the middle.
-        let mut t = if (f_lo < 0.0) != (f_hi < 0.0) { lo + (hi - lo) * (f_lo / (f_lo - f_hi)) } else { 0.5 * (lo + hi) };
+        let mut t =
+            if (f_lo < 0.0) != (f_hi < 0.0) { lo + (hi - lo) * (f_lo / (f_lo - f_hi)) } else { 0.5 * (lo + hi) };
         for _ in 0..MAX_STEPS {
             if !(t > lo && t < hi) {
                 t = 0.5 * (lo + hi);
@@ -86,7 +87,11 @@ impl Cubic {
             if f == 0.0 {
                 return t;
             }
-            if (f >= 0.0) == inside_lo { lo = t } else { hi = t }
+            if (f >= 0.0) == inside_lo {
+                lo = t
+            } else {
+                hi = t
+            }
             let next = t - f / self.slope(t);
             if (next - t).abs() <= 2.0 * f64::EPSILON * t.abs() {
                 return next.clamp(lo, hi);

@@ -264,7 +264,8 @@ mod tests {
                 f(lattice.to_world(DVec3::new(i as f64, j as f64, k as f64)))
             })
             .collect();
-        Field::new(&Volume::new("test", lattice, Samples::F64(samples)).unwrap(), Sweep::new(0.0, 1.0).unwrap()).unwrap()
+        Field::new(&Volume::new("test", lattice, Samples::F64(samples)).unwrap(), Sweep::new(0.0, 1.0).unwrap())
+            .unwrap()
     }
 
     #[test]

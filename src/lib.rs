@@ -24,3 +24,7 @@ pub mod brdf;
 pub mod polygon;
 pub mod luminaire;
 pub mod scene;
+// The one seam: nearest hit and visibility.
+pub mod tracer;
+#[allow(unsafe_code, reason = "FFI to Embree: the one place in this crate")]
+pub mod embree;

@@ -44,7 +44,9 @@ impl Polygon {
         let size = vertices.iter().map(|&v| (v - base).length()).fold(0.0, f64::max);
         let area = 0.5 * twice.length();
         if !(area > 1e-12 * size * size) {
-            return fail(format!("area {area:.3e} for a size of {size:.3e}; its vertices coincide or stand in one line"));
+            return fail(format!(
+                "area {area:.3e} for a size of {size:.3e}; its vertices coincide or stand in one line"
+            ));
         }
         let normal = twice.normalize();
         if let Some(i) = (0..n).find(|&i| (vertices[i] - base).dot(normal).abs() > 1e-5 * size) {
@@ -206,7 +208,8 @@ impl LocalPolygon {
     #[inline]
     pub fn intersect(&self, id: u32, ends: (Departure, Option<u32>), o: DVec3, d: DVec3, reach: f64) -> Option<f64> {
         let slope = self.normal.dot(d);
-        if slope == 0.0 || (slope > 0.0 && !self.opaque_back) || ends.0 == Departure::Polygon(id) || ends.1 == Some(id) {
+        if slope == 0.0 || (slope > 0.0 && !self.opaque_back) || ends.0 == Departure::Polygon(id) || ends.1 == Some(id)
+        {
             return None;
         }
         let height = self.normal.dot(o) - self.offset;

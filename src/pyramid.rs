@@ -190,9 +190,8 @@ impl Pyramid {
                 if departing.is_some() || corners.straddles(c) {
                     let last = t_exit >= reach;
                     let t_end = if last { reach } else { t_exit };
-                    let local = DVec3::from_array(std::array::from_fn(|a| {
-                        (o[a] + t * d[a] - cell[a] as f64).clamp(0.0, 1.0)
-                    }));
+                    let local =
+                        DVec3::from_array(std::array::from_fn(|a| (o[a] + t * d[a] - cell[a] as f64).clamp(0.0, 1.0)));
                     let mut cubic = corners.cubic(c, local, DVec3::from_array(d));
                     let start = match departing.take() {
                         Some(side) => {
@@ -215,8 +214,7 @@ impl Pyramid {
                     } else {
                         crossing_inside(&corners, axis, d[axis] > 0.0, cell, &o, &d, t_exit, c)
                     };
-                    let crossing =
-                        if ANY && start != end { Some(0.0) } else { cubic.first_crossing(span, start, end) };
+                    let crossing = if ANY && start != end { Some(0.0) } else { cubic.first_crossing(span, start, end) };
                     if let Some(dt) = crossing {
                         let side = if start { Side::Higher } else { Side::Lower };
                         return Some(FlattenedHit { t: (t + dt).min(reach) as f32, target: Target::Surface(side) });

@@ -207,8 +207,7 @@ mod tests {
             let sobol = Sobol::set(set, Stage::Test, 17);
             for d in 0..SOBOL_DIMENSIONS {
                 for m in [1u32, 4, 64, 4096] {
-                    let strata: HashSet<u32> =
-                        (0..m).map(|i| (sobol.coordinate(i, d) * f64::from(m)) as u32).collect();
+                    let strata: HashSet<u32> = (0..m).map(|i| (sobol.coordinate(i, d) * f64::from(m)) as u32).collect();
                     assert_eq!(strata.len(), m as usize, "dimension {d}, {m} points");
                 }
             }

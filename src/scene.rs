@@ -104,7 +104,8 @@ impl Scene {
         }
         let mut lo = DVec3::INFINITY;
         let mut hi = DVec3::NEG_INFINITY;
-        let corners = (0..8).map(|n| lattice.to_world(lattice.far() * DVec3::from_array([n & 1, n >> 1 & 1, n >> 2].map(f64::from))));
+        let corners = (0..8)
+            .map(|n| lattice.to_world(lattice.far() * DVec3::from_array([n & 1, n >> 1 & 1, n >> 2].map(f64::from))));
         for x in corners.chain(polygons.iter().flat_map(|p| p.vertices().iter().copied())) {
             (lo, hi) = (lo.min(x), hi.max(x));
         }
@@ -194,7 +195,9 @@ pub fn nearest_axes(lattice: &Lattice) -> [(usize, bool); 3] {
 /// `Invalid` for a margin that is negative or not finite.
 pub fn cornell_box(lattice: &Lattice, margin: f64) -> Result<Vec<Polygon>> {
     if !(margin >= 0.0 && margin.is_finite()) {
-        return Err(Error::Invalid(format!("box margin {margin}: must be a fraction of the volume's edges, 0 or more")));
+        return Err(Error::Invalid(format!(
+            "box margin {margin}: must be a fraction of the volume's edges, 0 or more"
+        )));
     }
     let nearest = nearest_axes(lattice);
     let far = lattice.far();

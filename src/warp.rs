@@ -21,7 +21,11 @@ impl Frame {
         let sign = 1f64.copysign(n.z);
         let a = -1.0 / (sign + n.z);
         let b = n.x * n.y * a;
-        Self { s: DVec3::new(1.0 + sign * n.x * n.x * a, sign * b, -sign * n.x), t: DVec3::new(b, sign + n.y * n.y * a, -n.y), n }
+        Self {
+            s: DVec3::new(1.0 + sign * n.x * n.x * a, sign * b, -sign * n.x),
+            t: DVec3::new(b, sign + n.y * n.y * a, -n.y),
+            n,
+        }
     }
 
     /// A local direction (z along the normal) in the world.

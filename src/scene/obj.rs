@@ -24,12 +24,7 @@ pub fn read_obj(path: &Path) -> Result<Vec<Polygon>> {
         let material = mesh.material_id.map(|i| &materials[i]);
         let channels = |v: Option<[f32; 3]>, default: DVec3| v.map_or(default, |c| DVec3::from_array(c.map(f64::from)));
         let albedo = channels(material.and_then(|m| m.diffuse), DVec3::new(0.725, 0.71, 0.68));
-        let emission = match material.and_then(|m| m.unknown_param.get("Ke")) {
-            Some(text) => parse_triple(text).ok_or_else(|| {
-                Error::invalid(path, format!("material '{}': Ke '{text}' must be three numbers", model.name))
-            })?,
-            None => DVec3::ZERO,
-        };
+        let emission = channels(material.and_then(|m| m.emissive), DVec3::ZERO);
         let vertex = |i: u32| {
             let p = &mesh.positions[3 * i as usize..][..3];
             DVec3::new(f64::from(p[0]), f64::from(p[1]), f64::from(p[2]))
@@ -53,11 +48,6 @@ pub fn read_obj(path: &Path) -> Result<Vec<Polygon>> {
     Ok(polygons)
 }
 
-fn parse_triple(text: &str) -> Option<DVec3> {
-    let v: Vec<f64> = text.split_whitespace().map(|w| w.parse().ok()).collect::<Option<_>>()?;
-    (v.len() == 3).then(|| DVec3::new(v[0], v[1], v[2]))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -66,11 +56,8 @@ mod tests {
     fn a_box_with_a_light() {
         let dir = tempfile::tempdir().unwrap();
         let obj = dir.path().join("box.obj");
-        std::fs::write(
-            dir.path().join("box.mtl"),
-            "newmtl red\nKd 0.63 0.065 0.05\nnewmtl lamp\nKd 0 0 0\nKe 2 3 4\n",
-        )
-        .unwrap();
+        std::fs::write(dir.path().join("box.mtl"), "newmtl red\nKd 0.63 0.065 0.05\nnewmtl lamp\nKd 0 0 0\nKe 2 3 4\n")
+            .unwrap();
         std::fs::write(
             &obj,
             "mtllib box.mtl\nv 0 0 0\nv 0 1 0\nv 0 1 1\nv 0 0 1\nv 1 1 1\no wall\nusemtl red\nf 1 2 3 4\no light\nusemtl lamp\nf 1 2 5\n",

@@ -1,0 +1,566 @@
+//! Scenes: triangles and user geometry under one bounding volume hierarchy.
+
+use super::abi::{Hit, INVALID_ID, Ray, Ray16, RayHit, RayHit16, RayView, Valid16, raw};
+use super::device::Device;
+use crate::error::{Error, Result};
+use embree4_sys::{RTCBoundsFunctionArguments, RTCIntersectFunctionNArguments, RTCOccludedFunctionNArguments};
+use std::ffi::c_void;
+use std::marker::PhantomData;
+use std::sync::Arc;
+
+/// Coordinates beyond this make Embree drop a primitive without a word (its `FLT_LARGE`).
+const LARGE: f32 = 1.844e18;
+
+/// What a [`UserGeometry`] reports for the nearest hit.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct UserHit {
+    /// Distance in units of the ray's `dir`. A hit outside [`tnear`, `tfar`], or NaN, is ignored.
+    pub t: f32,
+    /// First surface coordinate, handed on.
+    pub u: f32,
+    /// Second surface coordinate, handed on.
+    pub v: f32,
+    /// Normal, handed on.
+    pub normal: [f32; 3],
+}
+
+/// What a [`UserGeometry`] reports for up to sixteen rays: [`UserHit`], one field after the other.
+#[repr(C, align(64))]
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct UserHits16 {
+    /// Distances.
+    pub t: [f32; 16],
+    /// First surface coordinates.
+    pub u: [f32; 16],
+    /// Second surface coordinates.
+    pub v: [f32; 16],
+    /// Normals: x of all hits, then y, then z.
+    pub normal: [[f32; 16]; 3],
+}
+
+impl UserHits16 {
+    /// All zero.
+    pub const ZERO: Self = Self { t: [0.0; 16], u: [0.0; 16], v: [0.0; 16], normal: [[0.0; 16]; 3] };
+}
+
+/// Primitives that intersect rays themselves.
+///
+/// Embree calls these functions from C, on any thread, several at a time. **They must not panic:** a panic cannot
+/// cross C, so that it aborts the process (the trampolines are `extern "C"`, which aborts on unwinding since
+/// Rust 1.81). They must not query a scene of their own geometry without end, and should not allocate: a call costs
+/// about 25 ns besides what they do.
+///
+/// `intersect` and `occluded` must agree: the second is true exactly if the first finds a hit.
+pub trait UserGeometry: Sync {
+    /// The number of primitives. Asked once, when the geometry joins a scene.
+    fn len(&self) -> u32;
+
+    /// Whether there are no primitives.
+    fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// The lower and upper corner of primitive `prim`'s box. Embree uses these numbers as they are, and tests rays
+    /// against them without its ROBUST care, whatever the scene's flag says: grow them by what rounding can do.
+    fn bounds(&self, prim: u32) -> ([f32; 3], [f32; 3]);
+
+    /// The nearest hit within `tnear` and `tfar`.
+    fn intersect(&self, prim: u32, ray: &RayView) -> Option<UserHit>;
+
+    /// Whether anything is hit within `tnear` and `tfar`.
+    fn occluded(&self, prim: u32, ray: &RayView) -> bool;
+
+    /// `intersect` for the rays whose bit is set in `active`; returns the bits of the rays that hit, and their hits in
+    /// `hits` (whatever stands in the other lanes is ignored).
+    ///
+    /// Embree may split a packet, or fall back to `intersect` (always so on a CPU without AVX-512).
+    #[inline]
+    fn intersect16(&self, prim: u32, active: u16, rays: &Ray16, hits: &mut UserHits16) -> u16 {
+        let mut found = 0;
+        for lane in (0..16).filter(|lane| active >> lane & 1 == 1) {
+            if let Some(hit) = self.intersect(prim, &rays.lane(lane)) {
+                hits.t[lane] = hit.t;
+                hits.u[lane] = hit.u;
+                hits.v[lane] = hit.v;
+                for (all, one) in hits.normal.iter_mut().zip(hit.normal) {
+                    all[lane] = one;
+                }
+                found |= 1 << lane;
+            }
+        }
+        found
+    }
+
+    /// `occluded` for the rays whose bit is set in `active`; returns the bits of those that are.
+    #[inline]
+    fn occluded16(&self, prim: u32, active: u16, rays: &Ray16) -> u16 {
+        (0..16)
+            .filter(|lane| active >> lane & 1 == 1 && self.occluded(prim, &rays.lane(*lane)))
+            .fold(0, |found, lane| found | 1 << lane)
+    }
+}
+
+/// How much work goes into the hierarchy.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Quality {
+    /// Fast build.
+    Low,
+    /// Binned surface-area heuristic.
+    #[default]
+    Medium,
+    /// With spatial splits for triangles; a few times slower to build.
+    High,
+}
+
+impl Quality {
+    fn raw(self) -> embree4_sys::RTCBuildQuality {
+        match self {
+            Quality::Low => embree4_sys::RTCBuildQuality::LOW,
+            Quality::Medium => embree4_sys::RTCBuildQuality::MEDIUM,
+            Quality::High => embree4_sys::RTCBuildQuality::HIGH,
+        }
+    }
+}
+
+/// Collects geometries; [`SceneBuilder::commit`] makes a [`Scene`] of them.
+///
+/// ```
+/// use isolume::embree::{Device, Ray, RayHit, SceneBuilder};
+/// let device = Device::new(1)?;
+/// let mut builder = SceneBuilder::new(&device)?;
+/// let floor = builder.triangles(&[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], &[[0, 1, 2]], u32::MAX)?;
+/// let scene = builder.commit()?;
+/// let mut rayhit = RayHit::new(Ray::new([0.25, 0.25, 2.0], [0.0, 0.0, -1.0], 0.0, f32::INFINITY));
+/// scene.intersect1(&mut rayhit);
+/// assert_eq!((rayhit.hit.geometry, rayhit.ray.tfar), (floor, 2.0));
+/// # Ok::<(), isolume::error::Error>(())
+/// ```
+pub struct SceneBuilder<'a> {
+    scene: Scene<'a>,
+    quality: Quality,
+    robust: bool,
+}
+
+/// A committed scene. Any number of threads may query it at once.
+///
+/// It borrows (`'a`) or shares what its user geometries read, and keeps its [`Device`] alive.
+pub struct Scene<'a> {
+    handle: embree4_sys::RTCScene,
+    device: Device,
+    /// What the callbacks of shared user geometries read: never touched, only kept.
+    _shared: Vec<Arc<dyn UserGeometry + Send + 'a>>,
+    /// The same for borrowed ones.
+    _borrowed: PhantomData<&'a dyn UserGeometry>,
+}
+
+// SAFETY: the handle belongs to no thread. What its callbacks read is either borrowed, `&'a G` with `G: Sync`, or
+// shared, `Arc<G>` with `G: Send + Sync`: both may move to another thread.
+unsafe impl Send for Scene<'_> {}
+// SAFETY: `&Scene` allows queries only, which Embree documents as safe to run concurrently on a committed scene; the
+// callbacks that they run take `&G` with `G: Sync`. (`SceneBuilder`, which can change a scene, needs `&mut`.)
+unsafe impl Sync for Scene<'_> {}
+
+impl Drop for Scene<'_> {
+    fn drop(&mut self) {
+        // SAFETY: the handle came from rtcNewScene and is released once, here, before `_shared` and `device` go, and
+        // within `'a`: no callback can run afterwards.
+        unsafe { embree4_sys::rtcReleaseScene(self.handle) };
+    }
+}
+
+/// One reference to a geometry; a scene that it was attached to holds another.
+struct Geometry(embree4_sys::RTCGeometry);
+
+impl Geometry {
+    fn new(device: &Device, kind: embree4_sys::RTCGeometryType) -> Result<Self> {
+        // SAFETY: the device is live.
+        let handle = unsafe { embree4_sys::rtcNewGeometry(device.handle(), kind) };
+        let geometry = (!handle.is_null()).then_some(Self(handle));
+        device.check()?;
+        geometry.ok_or_else(|| Error::Embree("no geometry could be made".into()))
+    }
+}
+
+impl Drop for Geometry {
+    fn drop(&mut self) {
+        // SAFETY: the handle came from rtcNewGeometry and this reference is released once, here.
+        unsafe { embree4_sys::rtcReleaseGeometry(self.0) };
+    }
+}
+
+impl<'a> SceneBuilder<'a> {
+    /// An empty scene: ROBUST, of medium quality.
+    ///
+    /// # Errors
+    /// `Embree` if the library has no memory.
+    pub fn new(device: &Device) -> Result<Self> {
+        // SAFETY: the device is live.
+        let handle = unsafe { embree4_sys::rtcNewScene(device.handle()) };
+        if handle.is_null() {
+            device.check()?;
+            return Err(Error::Embree("no scene could be made".into()));
+        }
+        let scene = Scene { handle, device: device.clone(), _shared: Vec::new(), _borrowed: PhantomData };
+        device.check()?;
+        Ok(Self { scene, quality: Quality::default(), robust: true })
+    }
+
+    /// Sets the build quality of the scene and of the geometries added from here on.
+    #[must_use]
+    pub fn quality(mut self, quality: Quality) -> Self {
+        self.quality = quality;
+        self
+    }
+
+    /// Sets whether triangles are watertight at their edges (Embree's ROBUST flag). It has no effect on user geometry.
+    #[must_use]
+    pub fn robust(mut self, robust: bool) -> Self {
+        self.robust = robust;
+        self
+    }
+
+    /// Adds triangles, copied. Rays see them if `mask` and theirs share a bit. Returns the geometry's number.
+    ///
+    /// No triangles at all is fine: the geometry is then never hit.
+    ///
+    /// # Errors
+    /// `Invalid` if an index names no vertex, or a coordinate is NaN, infinite or beyond 1.844e18 (Embree would drop
+    /// such triangles silently), or there are more than 2³² − 1 vertices or triangles; `Embree` if the library refuses.
+    pub fn triangles(&mut self, vertices: &[[f32; 3]], indices: &[[u32; 3]], mask: u32) -> Result<u32> {
+        if u32::try_from(vertices.len()).is_err() || u32::try_from(indices.len()).is_err() {
+            return Err(Error::Invalid(format!(
+                "{} triangles of {} vertices: Embree counts both in 32 bits",
+                indices.len(),
+                vertices.len()
+            )));
+        }
+        if let Some((i, v)) = vertices.iter().enumerate().find(|(_, v)| !v.iter().all(|x| x.abs() < LARGE)) {
+            return Err(Error::Invalid(format!("vertex {i} is {v:?}: coordinates must be finite and below {LARGE:e}")));
+        }
+        if let Some((i, t)) = indices.iter().enumerate().find(|(_, t)| t.iter().any(|&v| v as usize >= vertices.len()))
+        {
+            let n = vertices.len();
+            return Err(Error::Invalid(format!("triangle {i} has the vertices {t:?}, but there are only {n}")));
+        }
+        let geometry = Geometry::new(&self.scene.device, embree4_sys::RTCGeometryType::TRIANGLE)?;
+        if !indices.is_empty() {
+            self.fill(&geometry, embree4_sys::RTCBufferType::VERTEX, embree4_sys::RTCFormat::FLOAT3, vertices)?;
+            self.fill(&geometry, embree4_sys::RTCBufferType::INDEX, embree4_sys::RTCFormat::UINT3, indices)?;
+        }
+        self.attach(geometry, mask)
+    }
+
+    /// Copies `items` into a new buffer of `geometry`.
+    fn fill<T: Copy>(
+        &self,
+        geometry: &Geometry,
+        buffer: embree4_sys::RTCBufferType,
+        format: embree4_sys::RTCFormat,
+        items: &[[T; 3]],
+    ) -> Result<()> {
+        const { assert!(size_of::<T>() == 4) };
+        let stride = size_of::<[T; 3]>();
+        // SAFETY: the geometry is live. Embree allocates `stride · len` bytes and owns them; for vertices it adds the
+        // bytes up to the next multiple of 16 that its 16-byte loads of the last item read.
+        let target = unsafe {
+            embree4_sys::rtcSetNewGeometryBuffer(geometry.0, buffer, 0, format, stride as _, items.len() as _)
+        };
+        self.scene.device.check()?;
+        if target.is_null() {
+            return Err(Error::Embree(format!("no buffer for {} items of {stride} bytes", items.len())));
+        }
+        // SAFETY: `target` has `stride · len` bytes (above), aligned to 16, and is fresh, so that it does not overlap
+        // `items`; both hold three 4-byte values per item (const assert).
+        unsafe { std::ptr::copy_nonoverlapping(items.as_ptr(), target.cast::<[T; 3]>(), items.len()) };
+        Ok(())
+    }
+
+    /// Adds a user geometry, borrowed. Rays see it if `mask` and theirs share a bit. Returns the geometry's number.
+    ///
+    /// # Errors
+    /// `Invalid` if a primitive's bounds are not finite, inverted, or beyond 1.844e18 (Embree would drop it silently);
+    /// `Embree` if the library refuses.
+    pub fn user<G: UserGeometry + 'a>(&mut self, geometry: &'a G, mask: u32) -> Result<u32> {
+        // SAFETY: `Scene<'a>` borrows `geometry` for `'a`, so the pointer outlives every callback.
+        unsafe { self.register::<G>(geometry, mask) }
+    }
+
+    /// [`SceneBuilder::user`] for a geometry that the scene shares, so that it needs to borrow nothing.
+    ///
+    /// # Errors
+    /// As [`SceneBuilder::user`].
+    pub fn user_shared<G: UserGeometry + Send + 'a>(&mut self, geometry: Arc<G>, mask: u32) -> Result<u32> {
+        let pointer = Arc::as_ptr(&geometry);
+        // Kept first: should `register` fail half-way, the pointer is still good for the life of the scene.
+        self.scene._shared.push(geometry);
+        // SAFETY: `_shared` keeps the Arc until `Scene::drop` has released the scene, so the pointer outlives every
+        // callback.
+        unsafe { self.register::<G>(pointer, mask) }
+    }
+
+    /// Registers the trampolines of `G`, which stand inside: each is made for one type and stored beside the pointer
+    /// to a value of that type, and no call per ray is indirect but Embree's own.
+    ///
+    /// # Safety
+    /// `geometry` points to a `G` that lives, and is only shared, as long as the scene.
+    unsafe fn register<G: UserGeometry>(&mut self, geometry: *const G, mask: u32) -> Result<u32> {
+        /// # Safety
+        /// Embree calls it with the arguments and the user pointer that it was registered with.
+        unsafe extern "C" fn bounds<G: UserGeometry>(args: *const RTCBoundsFunctionArguments) {
+            // SAFETY: Embree passes a valid struct; `geometryUserPtr` is the `*const G` that `register` stored, live
+            // and shared by its contract; `bounds_o` is Embree's own room for one RTCBounds.
+            unsafe {
+                let args = &*args;
+                let (lower, upper) = (*args.geometryUserPtr.cast::<G>()).bounds(args.primID);
+                args.bounds_o.write(embree4_sys::RTCBounds {
+                    lower_x: lower[0],
+                    lower_y: lower[1],
+                    lower_z: lower[2],
+                    align0: 0.0,
+                    upper_x: upper[0],
+                    upper_y: upper[1],
+                    upper_z: upper[2],
+                    align1: 0.0,
+                });
+            }
+        }
+
+        /// # Safety
+        /// As `bounds`.
+        unsafe extern "C" fn intersect<G: UserGeometry>(args: *const RTCIntersectFunctionNArguments) {
+            // SAFETY: Embree passes a valid struct, the same in 4.0 to 4.4; `geometryUserPtr` is the `*const G` that
+            // `register` stored, live and shared by its contract.
+            let (args, data) = unsafe { (&*args, &*(*args).geometryUserPtr.cast::<G>()) };
+            let (n, base) = (args.N as usize, args.rayhit.cast::<u32>());
+            if n == 1 {
+                let ray = base.cast::<Ray>();
+                // SAFETY: with N = 1 `rayhit` is the 16-byte aligned ray and hit of a single-ray query, nobody else
+                // uses it during this call, and the shared reference ends with `intersect`.
+                let found = unsafe { data.intersect(args.primID, &*ray) };
+                if let Some(hit) = found {
+                    // SAFETY: as above.
+                    unsafe { accept(base, 1, 0, &hit, args.primID, args.geomID) };
+                }
+            } else if n == 16 && base.cast::<Ray16>().is_aligned() {
+                // SAFETY: `valid` has N entries.
+                let active = unsafe { active16(args.valid) };
+                let mut hits = UserHits16::ZERO;
+                // SAFETY: with N = 16 the rays are a Ray16 (alignment tested); otherwise as for N = 1.
+                let found =
+                    active & unsafe { data.intersect16(args.primID, active, &*base.cast::<Ray16>(), &mut hits) };
+                for lane in (0..16).filter(|lane| found >> lane & 1 == 1) {
+                    let hit = UserHit {
+                        t: hits.t[lane],
+                        u: hits.u[lane],
+                        v: hits.v[lane],
+                        normal: [hits.normal[0][lane], hits.normal[1][lane], hits.normal[2][lane]],
+                    };
+                    // SAFETY: `base` is a packet of 16 rays and hits, `lane` < 16.
+                    unsafe { accept(base, 16, lane, &hit, args.primID, args.geomID) };
+                }
+            } else {
+                for lane in 0..n {
+                    // SAFETY: `valid` has N entries, `base` is a packet of N rays and hits, `lane` < N.
+                    unsafe {
+                        if args.valid.add(lane).read() == 0 {
+                            continue;
+                        }
+                        if let Some(hit) = data.intersect(args.primID, &lane_of(base, n, lane)) {
+                            accept(base, n, lane, &hit, args.primID, args.geomID);
+                        }
+                    }
+                }
+            }
+        }
+
+        /// # Safety
+        /// As `bounds`.
+        unsafe extern "C" fn occluded<G: UserGeometry>(args: *const RTCOccludedFunctionNArguments) {
+            // SAFETY: as in `intersect`.
+            let (args, data) = unsafe { (&*args, &*(*args).geometryUserPtr.cast::<G>()) };
+            let (n, base) = (args.N as usize, args.ray.cast::<u32>());
+            if n == 1 {
+                let ray = base.cast::<Ray>();
+                // SAFETY: as in `intersect`, without a hit behind the ray.
+                unsafe {
+                    if data.occluded(args.primID, &*ray) {
+                        (&raw mut (*ray).tfar).write(f32::NEG_INFINITY);
+                    }
+                }
+            } else if n == 16 && base.cast::<Ray16>().is_aligned() {
+                // SAFETY: `valid` has N entries; with N = 16 the rays are a Ray16 (alignment tested).
+                unsafe {
+                    let active = active16(args.valid);
+                    let found = active & data.occluded16(args.primID, active, &*base.cast::<Ray16>());
+                    for lane in (0..16).filter(|lane| found >> lane & 1 == 1) {
+                        base.add(TFAR * 16 + lane).write(f32::NEG_INFINITY.to_bits());
+                    }
+                }
+            } else {
+                for lane in 0..n {
+                    // SAFETY: `valid` has N entries, `base` is a packet of N rays, `lane` < N.
+                    unsafe {
+                        if args.valid.add(lane).read() != 0 && data.occluded(args.primID, &lane_of(base, n, lane)) {
+                            base.add(TFAR * n + lane).write(f32::NEG_INFINITY.to_bits());
+                        }
+                    }
+                }
+            }
+        }
+
+        // SAFETY: the caller's `geometry` is live and shared.
+        let data = unsafe { &*geometry };
+        let count = data.len();
+        for prim in 0..count {
+            let (lower, upper) = data.bounds(prim);
+            if !(0..3).all(|a| lower[a] > -LARGE && lower[a] <= upper[a] && upper[a] < LARGE) {
+                return Err(Error::Invalid(format!(
+                    "user primitive {prim} has the bounds {lower:?} to {upper:?}: they must be finite, in order and below {LARGE:e}"
+                )));
+            }
+        }
+        let handle = Geometry::new(&self.scene.device, embree4_sys::RTCGeometryType::USER)?;
+        // SAFETY: the handle is live; the pointer is what the trampolines of the same `G` expect, and the caller
+        // promises that it outlives the scene. Embree never writes through it, and neither do they.
+        unsafe {
+            embree4_sys::rtcSetGeometryUserPrimitiveCount(handle.0, count);
+            embree4_sys::rtcSetGeometryUserData(handle.0, geometry.cast_mut().cast::<c_void>());
+            embree4_sys::rtcSetGeometryBoundsFunction(handle.0, Some(bounds::<G>), std::ptr::null_mut());
+            embree4_sys::rtcSetGeometryIntersectFunction(handle.0, Some(intersect::<G>));
+            embree4_sys::rtcSetGeometryOccludedFunction(handle.0, Some(occluded::<G>));
+        }
+        self.attach(handle, mask)
+    }
+
+    fn attach(&mut self, geometry: Geometry, mask: u32) -> Result<u32> {
+        // SAFETY: scene and geometry are live; the scene takes its own reference to the geometry.
+        let id = unsafe {
+            embree4_sys::rtcSetGeometryMask(geometry.0, mask);
+            embree4_sys::rtcSetGeometryBuildQuality(geometry.0, self.quality.raw());
+            embree4_sys::rtcCommitGeometry(geometry.0);
+            embree4_sys::rtcAttachGeometry(self.scene.handle, geometry.0)
+        };
+        self.scene.device.check()?;
+        Ok(id)
+    }
+
+    /// Builds the hierarchy.
+    ///
+    /// # Errors
+    /// `Embree` with what the library reported, such as a lack of memory.
+    pub fn commit(self) -> Result<Scene<'a>> {
+        let flags =
+            if self.robust { embree4_sys::RTCSceneFlags::ROBUST } else { embree4_sys::RTCSceneFlags::default() };
+        // SAFETY: the scene is live and nobody else has its handle. Bounds callbacks run now, on Embree's threads
+        // too: `G` is Sync.
+        unsafe {
+            embree4_sys::rtcSetSceneFlags(self.scene.handle, flags);
+            embree4_sys::rtcSetSceneBuildQuality(self.scene.handle, self.quality.raw());
+            embree4_sys::rtcCommitScene(self.scene.handle);
+        }
+        self.scene.device.check()?;
+        Ok(self.scene)
+    }
+}
+
+impl Scene<'_> {
+    /// Finds the nearest hit of one ray: writes it, and its distance into the ray's `tfar`. A miss changes nothing.
+    ///
+    /// The ray must be finite but for `tfar`; otherwise what it hits is not specified.
+    #[inline]
+    pub fn intersect1(&self, rayhit: &mut RayHit) {
+        // SAFETY: the scene is committed. `rayhit` is ours alone, 16-byte aligned and 96 bytes long, the most that
+        // any Embree from 4.0 to 4.4 (`Device::new` checked the version) reads or writes. NULL arguments: the
+        // defaults, by which user geometries run the callbacks they were registered with.
+        unsafe { raw::rtcIntersect1(self.handle, rayhit, std::ptr::null_mut()) }
+    }
+
+    /// Whether anything is hit. If so the ray's `tfar` becomes −∞.
+    ///
+    /// The ray must be finite but for `tfar`; otherwise what it hits is not specified.
+    #[inline]
+    #[must_use]
+    pub fn occluded1(&self, ray: &mut Ray) -> bool {
+        // SAFETY: as in `intersect1`; a ray without hit has had 48 bytes in every Embree 4.
+        unsafe { raw::rtcOccluded1(self.handle, ray, std::ptr::null_mut()) }
+        ray.tfar == f32::NEG_INFINITY
+    }
+
+    /// [`Scene::intersect1`] for the rays of `rayhit` that take part.
+    #[inline]
+    pub fn intersect16(&self, valid: &Valid16, rayhit: &mut RayHit16) {
+        // SAFETY: as in `intersect1`, with 1344 bytes; both structs are 64-byte aligned by their types.
+        unsafe { raw::rtcIntersect16(valid.as_ptr(), self.handle, rayhit, std::ptr::null_mut()) }
+    }
+
+    /// [`Scene::occluded1`] for the rays that take part: `tfar` of the occluded ones becomes −∞.
+    #[inline]
+    pub fn occluded16(&self, valid: &Valid16, rays: &mut Ray16) {
+        // SAFETY: as in `intersect16`, with 768 bytes.
+        unsafe { raw::rtcOccluded16(valid.as_ptr(), self.handle, rays, std::ptr::null_mut()) }
+    }
+}
+
+// A packet of N rays and hits is 12 + 8 (or 9) fields of N 32-bit words. The field numbers:
+const TNEAR: usize = std::mem::offset_of!(Ray, tnear) / 4;
+const TFAR: usize = std::mem::offset_of!(Ray, tfar) / 4;
+const HIT: usize = size_of::<Ray>() / 4;
+const NORMAL: usize = HIT + std::mem::offset_of!(Hit, normal) / 4;
+const U: usize = HIT + std::mem::offset_of!(Hit, u) / 4;
+const V: usize = HIT + std::mem::offset_of!(Hit, v) / 4;
+const PRIM: usize = HIT + std::mem::offset_of!(Hit, prim) / 4;
+const GEOMETRY: usize = HIT + std::mem::offset_of!(Hit, geometry) / 4;
+const INSTANCE: usize = HIT + std::mem::offset_of!(Hit, instance) / 4;
+
+/// Writes `hit` into lane `lane` of a packet of `n`, if it lies within the ray.
+///
+/// Only the fields that every Embree 4 has are touched: inside a callback the packet may be Embree's own copy, without
+/// the spare bytes of `Hit`.
+///
+/// # Safety
+/// `base` points to a packet of `n` rays and hits that nobody else uses; `lane < n`.
+#[inline]
+unsafe fn accept(base: *mut u32, n: usize, lane: usize, hit: &UserHit, prim: u32, geometry: u32) {
+    // SAFETY: the fields are within the packet (their numbers are below 20) and words are 4-byte aligned in it.
+    unsafe {
+        let word = |field: usize| base.add(field * n + lane);
+        let (tnear, tfar) = (f32::from_bits(word(TNEAR).read()), f32::from_bits(word(TFAR).read()));
+        // Also refuses NaN, which would end the traversal in an unknown state.
+        if !(hit.t >= tnear && hit.t <= tfar) {
+            return;
+        }
+        word(TFAR).write(hit.t.to_bits());
+        for (a, x) in hit.normal.iter().enumerate() {
+            word(NORMAL + a).write(x.to_bits());
+        }
+        word(U).write(hit.u.to_bits());
+        word(V).write(hit.v.to_bits());
+        word(PRIM).write(prim);
+        word(GEOMETRY).write(geometry);
+        word(INSTANCE).write(INVALID_ID);
+    }
+}
+
+/// Ray `lane` of a packet of `n`.
+///
+/// # Safety
+/// `base` points to a packet of `n` rays; `lane < n`.
+#[inline]
+unsafe fn lane_of(base: *const u32, n: usize, lane: usize) -> Ray {
+    // SAFETY: a ray has 12 fields, all within the packet; Ray is those twelve words, and any bits are valid in them.
+    unsafe {
+        let words: [u32; 12] = std::array::from_fn(|field| base.add(field * n + lane).read());
+        std::mem::transmute::<[u32; 12], Ray>(words)
+    }
+}
+
+/// Bit i is set if `valid[i]` is not 0.
+///
+/// # Safety
+/// `valid` points to 16 values.
+#[inline]
+unsafe fn active16(valid: *const i32) -> u16 {
+    // SAFETY: the caller's promise; i32 alignment is Embree's.
+    let valid = unsafe { &*valid.cast::<[i32; 16]>() };
+    valid.iter().enumerate().fold(0, |bits, (i, &v)| bits | u16::from(v != 0) << i)
+}

@@ -1,0 +1,341 @@
+//! Photons in the flattened scene: emission over luminaires and isovalues, scattering inside one hyperplane, energy
+//! kept to the last bit. [BB09 §2.3; Jensen01]
+
+use crate::flattened::{Departure, Side, Target};
+use crate::rng::{Rng, Sobol, Stage};
+use crate::scene::Scene;
+use crate::tracer::Tracer;
+use crate::warp::{Frame, cosine_hemisphere};
+use glam::{DVec3, Vec3};
+use rayon::prelude::*;
+use std::f64::consts::PI;
+use std::ops::AddAssign;
+
+/// A photon that landed on a level set.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SurfacePhoton {
+    /// Where, local frame.
+    pub position: Vec3,
+    /// Height c of its hyperplane, [0, 1].
+    pub isovalue: f32,
+    /// Power × isovalue per channel, before reflection.
+    pub power: Vec3,
+    /// Reflections before this landing: 0 is direct light.
+    pub bounces: u16,
+    /// The side it landed on.
+    pub side: Side,
+}
+
+/// A photon that landed on a textured flat: a polygon or a cap.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FlatPhoton {
+    /// Which: polygons first, then the six caps.
+    pub flat: u32,
+    /// Texture coordinates and isovalue, [0, 1]³.
+    pub uvc: [f32; 3],
+    /// Power × isovalue per channel, before reflection.
+    pub power: Vec3,
+    /// Reflections before this landing.
+    pub bounces: u16,
+}
+
+/// Isovalue bins of the energy balance.
+pub const ENERGY_BINS: usize = 16;
+
+/// Where emitted power × isovalue went, summed over channels: emitted = absorbed + escaped + terminated.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Energy {
+    /// Emitted.
+    pub emitted: f64,
+    /// Absorbed by surfaces (roulette losses included).
+    pub absorbed: f64,
+    /// Left the scene.
+    pub escaped: f64,
+    /// Cut off by the bounce limit, or landed where ∇h vanishes.
+    pub terminated: f64,
+}
+
+impl Energy {
+    /// |emitted − absorbed − escaped − terminated| / emitted; 0 if nothing was emitted.
+    pub fn imbalance(&self) -> f64 {
+        if self.emitted == 0.0 {
+            return 0.0;
+        }
+        (self.emitted - self.absorbed - self.escaped - self.terminated).abs() / self.emitted
+    }
+}
+
+impl AddAssign for Energy {
+    fn add_assign(&mut self, o: Self) {
+        self.emitted += o.emitted;
+        self.absorbed += o.absorbed;
+        self.escaped += o.escaped;
+        self.terminated += o.terminated;
+    }
+}
+
+/// What tracing photons gave.
+#[derive(Clone, Debug, Default)]
+pub struct Photons {
+    /// Landings on level sets.
+    pub surface: Vec<SurfacePhoton>,
+    /// Landings on polygons and caps.
+    pub flat: Vec<FlatPhoton>,
+    /// Energy per isovalue bin.
+    pub energy: [Energy; ENERGY_BINS],
+    /// Photons emitted.
+    pub emitted: u64,
+    /// Rays traced.
+    pub rays: u64,
+    /// Landings where ∇h vanishes, which were absorbed.
+    pub flat_gradient: u64,
+}
+
+impl Photons {
+    /// The energy of all bins.
+    pub fn total_energy(&self) -> Energy {
+        let mut total = Energy::default();
+        self.energy.iter().for_each(|&e| total += e);
+        total
+    }
+
+    /// Landings of all kinds.
+    pub fn stored(&self) -> u64 {
+        (self.surface.len() + self.flat.len()) as u64
+    }
+}
+
+/// How photons are traced.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PhotonSettings {
+    /// Photons to emit.
+    pub count: u64,
+    /// Reflections after which a path is cut; `u16::MAX` leaves it to Russian roulette.
+    pub max_bounces: u16,
+    /// Seed of the run.
+    pub seed: u64,
+    /// Emit all photons at this isovalue instead of over the whole sweep: the ordinary 3D photon map of one level set.
+    pub fixed_isovalue: Option<f32>,
+}
+
+/// Photons per task: fixed, so that sums are made in the same order on any number of threads.
+const CHUNK: u64 = 1 << 14;
+
+/// One source of photons with its total power × isovalue per channel.
+enum Source {
+    /// A luminaire, by polygon number.
+    Luminaire(u32, DVec3),
+    /// The emitting level sets.
+    Field(DVec3),
+}
+
+impl Source {
+    fn power(&self) -> DVec3 {
+        match self {
+            Source::Luminaire(_, p) | Source::Field(p) => *p,
+        }
+    }
+}
+
+/// Emits and traces `settings.count` photons. `tick` is called with the number of photons done, from any thread;
+/// returning false stops the work early with what is done.
+pub fn trace_photons<T: Tracer>(
+    scene: &Scene,
+    tracer: &T,
+    settings: &PhotonSettings,
+    tick: &(dyn Fn(u64) -> bool + Sync),
+) -> Photons {
+    let sources = sources(scene);
+    let total: f64 = sources.iter().map(|s| s.power().max_element()).sum();
+    if total == 0.0 || settings.count == 0 {
+        return Photons::default();
+    }
+    let chunks: Vec<Photons> = (0..settings.count.div_ceil(CHUNK) as usize)
+        .into_par_iter()
+        .map(|chunk| {
+            let mut out = Photons::default();
+            let range = chunk as u64 * CHUNK..((chunk as u64 + 1) * CHUNK).min(settings.count);
+            let n = range.end - range.start;
+            if tick(0) {
+                range.for_each(|i| trace_photon(scene, tracer, settings, &sources, total, i, &mut out));
+                tick(n);
+            }
+            out
+        })
+        .collect();
+    let mut all = Photons::default();
+    all.surface.reserve_exact(chunks.iter().map(|c| c.surface.len()).sum());
+    all.flat.reserve_exact(chunks.iter().map(|c| c.flat.len()).sum());
+    for c in chunks {
+        all.surface.extend_from_slice(&c.surface);
+        all.flat.extend_from_slice(&c.flat);
+        all.emitted += c.emitted;
+        all.rays += c.rays;
+        all.flat_gradient += c.flat_gradient;
+        all.energy.iter_mut().zip(c.energy).for_each(|(a, b)| *a += b);
+    }
+    all
+}
+
+/// Luminaires at flux Φ = π L_e A per hyperplane (times the sweep's length 1), and the level sets if they emit.
+fn sources(scene: &Scene) -> Vec<Source> {
+    let mut sources: Vec<Source> = scene
+        .luminaires()
+        .iter()
+        .map(|&l| {
+            let p = &scene.polygons()[l as usize];
+            Source::Luminaire(l, PI * p.area() * p.emission)
+        })
+        .collect();
+    if scene.surface.emission != DVec3::ZERO {
+        // Both sides emit π L_e |∇h| per volume; |∇h| multiplies the single photon. The mean slope of the sweep across
+        // Ω's diagonal only balances this source against luminaires.
+        let lattice = scene.lattice();
+        let diagonal = (lattice.axes() * lattice.far()).length();
+        sources.push(Source::Field(2.0 * PI * scene.surface.emission * lattice.world_volume() / diagonal));
+    }
+    sources
+}
+
+/// A photon about to fly.
+struct Flight {
+    origin: Vec3,
+    direction: DVec3,
+    isovalue: f32,
+    departure: Departure,
+    power: DVec3,
+}
+
+#[allow(clippy::cast_possible_truncation, reason = "storage is f32; indices below 2³²")]
+fn trace_photon<T: Tracer>(
+    scene: &Scene,
+    tracer: &T,
+    settings: &PhotonSettings,
+    sources: &[Source],
+    total: f64,
+    index: u64,
+    out: &mut Photons,
+) {
+    let mut rng = Rng::stream(settings.seed, Stage::Photon, index);
+    out.emitted += 1;
+    let Some(mut photon) = emit(scene, settings, sources, total, index) else { return };
+    let lattice = scene.lattice();
+    let bin = ((photon.isovalue * ENERGY_BINS as f32) as usize).min(ENERGY_BINS - 1);
+    let energy = &mut out.energy[bin];
+    energy.emitted += photon.power.element_sum();
+    for bounces in 0..=u16::MAX {
+        let ray = scene.ray(photon.origin, photon.direction, photon.isovalue, photon.departure);
+        out.rays += 1;
+        let Some(hit) = tracer.intersect(&ray) else {
+            energy.escaped += photon.power.element_sum();
+            return;
+        };
+        let local = ray.at(hit.t);
+        let position = local.as_vec3();
+        let mut store_flat = |flat: u32, [u, v]: [f64; 2]| {
+            let uvc = [u as f32, v as f32, photon.isovalue];
+            out.flat.push(FlatPhoton { flat, uvc, power: photon.power.as_vec3(), bounces });
+        };
+        let (albedo, normal, departure) = match hit.target {
+            Target::Surface(side) => {
+                out.surface.push(SurfacePhoton {
+                    position,
+                    isovalue: photon.isovalue,
+                    power: photon.power.as_vec3(),
+                    bounces,
+                    side,
+                });
+                (scene.surface.albedo, scene.normal(position.as_dvec3(), side), Departure::Surface(side))
+            }
+            Target::Cap(face, side) => {
+                store_flat(scene.polygons().len() as u32 + u32::from(face), crate::flat::face_texture(scene, face, local));
+                let n = scene.face_normal(face);
+                let n = if side == Side::Lower { n } else { -n };
+                (scene.surface.albedo, Some(n), Departure::Free)
+            }
+            Target::Polygon(id) => {
+                let p = &scene.polygons()[id as usize];
+                if p.albedo != DVec3::ZERO {
+                    store_flat(id, p.texture(lattice.to_world(local)));
+                }
+                (p.albedo, Some(p.normal()), Departure::Polygon(id))
+            }
+        };
+        let Some(normal) = normal else {
+            out.flat_gradient += 1;
+            energy.terminated += photon.power.element_sum();
+            return;
+        };
+        // Russian roulette keeps the largest channel's power. [Arvo90]
+        let reflected = photon.power * albedo;
+        let survival = (reflected.max_element() / photon.power.max_element()).min(1.0);
+        if rng.unit() >= survival {
+            energy.absorbed += photon.power.element_sum();
+            return;
+        }
+        let next = reflected / survival;
+        energy.absorbed += (photon.power - next).element_sum();
+        if bounces >= settings.max_bounces {
+            energy.terminated += next.element_sum();
+            return;
+        }
+        let direction = Frame::new(normal).to_world(cosine_hemisphere(rng.unit2()));
+        photon = Flight { origin: position, direction, isovalue: photon.isovalue, departure, power: next };
+    }
+}
+
+/// Photon `index`: source by power, point uniform over the area, direction by the cosine, isovalue uniform over the
+/// sweep. All from one scrambled Sobol point, so that any power-of-two prefix is stratified in isovalue, source, place
+/// and direction.
+#[allow(clippy::cast_possible_truncation, reason = "storage is f32; indices below 2³²")]
+fn emit(scene: &Scene, settings: &PhotonSettings, sources: &[Source], total: f64, index: u64) -> Option<Flight> {
+    let set = Sobol::set(settings.seed, Stage::Photon, index >> 32);
+    let i = index as u32;
+    let mut pick = set.coordinate(i, 5) * total;
+    let last = sources.len() - 1;
+    let source = sources
+        .iter()
+        .enumerate()
+        .find(|(k, s)| {
+            pick -= s.power().max_element();
+            pick < 0.0 || *k == last
+        })
+        .map(|(_, s)| s)?;
+    let probability = source.power().max_element() / total;
+    let share = source.power() / (probability * settings.count as f64);
+    let direction = cosine_hemisphere(set.point2(i, 3));
+    match *source {
+        Source::Luminaire(id, _) => {
+            let isovalue = settings.fixed_isovalue.unwrap_or(set.coordinate(i, 0) as f32);
+            let p = &scene.polygons()[id as usize];
+            let y = p.sample(set.point2(i, 1));
+            Some(Flight {
+                origin: scene.lattice().to_index(y).as_vec3(),
+                direction: Frame::new(p.normal()).to_world(direction),
+                isovalue,
+                departure: Departure::Polygon(id),
+                power: share,
+            })
+        }
+        Source::Field(_) => {
+            let [v, w] = set.point2(i, 1);
+            let origin = (scene.lattice().far() * DVec3::new(set.coordinate(i, 0), v, w)).as_vec3();
+            let h = scene.field.value(origin.as_dvec3());
+            if !(0.0..=1.0).contains(&h) {
+                return None;
+            }
+            // Half of the photons leave into each side; the low bits of an independent stream decide.
+            let side = if Rng::stream(settings.seed, Stage::Photon, !index).bits() & 1 == 0 { Side::Lower } else { Side::Higher };
+            let normal = scene.normal(origin.as_dvec3(), side)?;
+            let lattice = scene.lattice();
+            let diagonal = (lattice.axes() * lattice.far()).length();
+            Some(Flight {
+                origin,
+                direction: Frame::new(normal).to_world(direction),
+                isovalue: h as f32,
+                departure: Departure::Surface(side),
+                power: share * scene.field.gradient(origin.as_dvec3()).length() * diagonal,
+            })
+        }
+    }
+}
