@@ -25,7 +25,7 @@ unsafe impl Sync for Inner {}
 impl Device {
     /// Opens Embree with `threads` threads for building scenes (0: one per core). Queries run on their callers' threads.
     ///
-    /// The number is a property of the process, not of the device: the first device's counts while it lives.
+    /// The library shares its threads between the devices of a process: the largest number among those alive counts.
     ///
     /// # Errors
     /// `Embree` if the library is not a 4.x, or lacks triangles, user geometry or ray masks, or cannot start (an

@@ -1,0 +1,47 @@
+# isolume is a plain cargo package; this file gets its two native libraries and names the common errands.
+
+.PHONY: all deps demo test check bench doc clean distclean
+
+# `make deps` writes third_party/env.sh only if libclang had to be unpacked there.
+CARGO = if [ -f third_party/env.sh ]; then . third_party/env.sh; fi; cargo
+
+all: deps
+	$(CARGO) build --release
+
+# Embree 4 and libclang: installed ones, or else fetched (see scripts/get-deps). EMBREE_DIR=... names your own Embree.
+deps:
+	@scripts/get-deps
+
+# A first picture: bakes the bumps scene and renders one isosurface of it.
+demo: deps
+	$(CARGO) build --release
+	@mkdir -p demo
+	$(CARGO) run --release --quiet -- bake scenes/cornell-bumps.toml -o demo/bumps.vti --preset preview
+	$(CARGO) run --release --quiet -- render demo/bumps.vti --isovalue 47 -o demo/bumps.png
+	@echo
+	@echo "demo/bumps.vti  the volume with its illumination, for every isovalue: open it in ParaView, or render it again:"
+	@echo "                cargo run --release -- render demo/bumps.vti --isovalue 60 -o demo/other.png"
+	@echo "demo/bumps.png  the isosurface at 47"
+
+test: deps
+	$(CARGO) test
+
+# What a change must pass besides the tests.
+check: deps
+	cargo fmt --check
+	$(CARGO) clippy --all-targets -- -D warnings
+	export RUSTDOCFLAGS='-D warnings'; $(CARGO) doc --no-deps
+
+bench: deps
+	$(CARGO) bench
+
+doc: deps
+	$(CARGO) doc --no-deps
+
+clean:
+	cargo clean
+	rm -rf demo
+
+# Also what `make deps` fetched.
+distclean: clean
+	rm -rf third_party
