@@ -9,3 +9,4 @@
 pub mod error;
 pub mod volume;
 pub mod isosurface;
+pub mod export;
