@@ -3,6 +3,7 @@
 
 pub mod atomic;
 pub mod obj;
+pub mod picture;
 pub mod ply;
 
 use crate::error::{Error, Result};
