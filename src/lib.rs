@@ -12,19 +12,26 @@ pub mod rng;
 pub mod stats;
 pub mod warp;
 pub mod cubic;
+pub mod nearest;
 // Samples, value, gradient, range.
 pub mod volume;
 pub mod field;
-// Rays of R⁴; one hexahedron; the min/max hierarchy and its walk.
+// Rays of R⁴; one hexahedron; the min/max hierarchy and its walk; triangle meshes of L(h, c).
 pub mod flattened;
 pub mod cell;
 pub mod pyramid;
+pub mod isosurface;
 // What a hyperplane contains.
 pub mod brdf;
 pub mod polygon;
 pub mod luminaire;
 pub mod scene;
+pub mod flat;
 // The one seam: nearest hit and visibility.
 pub mod tracer;
 #[allow(unsafe_code, reason = "FFI to Embree: the one place in this crate")]
 pub mod embree;
+// Light transport, generic over the tracer.
+pub mod photon;
+// Products.
+pub mod export;

@@ -1,0 +1,55 @@
+//! Writers of what users take away: textured meshes and pictures. Every file appears under its name only when it is
+//! complete.
+
+pub mod atomic;
+pub mod obj;
+pub mod picture;
+pub mod ply;
+
+use crate::error::{Error, Result};
+use glam::{DVec3, Vec3};
+use std::path::Path;
+
+/// A mesh to be written, in world units. All vertex arrays are in the order of `positions`.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Mesh<'a> {
+    /// Vertices in world coordinates.
+    pub positions: &'a [DVec3],
+    /// Triangles as indices into `positions`, counter-clockwise seen from outside.
+    pub triangles: &'a [[u32; 3]],
+    /// Unit normals at the vertices, pointing outside. Written as they are.
+    pub normals: Option<&'a [Vec3]>,
+    /// Display colours at the vertices, sRGB-encoded.
+    pub colours: Option<&'a [[u8; 3]]>,
+    /// Named values at the vertices, such as `radiance_r`. Formats that cannot hold them leave them out.
+    pub properties: &'a [(&'a str, &'a [f32])],
+}
+
+impl Mesh<'_> {
+    /// Whether the arrays fit each other, before anything is written.
+    fn check(&self, path: &Path) -> Result<()> {
+        let n = self.positions.len();
+        let lengths = [("normals", self.normals.map(<[_]>::len)), ("colours", self.colours.map(<[_]>::len))];
+        let named = self.properties.iter().map(|(name, values)| (*name, Some(values.len())));
+        for (name, length) in lengths.into_iter().chain(named) {
+            if let Some(length) = length
+                && length != n
+            {
+                return Err(Error::invalid(path, format!("mesh of {n} vertices with {length} values of {name}")));
+            }
+        }
+        if n > i32::MAX as usize || self.triangles.len() > i32::MAX as usize {
+            return Err(Error::not_supported(
+                path,
+                format!("mesh of {n} vertices and {} triangles: readers count to {}", self.triangles.len(), i32::MAX),
+            ));
+        }
+        if let Some(t) = self.triangles.iter().position(|t| t.iter().any(|v| *v as usize >= n)) {
+            return Err(Error::invalid(path, format!("triangle {t} names {:?} of {n} vertices", self.triangles[t])));
+        }
+        if let Some(v) = self.positions.iter().position(|p| !p.as_vec3().is_finite()) {
+            return Err(Error::invalid(path, format!("vertex {v} stands at {}, beyond f32", self.positions[v])));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,180 @@
+//! Files that appear only when they are complete.
+
+use crate::error::{Error, Result};
+use std::ffi::OsString;
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, BufWriter, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering};
+
+/// A file under a temporary name beside its own; [`AtomicFile::commit`] renames it.
+///
+/// Whoever reads the file's own name sees the old content or the complete new one, never a part. Dropped without
+/// commit, the temporary file is removed and the old content stays; only a killed process leaves it behind (hidden, named
+/// `.<name>.<process>-<count>.tmp`). A symbolic link is followed: the file it names is replaced, not the link.
+#[derive(Debug)]
+pub struct AtomicFile {
+    /// `None` once closed.
+    file: Option<BufWriter<File>>,
+    temporary: PathBuf,
+    target: PathBuf,
+}
+
+impl AtomicFile {
+    /// Opens a temporary file beside `path`: an unwritable folder shows now, before hours of work.
+    ///
+    /// # Errors
+    /// `Io` if the folder does not exist or cannot be written; `Invalid` if `path` has no file name or names something
+    /// other than a regular file (a folder, a device), which a rename would replace.
+    pub fn create(path: impl AsRef<Path>) -> Result<Self> {
+        static COUNT: AtomicU32 = AtomicU32::new(0);
+        let path = path.as_ref();
+        let target = match fs::metadata(path) {
+            Ok(found) if found.is_file() => fs::canonicalize(path).map_err(|e| Error::io(path, e))?,
+            Ok(found) => {
+                let what = if found.is_dir() { "a folder" } else { "no regular file" };
+                return Err(Error::invalid(path, format!("is {what}; give the name of a file to write")));
+            }
+            Err(_) => path.to_path_buf(),
+        };
+        let Some(name) = target.file_name() else {
+            return Err(Error::invalid(path, "has no file name; give the name of a file to write"));
+        };
+        // A name of its own per process and call, and create_new: two writers never share a temporary file.
+        loop {
+            let mut hidden = OsString::from(".");
+            hidden.push(name);
+            hidden.push(format!(".{}-{}.tmp", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed)));
+            let temporary = target.with_file_name(hidden);
+            match OpenOptions::new().write(true).create_new(true).open(&temporary) {
+                Ok(file) => return Ok(Self { file: Some(BufWriter::new(file)), temporary, target }),
+                Err(e) if e.kind() == io::ErrorKind::AlreadyExists => {} // left by a killed process of the same number
+                Err(e) => return Err(Error::io(path, e)),
+            }
+        }
+    }
+
+    /// Flushes to the disk, and gives the file its name.
+    ///
+    /// # Errors
+    /// `Io`, for example on a full disk; the temporary file is then removed and the old content stays.
+    pub fn commit(mut self) -> Result<()> {
+        let mut finish = || -> io::Result<()> {
+            let file = self.open()?;
+            file.flush()?;
+            // Without this a power cut soon after could leave the new name with the content of nothing.
+            file.get_ref().sync_all()
+        };
+        let finished = finish();
+        self.close();
+        finished.and_then(|()| fs::rename(&self.temporary, &self.target)).map_err(|e| Error::io(&self.target, e))?;
+        self.temporary.clear();
+        Ok(())
+    }
+
+    /// Commits what `written` says was written well; its failure becomes an [`Error::Io`] at the file.
+    pub(super) fn finish(self, written: io::Result<()>) -> Result<()> {
+        written.map_err(|e| Error::io(&self.target, e))?;
+        self.commit()
+    }
+
+    fn open(&mut self) -> io::Result<&mut BufWriter<File>> {
+        self.file.as_mut().ok_or_else(|| io::Error::other("the file is closed"))
+    }
+
+    /// Closes without writing what is still buffered: all of it is written, or the file is about to be removed.
+    fn close(&mut self) {
+        self.file.take().map(BufWriter::into_parts);
+    }
+}
+
+impl Write for AtomicFile {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.open()?.write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.open()?.flush()
+    }
+}
+
+impl Seek for AtomicFile {
+    fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
+        self.open()?.seek(to)
+    }
+}
+
+impl Drop for AtomicFile {
+    fn drop(&mut self) {
+        self.close();
+        if !self.temporary.as_os_str().is_empty() {
+            // Nobody is left to tell, and a stray temporary file does no harm.
+            let _ = fs::remove_file(&self.temporary);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn entries(folder: &Path) -> Vec<OsString> {
+        let mut names: Vec<_> = fs::read_dir(folder).unwrap().map(|e| e.unwrap().file_name()).collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn old_content_stays_until_commit() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.bin");
+        fs::write(&path, "old").unwrap();
+        let mut file = AtomicFile::create(&path).unwrap();
+        file.write_all(b"newer").unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"old");
+        assert_eq!(entries(folder.path()).len(), 2);
+        file.commit().unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"newer");
+        assert_eq!(entries(folder.path()), ["a.bin"]);
+    }
+
+    #[test]
+    fn dropped_files_leave_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut file = AtomicFile::create(folder.path().join("a.bin")).unwrap();
+        file.write_all(b"half").unwrap();
+        let second = AtomicFile::create(folder.path().join("a.bin")).unwrap();
+        assert_eq!(entries(folder.path()).len(), 2, "two writers, two files");
+        drop((file, second));
+        assert!(entries(folder.path()).is_empty());
+        let failed =
+            AtomicFile::create(folder.path().join("a.bin")).unwrap().finish(Err(io::Error::other("disk full")));
+        assert!(failed.unwrap_err().to_string().contains("a.bin: disk full"));
+        assert!(entries(folder.path()).is_empty());
+    }
+
+    #[test]
+    fn wrong_targets_are_refused_at_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let message = |path: &Path| AtomicFile::create(path).unwrap_err().to_string();
+        assert!(message(folder.path()).contains("is a folder"));
+        assert!(message(&folder.path().join("none").join("a.ply")).contains("none"));
+        assert!(message(Path::new("")).contains("no file name"));
+        #[cfg(unix)]
+        assert!(message(Path::new("/dev/null")).contains("no regular file"));
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn links_are_followed() {
+        let folder = tempfile::tempdir().unwrap();
+        let (real, link) = (folder.path().join("real"), folder.path().join("link"));
+        fs::write(&real, "old").unwrap();
+        std::os::unix::fs::symlink(&real, &link).unwrap();
+        let mut file = AtomicFile::create(&link).unwrap();
+        file.write_all(b"new").unwrap();
+        file.commit().unwrap();
+        assert!(fs::symlink_metadata(&link).unwrap().is_symlink());
+        assert_eq!(fs::read(&real).unwrap(), b"new");
+    }
+}
