@@ -248,7 +248,10 @@ fn trace_photon<T: Tracer>(
                 (scene.surface.albedo, scene.normal(position.as_dvec3(), side), Departure::Surface(side))
             }
             Target::Cap(face, side) => {
-                store_flat(scene.polygons().len() as u32 + u32::from(face), crate::flat::face_texture(scene, face, local));
+                store_flat(
+                    scene.polygons().len() as u32 + u32::from(face),
+                    crate::flat::face_texture(scene, face, local),
+                );
                 let n = scene.face_normal(face);
                 let n = if side == Side::Lower { n } else { -n };
                 (scene.surface.albedo, Some(n), Departure::Free)
@@ -325,7 +328,11 @@ fn emit(scene: &Scene, settings: &PhotonSettings, sources: &[Source], total: f64
                 return None;
             }
             // Half of the photons leave into each side; the low bits of an independent stream decide.
-            let side = if Rng::stream(settings.seed, Stage::Photon, !index).bits() & 1 == 0 { Side::Lower } else { Side::Higher };
+            let side = if Rng::stream(settings.seed, Stage::Photon, !index).bits() & 1 == 0 {
+                Side::Lower
+            } else {
+                Side::Higher
+            };
             let normal = scene.normal(origin.as_dvec3(), side)?;
             let lattice = scene.lattice();
             let diagonal = (lattice.axes() * lattice.far()).length();

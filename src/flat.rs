@@ -1,0 +1,168 @@
+//! Flats: everything planar that holds a (u, v, isovalue) texture of light – walls, luminaires' fronts, and the caps of
+//! Ω's faces. Flat numbers are polygon numbers, then six caps (axis + 3 · far end).
+
+use crate::flattened::Departure;
+use crate::scene::{Boundary, Scene};
+use glam::DVec3;
+
+/// A flat's place and material in the world.
+#[derive(Clone, Copy, Debug)]
+pub struct Flat {
+    corner: DVec3,
+    edges: [DVec3; 2],
+    /// Unit normal of its lit side.
+    pub normal: DVec3,
+    /// Diffuse reflectance.
+    pub albedo: DVec3,
+    /// What rays from it start on.
+    pub departure: Departure,
+}
+
+/// Number of flats of a scene, caps included.
+pub fn count(scene: &Scene) -> usize {
+    scene.polygons().len() + 6
+}
+
+/// Flat number `number` of `scene`; `None` for caps of an open boundary.
+pub fn flat(scene: &Scene, number: usize) -> Option<Flat> {
+    if let Some(p) = scene.polygons().get(number) {
+        let id = u32::try_from(number).expect("scenes hold fewer than 2¹⁶ polygons");
+        return Some(Flat {
+            corner: p.at([0.0, 0.0]),
+            edges: p.texture_edges(),
+            normal: p.normal(),
+            albedo: p.albedo,
+            departure: Departure::Polygon(id),
+        });
+    }
+    if scene.boundary == Boundary::Open {
+        return None;
+    }
+    let face = u8::try_from(number - scene.polygons().len()).expect("six caps");
+    let (lattice, a) = (scene.lattice(), usize::from(face % 3));
+    let far = lattice.far();
+    let mut corner = DVec3::ZERO;
+    if face >= 3 {
+        corner[a] = far[a];
+    }
+    let edge = |b: usize| lattice.axes().col(b) * far[b];
+    Some(Flat {
+        corner: lattice.to_world(corner),
+        edges: [edge((a + 1) % 3), edge((a + 2) % 3)],
+        normal: scene.face_normal(face),
+        albedo: scene.surface.albedo,
+        departure: Departure::Free,
+    })
+}
+
+impl Flat {
+    /// World position of texture coordinates.
+    #[inline]
+    pub fn at(&self, [u, v]: [f64; 2]) -> DVec3 {
+        self.corner + u * self.edges[0] + v * self.edges[1]
+    }
+
+    /// World area of the texture's parallelogram.
+    pub fn area(&self) -> f64 {
+        self.edges[0].cross(self.edges[1]).length()
+    }
+
+    /// World lengths of u and v.
+    pub fn lengths(&self) -> [f64; 2] {
+        self.edges.map(DVec3::length)
+    }
+}
+
+/// Texture coordinates on a face of Ω of local `p`: the two other axes in cyclic order, scaled to [0, 1].
+#[inline]
+pub fn face_texture(scene: &Scene, face: u8, p: DVec3) -> [f64; 2] {
+    let far = scene.lattice().far();
+    let a = usize::from(face % 3);
+    let (b, c) = ((a + 1) % 3, (a + 2) % 3);
+    [p[b] / far[b], p[c] / far[c]]
+}
+
+/// Light over (u, v, c), at texel centres, u fastest.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FlatTexture {
+    /// Texels along u, v and the isovalue.
+    pub dims: [usize; 3],
+    /// RGB per texel.
+    pub texels: Vec<[f32; 3]>,
+}
+
+impl FlatTexture {
+    /// A black texture.
+    pub fn black(dims: [usize; 3]) -> Self {
+        Self { dims, texels: vec![[0.0; 3]; dims.iter().product()] }
+    }
+
+    /// Texel-centred trilinear lookup at (u, v, c) ∈ [0, 1]³, clamped at the borders.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the texture")]
+    pub fn lookup(&self, uvc: [f64; 3]) -> DVec3 {
+        let mut base = [0usize; 3];
+        let mut frac = [0f64; 3];
+        for a in 0..3 {
+            let last = self.dims[a] - 1;
+            let x = (uvc[a] * self.dims[a] as f64 - 0.5).clamp(0.0, last as f64);
+            base[a] = (x as usize).min(last.saturating_sub(1));
+            frac[a] = x - base[a] as f64;
+        }
+        let mut sum = DVec3::ZERO;
+        for corner in 0..8usize {
+            let mut w = 1.0;
+            let mut at = [0usize; 3];
+            for a in 0..3 {
+                let bit = corner >> a & 1;
+                w *= if bit == 1 { frac[a] } else { 1.0 - frac[a] };
+                at[a] = (base[a] + bit).min(self.dims[a] - 1);
+            }
+            if w > 0.0 {
+                let t = self.texels[(at[2] * self.dims[1] + at[1]) * self.dims[0] + at[0]];
+                sum += w * DVec3::from_array(t.map(f64::from));
+            }
+        }
+        sum
+    }
+
+    /// Texture coordinates of the centre of texel `index`.
+    pub fn centre(&self, index: usize) -> [f64; 3] {
+        let [nu, nv, nc] = self.dims;
+        let ijk = [index % nu, index / nu % nv, index / (nu * nv)];
+        let dims = [nu, nv, nc];
+        std::array::from_fn(|a| (ijk[a] as f64 + 0.5) / dims[a] as f64)
+    }
+
+    /// The texel that holds (u, v, c).
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the texture")]
+    pub fn texel(&self, uvc: [f32; 3]) -> usize {
+        let i: [usize; 3] = std::array::from_fn(|a| ((uvc[a] * self.dims[a] as f32) as usize).min(self.dims[a] - 1));
+        (i[2] * self.dims[1] + i[1]) * self.dims[0] + i[0]
+    }
+
+    /// Texels along u and v for about `across` along the longer edge of a flat of the given edge lengths.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few hundred at most")]
+    pub fn resolution(lengths: [f64; 2], across: usize, isovalues: usize) -> [usize; 3] {
+        let longest = lengths[0].max(lengths[1]);
+        let n = |l: f64| ((l / longest * across as f64).round() as usize).max(2);
+        [n(lengths[0]), n(lengths[1]), isovalues]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lookup_reproduces_linear_functions_between_centres() {
+        let mut t = FlatTexture::black([5, 4, 3]);
+        for i in 0..t.texels.len() {
+            let [u, v, c] = t.centre(i);
+            t.texels[i] = [u as f32, (2.0 * v + c) as f32, 1.0];
+            assert_eq!(t.texel([u as f32, v as f32, c as f32]), i);
+        }
+        let got = t.lookup([0.37, 0.61, 0.44]);
+        assert!((got - DVec3::new(0.37, 1.66, 1.0)).length() < 1e-6, "{got}");
+        assert!((t.lookup([0.0, 0.0, 0.0]).x - 0.1).abs() < 1e-7, "clamped to the first centre");
+    }
+}
