@@ -177,7 +177,7 @@ impl Sobol {
             ^ t[2][(n >> 16 & 255) as usize]
             ^ t[3][(n >> 24) as usize];
         #[allow(clippy::cast_possible_truncation, reason = "folds 64 bits to 32")]
-        let seed = mix(u64::from(self.seed) << 8 | dimension as u64 + 1) as u32;
+        let seed = mix((u64::from(self.seed) << 8) | (dimension as u64 + 1)) as u32;
         // 2⁻³³ centres the point in its cell, so that 0 and 1 are never drawn.
         f64::from(scramble(x, seed)) * (1.0 / 4_294_967_296.0) + 0.5 / 4_294_967_296.0
     }
