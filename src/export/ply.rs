@@ -92,7 +92,7 @@ impl PlyMesh {
     }
 }
 
-/// Reads a PLY file as [`write`] makes it.
+/// Reads a PLY file as [`write()`] makes it.
 ///
 /// # Errors
 /// `Io`, or as [`parse`].
