@@ -6,16 +6,18 @@
 //! Isosurface Generation Using 4D Light Transport", IEEE TVCG 15(6), 2009; the other tags are listed in
 //! `docs/references.md`.
 
-// Numerics, no knowledge of volumes.
+// Numerics, no knowledge of volumes; progress of long work.
 pub mod error;
 pub mod rng;
 pub mod stats;
 pub mod warp;
 pub mod cubic;
 pub mod nearest;
+pub mod progress;
 // Samples, value, gradient, range.
 pub mod volume;
 pub mod field;
+pub mod mask;
 // Rays of R⁴; one hexahedron; the min/max hierarchy and its walk; triangle meshes of L(h, c).
 pub mod flattened;
 pub mod cell;
@@ -33,5 +35,14 @@ pub mod tracer;
 pub mod embree;
 // Light transport, generic over the tracer.
 pub mod photon;
+pub mod direct;
+pub mod photon_map;
+pub mod radiance_cache;
+pub mod gather;
+// Where, how much, onto the lattice.
+pub mod sampling;
+pub mod radiance;
+pub mod illumination_grid;
+pub mod bake;
 // Products.
 pub mod export;

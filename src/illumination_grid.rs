@@ -1,0 +1,190 @@
+//! The illumination grid: radiance at the points of a regular lattice over Ω, by modified Shepard interpolation of
+//! scattered samples. Linear interpolation of it is what every viewer does with a 3D texture.
+
+use crate::error::{Error, Result};
+use crate::field::Field;
+use crate::mask::Mask;
+use crate::nearest::{Neighbours, PointGrid};
+use crate::radiance::RadianceSample;
+use crate::volume::Lattice;
+use glam::{DMat3, DVec3, Vec3};
+use rayon::prelude::*;
+use std::str::FromStr;
+
+/// The size of a grid over Ω.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum GridSize {
+    /// So many intervals per interval of the volume: 1 is the volume's own lattice.
+    Factor(usize),
+    /// Points along each axis.
+    Points([usize; 3]),
+}
+
+impl FromStr for GridSize {
+    type Err = String;
+
+    /// `2x`, or `NX,NY,NZ`.
+    fn from_str(text: &str) -> std::result::Result<Self, String> {
+        let wrong = || format!("'{text}' is no grid size; write a factor such as 2x, or points such as 101,101,101");
+        if let Some(factor) = text.strip_suffix('x') {
+            return match factor.parse() {
+                Ok(n) if (1..=16).contains(&n) => Ok(GridSize::Factor(n)),
+                _ => Err(wrong()),
+            };
+        }
+        let n: Vec<usize> = text
+            .split(',')
+            .map(|w| w.trim().parse().ok().filter(|&n| n >= 2))
+            .collect::<Option<_>>()
+            .ok_or_else(wrong)?;
+        n.try_into().map(GridSize::Points).map_err(|_| wrong())
+    }
+}
+
+impl std::fmt::Display for GridSize {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            GridSize::Factor(n) => write!(f, "{n}x"),
+            GridSize::Points([x, y, z]) => write!(f, "{x},{y},{z}"),
+        }
+    }
+}
+
+impl GridSize {
+    /// The lattice of this size over the Ω of `volume`: same corners, other spacing.
+    ///
+    /// # Errors
+    /// `Invalid` if it has too many points.
+    pub fn lattice(self, volume: &Lattice) -> Result<Lattice> {
+        let dims = match self {
+            GridSize::Factor(1) => return Ok(volume.clone()),
+            GridSize::Factor(n) => volume.cells().map(|c| c * n + 1),
+            GridSize::Points(p) => p,
+        };
+        let step = volume.far() / DVec3::from_array(dims.map(|n| (n - 1) as f64));
+        let axes = volume.axes();
+        let axes = DMat3::from_cols(axes.x_axis * step.x, axes.y_axis * step.y, axes.z_axis * step.z);
+        Lattice::new(dims, volume.origin(), axes).map_err(|e| Error::Invalid(format!("--grid {self}: {e}")))
+    }
+}
+
+/// Radiance of one side over a lattice.
+#[derive(Clone, Debug)]
+pub struct IlluminationGrid {
+    /// Linear RGB radiance per point, x fastest; 0 where empty.
+    pub radiance: Vec<[f32; 3]>,
+    /// Standard error of the luminance.
+    pub std_error: Vec<f32>,
+    /// What each point holds.
+    pub mask: Vec<Mask>,
+}
+
+/// Modified Shepard interpolation: the `neighbours` nearest samples, weighted ((R − d)/(R d))² with R the distance of
+/// the farthest. [Shepard68; FN80] `tick(n)` reports n points done; returning false stops early.
+#[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+pub fn shepard(
+    field: &Field,
+    lattice: &Lattice,
+    masks: &[Mask],
+    samples: &[RadianceSample],
+    neighbours: usize,
+    tick: &(dyn Fn(u64) -> bool + Sync),
+) -> IlluminationGrid {
+    let axes = field.lattice().axes();
+    // Distances in the world; positions relative to Ω's corner keep f32 fine-grained.
+    let points: Vec<Vec3> = samples.par_iter().map(|s| (axes * s.position.as_dvec3()).as_vec3()).collect();
+    let grid = PointGrid::new(&points, 2.0);
+    let sorted: Vec<RadianceSample> = grid.numbers().par_iter().map(|&n| samples[n as usize]).collect();
+    let step = lattice.axes();
+    const ROW: usize = 4096;
+    let mut out: Vec<([f32; 3], f32)> = vec![([0.0; 3], 0.0); lattice.len()];
+    out.par_chunks_mut(ROW).enumerate().for_each(|(chunk, out)| {
+        if !tick(0) {
+            return;
+        }
+        let mut found = Neighbours::default();
+        for (n, value) in out.iter_mut().enumerate() {
+            let o = chunk * ROW + n;
+            if masks[o] == Mask::Empty {
+                continue;
+            }
+            let q = (step * DVec3::from_array(lattice.ijk(o).map(|i| i as f64))).as_vec3();
+            grid.nearest(q, neighbours, f32::INFINITY, |_| true, &mut found);
+            *value = blend(found.found(), &sorted);
+        }
+        tick(out.len() as u64);
+    });
+    let (radiance, std_error) = out.into_iter().unzip();
+    IlluminationGrid { radiance, std_error, mask: masks.to_vec() }
+}
+
+/// Shepard's mean of (squared distance, slot) entries, and its standard error.
+#[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+fn blend(found: &[(f32, u32)], samples: &[RadianceSample]) -> ([f32; 3], f32) {
+    let Some(farthest) = found.iter().map(|e| e.0).reduce(f32::max) else { return ([0.0; 3], 0.0) };
+    let radius = f64::from(farthest).sqrt() * (1.0 + 1e-6);
+    let (mut sum, mut weights, mut variance) = (DVec3::ZERO, 0.0, 0.0);
+    for &(d2, slot) in found {
+        // A sample on the point itself takes all the weight that f64 can hold.
+        let d = f64::from(d2).sqrt().max(1e-9 * radius);
+        let w = if found.len() == 1 { 1.0 } else { ((radius - d) / (radius * d)).powi(2) * radius * radius };
+        let s = &samples[slot as usize];
+        sum += w * s.radiance.as_dvec3();
+        variance += w * w * f64::from(s.variance);
+        weights += w;
+    }
+    ((sum / weights).as_vec3().to_array(), (variance.sqrt() / weights) as f32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::Sweep;
+    use crate::rng::{Sobol, Stage};
+    use crate::volume::{Samples, Volume};
+
+    fn field() -> Field {
+        let lattice = Lattice::aligned([9, 9, 9], DVec3::splat(-3.0), DVec3::new(0.5, 1.0, 2.0)).unwrap();
+        let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[0] as f32).collect();
+        let volume = Volume::new("x", lattice, Samples::F32(samples)).unwrap();
+        Field::new(&volume, Sweep::new(0.0, 8.0).unwrap()).unwrap()
+    }
+
+    #[test]
+    fn shepard_reproduces_constants_and_approaches_smooth_functions() {
+        let field = field();
+        let set = Sobol::set(1, Stage::Test, 0);
+        let f = |p: DVec3| (0.3 * p.x + 0.2 * p.y).sin() + 2.0;
+        let mut worst = Vec::new();
+        for n in [4_000u32, 32_000] {
+            let samples: Vec<RadianceSample> = (0..n)
+                .map(|i| {
+                    let [x, y] = set.point2(i, 0);
+                    let p = field.lattice().far() * DVec3::new(x, y, set.coordinate(i, 2));
+                    let radiance = Vec3::new(7.0, f(p) as f32, 0.0);
+                    RadianceSample { position: p.as_vec3(), radiance, ..RadianceSample::default() }
+                })
+                .collect();
+            let masks = crate::mask::masks(&field, field.lattice());
+            let grid = shepard(&field, field.lattice(), &masks, &samples, 12, &|_| true);
+            let mut error = 0f64;
+            for (o, rgb) in grid.radiance.iter().enumerate() {
+                let p = DVec3::from_array(field.lattice().ijk(o).map(|i| i as f64));
+                assert!((rgb[0] - 7.0).abs() < 1e-5);
+                error = error.max((f64::from(rgb[1]) - f(p)).abs());
+            }
+            worst.push(error);
+        }
+        assert!(worst[1] < 0.6 * worst[0] && worst[0] < 0.2, "halving the distance: {worst:?}");
+    }
+
+    #[test]
+    fn grid_sizes() {
+        let lattice = Lattice::aligned([3, 4, 5], DVec3::ONE, DVec3::ONE).unwrap();
+        let fine = "2x".parse::<GridSize>().unwrap().lattice(&lattice).unwrap();
+        assert_eq!((fine.dims(), fine.spacing()), ([5, 7, 9], DVec3::splat(0.5)));
+        assert_eq!(fine.to_world(fine.far()), lattice.to_world(lattice.far()));
+        assert_eq!("7, 8,9".parse::<GridSize>(), Ok(GridSize::Points([7, 8, 9])));
+        assert!("0x".parse::<GridSize>().is_err() && "4,4".parse::<GridSize>().is_err());
+    }
+}

@@ -1,0 +1,105 @@
+//! Which points of a lattice over Ω the sweep's surfaces need, and points of the graph that can stand for them.
+
+use crate::field::Field;
+use crate::rng::{Rng, Stage};
+use crate::volume::Lattice;
+use glam::DVec3;
+use rayon::prelude::*;
+
+/// What a grid point holds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Mask {
+    /// Nothing: no level set of the sweep passes near. Stored as 0.
+    Empty = 0,
+    /// Radiance of the level set through the point.
+    Valid = 1,
+    /// Outside the sweep or without gradient itself, but in a cell that surfaces of the sweep cross, or beside one:
+    /// filled from valid samples nearby, since those surfaces interpolate it.
+    Filled = 2,
+}
+
+/// Lattice point `o` in the local frame of the field.
+#[inline]
+pub fn local_position(field: &Field, lattice: &Lattice, o: usize) -> DVec3 {
+    let p = DVec3::from_array(lattice.ijk(o).map(|i| i as f64));
+    if lattice == field.lattice() { p } else { p * (field.lattice().far() / lattice.far()) }
+}
+
+/// Where a lattice over Ω holds surfaces of the sweep.
+pub fn masks(field: &Field, lattice: &Lattice) -> Vec<Mask> {
+    let dims = lattice.dims();
+    let at = |o: usize| local_position(field, lattice, o);
+    let values: Vec<f32> = if lattice == field.lattice() {
+        field.samples().to_vec()
+    } else {
+        #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+        (0..lattice.len()).into_par_iter().map(|o| field.value(at(o)) as f32).collect()
+    };
+    (0..lattice.len())
+        .into_par_iter()
+        .with_min_len(4096)
+        .map(|o| {
+            let h = values[o];
+            if (0.0..=1.0).contains(&h) && field.falling_normal(at(o)).is_some() {
+                return Mask::Valid;
+            }
+            let [i, j, k] = lattice.ijk(o);
+            let (mut lo, mut hi) = (f32::INFINITY, f32::NEG_INFINITY);
+            for z in k.saturating_sub(1)..=(k + 1).min(dims[2] - 1) {
+                for y in j.saturating_sub(1)..=(j + 1).min(dims[1] - 1) {
+                    for x in i.saturating_sub(1)..=(i + 1).min(dims[0] - 1) {
+                        let s = values[lattice.offset(x, y, z)];
+                        (lo, hi) = (lo.min(s), hi.max(s));
+                    }
+                }
+            }
+            if lo <= 1.0 && hi >= 0.0 && lo < hi { Mask::Filled } else { Mask::Empty }
+        })
+        .collect()
+}
+
+/// Points of the graph that stand for lattice point `o`: itself if a level set of the sweep passes through it, else up to
+/// two points of the cells around it where one does (keyed by `seed`); none where none is found.
+pub fn stand_ins(field: &Field, lattice: &Lattice, o: usize, seed: u64) -> [Option<DVec3>; 2] {
+    let centre = local_position(field, lattice, o);
+    let usable = |p: DVec3| (0.0..=1.0).contains(&field.value(p)) && field.falling_normal(p).is_some();
+    if usable(centre) {
+        return [Some(centre), None];
+    }
+    let cell = field.lattice().far() / lattice.far();
+    let mut rng = Rng::stream(seed, Stage::Cache, o as u64);
+    let mut found = [None, None];
+    for _ in 0..32 {
+        let p = centre + (DVec3::new(rng.unit(), rng.unit(), rng.unit()) * 2.0 - 1.0) * cell;
+        let p = p.clamp(DVec3::ZERO, field.lattice().far());
+        if usable(p) {
+            if found[0].is_some() {
+                found[1] = Some(p);
+                break;
+            }
+            found[0] = Some(p);
+        }
+    }
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::Sweep;
+    use crate::volume::{Samples, Volume};
+
+    #[test]
+    fn masks_say_what_a_point_holds() {
+        let lattice = Lattice::aligned([8, 3, 3], DVec3::ZERO, DVec3::ONE).unwrap();
+        let row = [0.0, 0.0, 0.0, 0.5, 2.0, 9.0, 9.0, 9.0f32];
+        let samples = (0..lattice.len()).map(|o| row[o % 8]).collect();
+        let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
+        let field = Field::new(&volume, Sweep::new(0.2, 1.2).unwrap()).unwrap();
+        let got = masks(&field, &lattice);
+        use Mask::{Empty, Filled, Valid};
+        // Cells 2–3, 3–4 hold the sweep; nodes of those cells and the cells beside them are filled.
+        assert_eq!(got[..8], [Empty, Empty, Filled, Valid, Filled, Empty, Empty, Empty]);
+    }
+}

@@ -1,0 +1,83 @@
+//! Progress of long work: a bar with an ETA on a terminal, plain lines otherwise, and the wish to stop.
+
+use crate::error::{Error, Result};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use std::io::IsTerminal;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+static INTERRUPTED: AtomicBool = AtomicBool::new(false);
+
+/// Asks all running stages to stop; what a signal handler calls.
+pub fn interrupt() {
+    INTERRUPTED.store(true, Ordering::Relaxed);
+}
+
+/// Whether someone has asked to stop.
+#[inline]
+pub fn interrupted() -> bool {
+    INTERRUPTED.load(Ordering::Relaxed)
+}
+
+/// Where progress goes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Progress {
+    /// Nowhere.
+    Quiet,
+    /// To standard error: bars on a terminal, a line per stage otherwise.
+    Shown,
+}
+
+/// One running stage.
+pub struct Stage {
+    bar: Option<ProgressBar>,
+    name: String,
+    shown: bool,
+    begun: Instant,
+}
+
+impl Progress {
+    /// Begins a stage of `total` units of work.
+    pub fn stage(self, name: &str, total: u64) -> Stage {
+        let shown = self == Progress::Shown;
+        let bar = (shown && std::io::stderr().is_terminal()).then(|| {
+            let bar = ProgressBar::with_draw_target(Some(total), ProgressDrawTarget::stderr_with_hz(8));
+            let template = "{prefix:>14} [{bar:30}] {percent:>3} %  {elapsed} elapsed, {eta} left";
+            bar.set_style(ProgressStyle::with_template(template).expect("the template is fixed").progress_chars("=> "));
+            bar.set_prefix(name.to_owned());
+            bar
+        });
+        Stage { bar, name: name.to_owned(), shown, begun: Instant::now() }
+    }
+}
+
+impl Stage {
+    /// Reports `n` more units done; false if the work should stop.
+    #[inline]
+    pub fn tick(&self, n: u64) -> bool {
+        if n > 0
+            && let Some(bar) = &self.bar
+        {
+            bar.inc(n);
+        }
+        !interrupted()
+    }
+
+    /// Ends the stage; returns its wall seconds.
+    ///
+    /// # Errors
+    /// `Interrupted` if someone has asked to stop meanwhile.
+    pub fn end(self) -> Result<f64> {
+        let seconds = self.begun.elapsed().as_secs_f64();
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+        if interrupted() {
+            return Err(Error::Interrupted);
+        }
+        if self.shown {
+            eprintln!("{:>14}  {seconds:.2} s", self.name);
+        }
+        Ok(seconds)
+    }
+}

@@ -1,0 +1,269 @@
+//! The radiance that a gather ray finds where it lands: reflected light cached at the lattice's nodes, per side, and on
+//! flats as (u, v, c) textures. Direct light by shadow rays plus photons without their first landings. [Christensen99]
+
+use crate::brdf::reflected;
+use crate::direct::{Receiver, direct_irradiance};
+use crate::flat::{self, FlatTexture};
+use crate::flattened::{Departure, Side, Target};
+use crate::mask::{Mask, masks, stand_ins};
+use crate::nearest::Neighbours;
+use crate::photon::{FlatPhoton, Photons};
+use crate::photon_map::{EstimateSettings, PhotonMap};
+use crate::rng::Stage;
+use crate::scene::Scene;
+use crate::tracer::Tracer;
+use glam::DVec3;
+use rayon::prelude::*;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// How the cache is filled.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CacheSettings {
+    /// Shadow rays per node and luminaire.
+    pub node_shadow_rays: u32,
+    /// Shadow rays per texel of a flat and luminaire.
+    pub flat_shadow_rays: u32,
+    /// Texels along the longer edge of a flat.
+    pub flat_resolution: usize,
+    /// Texels along the isovalue.
+    pub isovalue_resolution: usize,
+    /// Seed of the run.
+    pub seed: u64,
+}
+
+/// Outgoing radiance (reflected and, for emitting level sets, emitted) wherever a gather ray can land.
+pub struct RadianceCache {
+    /// Per side (lower, higher): RGB at each node, NaN where neither the node nor its surroundings hold a surface.
+    nodes: [Option<Vec<[f32; 3]>>; 2],
+    flats: Vec<Option<FlatTexture>>,
+    /// Rays traced to fill it.
+    pub rays: u64,
+    /// Lookups that found no node of their cell filled.
+    misses: AtomicU64,
+}
+
+impl RadianceCache {
+    /// Fills the cache: flats always, nodes if `with_nodes` (a gather needs them, pictures of walls do not). `tick(n)` reports n nodes or texels done; returning false stops early.
+    pub fn new<T: Tracer>(
+        scene: &Scene,
+        tracer: &T,
+        photons: &Photons,
+        estimate: EstimateSettings,
+        settings: &CacheSettings,
+        with_nodes: bool,
+        tick: &(dyn Fn(u64) -> bool + Sync),
+    ) -> Self {
+        let rays = AtomicU64::new(0);
+        let flats =
+            (0..flat::count(scene)).map(|n| fill_flat(scene, tracer, n, &photons.flat, settings, &rays)).collect();
+        // A side is filled if photons reach it, or light can: the outside always.
+        let nodes = [Side::Lower, Side::Higher].map(|side| {
+            let used = side == scene.surface.outside
+                || scene.surface.both_sides
+                || photons.surface.iter().any(|p| p.side == side);
+            (with_nodes && used).then(|| fill_nodes(scene, tracer, photons, side, estimate, settings, tick, &rays))
+        });
+        Self { nodes, flats, rays: rays.into_inner(), misses: AtomicU64::new(0) }
+    }
+
+    /// Total work units that `tick` will see, for a progress bar.
+    pub fn work(scene: &Scene) -> u64 {
+        scene.lattice().len() as u64
+    }
+
+    /// Outgoing radiance where a ray of hyperplane `isovalue` landed, without what luminaires emit.
+    pub fn lookup(&self, scene: &Scene, target: Target, position: DVec3, isovalue: f32) -> DVec3 {
+        match target {
+            Target::Surface(side) => self.surface(scene, side, position),
+            Target::Cap(_, Side::Higher) => DVec3::ZERO,
+            Target::Cap(face, Side::Lower) => {
+                let uv = flat::face_texture(scene, face, position);
+                self.flat(scene.polygons().len() + usize::from(face), uv, isovalue)
+            }
+            Target::Polygon(id) => {
+                let uv = scene.polygons()[id as usize].texture(scene.lattice().to_world(position));
+                self.flat(id as usize, uv, isovalue)
+            }
+        }
+    }
+
+    fn flat(&self, number: usize, [u, v]: [f64; 2], isovalue: f32) -> DVec3 {
+        self.flats[number].as_ref().map_or(DVec3::ZERO, |t| t.lookup([u, v, f64::from(isovalue)]))
+    }
+
+    /// Trilinear over the filled nodes of the cell.
+    fn surface(&self, scene: &Scene, side: Side, position: DVec3) -> DVec3 {
+        let Some(nodes) = &self.nodes[side.index()] else { return scene.surface.emission };
+        let ([i, j, k], u) = scene.field.locate(position);
+        let (mut sum, mut weight) = (DVec3::ZERO, 0.0);
+        for corner in 0..8 {
+            let [x, y, z] = [corner & 1, corner >> 1 & 1, corner >> 2];
+            let value = nodes[scene.lattice().offset(i + x, j + y, k + z)];
+            if value[0].is_nan() {
+                continue;
+            }
+            // 1e-6 keeps a hit at a node without surface on the others.
+            let w = (if x == 1 { u.x } else { 1.0 - u.x })
+                * (if y == 1 { u.y } else { 1.0 - u.y })
+                * (if z == 1 { u.z } else { 1.0 - u.z })
+                + 1e-6;
+            sum += w * DVec3::from_array(value.map(f64::from));
+            weight += w;
+        }
+        if weight > 0.0 {
+            return sum / weight;
+        }
+        self.misses.fetch_add(1, Ordering::Relaxed);
+        scene.surface.emission
+    }
+
+    /// The flats' radiance textures; `None` for flats that reflect nothing.
+    pub fn flats(&self) -> &[Option<FlatTexture>] {
+        &self.flats
+    }
+
+    /// The flats' textures, without the rest.
+    pub fn into_flats(self) -> Vec<Option<FlatTexture>> {
+        self.flats
+    }
+
+    /// Lookups so far that found nothing.
+    pub fn misses(&self) -> u64 {
+        self.misses.load(Ordering::Relaxed)
+    }
+}
+
+#[allow(clippy::too_many_arguments, reason = "one call")]
+#[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+fn fill_nodes<T: Tracer>(
+    scene: &Scene,
+    tracer: &T,
+    photons: &Photons,
+    side: Side,
+    estimate: EstimateSettings,
+    settings: &CacheSettings,
+    tick: &(dyn Fn(u64) -> bool + Sync),
+    rays: &AtomicU64,
+) -> Vec<[f32; 3]> {
+    let map = PhotonMap::new(scene, &photons.surface, side, |p| p.bounces > 0, estimate);
+    let masks = masks(&scene.field, scene.lattice());
+    let mut nodes = vec![[f32::NAN; 3]; scene.lattice().len()];
+    const ROW: usize = 4096;
+    nodes.par_chunks_mut(ROW).enumerate().for_each(|(chunk, out)| {
+        if !tick(0) {
+            return;
+        }
+        let mut scratch = Neighbours::default();
+        let mut traced = 0;
+        for (n, value) in out.iter_mut().enumerate() {
+            let node = chunk * ROW + n;
+            if masks[node] == Mask::Empty {
+                continue;
+            }
+            let (mut sum, mut count) = (DVec3::ZERO, 0.0);
+            for (stand_in, p) in
+                stand_ins(&scene.field, scene.lattice(), node, settings.seed).into_iter().flatten().enumerate()
+            {
+                let position = p.as_vec3();
+                let Some(normal) = scene.normal(position.as_dvec3(), side) else { continue };
+                let isovalue = scene.field.value(position.as_dvec3()) as f32;
+                let receiver = Receiver { position, normal, isovalue, departure: Departure::Surface(side) };
+                let index = (node as u64 * 2 + stand_in as u64) * 2 + side.index() as u64;
+                let direct = direct_irradiance(
+                    scene,
+                    tracer,
+                    &receiver,
+                    settings.node_shadow_rays,
+                    (settings.seed, Stage::Cache, index),
+                );
+                traced += direct.rays;
+                let indirect = map.irradiance(p, f64::from(isovalue), &mut scratch).mean;
+                sum += reflected(scene.surface.albedo, direct.mean + indirect) + scene.surface.emission;
+                count += 1.0;
+            }
+            if count > 0.0 {
+                *value = (sum / count).as_vec3().to_array();
+            }
+        }
+        rays.fetch_add(traced, Ordering::Relaxed);
+        tick(out.len() as u64);
+    });
+    nodes
+}
+
+/// Direct light at texel centres and photons of later landings, smoothed.
+fn fill_flat<T: Tracer>(
+    scene: &Scene,
+    tracer: &T,
+    number: usize,
+    photons: &[FlatPhoton],
+    settings: &CacheSettings,
+    rays: &AtomicU64,
+) -> Option<FlatTexture> {
+    let flat = flat::flat(scene, number)?;
+    if flat.albedo == DVec3::ZERO {
+        return None;
+    }
+    let dims = FlatTexture::resolution(flat.lengths(), settings.flat_resolution, settings.isovalue_resolution);
+    let indirect = flat_irradiance(&flat, number, dims, photons);
+    let mut texture = FlatTexture::black(dims);
+    let centres = FlatTexture::black(dims);
+    let lattice = scene.lattice();
+    texture.texels.par_iter_mut().enumerate().with_min_len(256).for_each(|(i, texel)| {
+        let [u, v, c] = centres.centre(i);
+        let x = flat.at([u, v]);
+        #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
+        let receiver = Receiver {
+            position: lattice.to_index(x).as_vec3(),
+            normal: flat.normal,
+            isovalue: c as f32,
+            departure: flat.departure,
+        };
+        let index = ((number as u64) << 40) | i as u64;
+        let direct = direct_irradiance(
+            scene,
+            tracer,
+            &receiver,
+            settings.flat_shadow_rays,
+            (settings.seed, Stage::Cache, !index),
+        );
+        rays.fetch_add(direct.rays, Ordering::Relaxed);
+        let total = direct.mean + DVec3::from_array(indirect[i].map(f64::from));
+        *texel = reflected(flat.albedo, total).as_vec3().to_array();
+    });
+    Some(texture)
+}
+
+/// Irradiance of photons that were reflected before, per texel: a histogram over (u, v, c), smoothed by a 2D kernel × a
+/// 1D kernel in c that is normalised over the texture, so that borders are unbiased.
+#[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+fn flat_irradiance(flat: &flat::Flat, number: usize, dims: [usize; 3], photons: &[FlatPhoton]) -> Vec<[f32; 3]> {
+    let mut bins = FlatTexture::black(dims);
+    let mut power = vec![DVec3::ZERO; bins.texels.len()];
+    for p in photons.iter().filter(|p| p.flat as usize == number && p.bounces > 0) {
+        power[bins.texel(p.uvc)] += p.power.as_dvec3();
+    }
+    let texel = flat.area() / (dims[0] * dims[1]) as f64 / dims[2] as f64;
+    let mut image: Vec<DVec3> = power.into_iter().map(|p| p / texel).collect();
+    for _ in 0..3 {
+        for axis in 0..3 {
+            image = smooth(&image, dims, axis);
+        }
+    }
+    bins.texels.iter_mut().zip(image).for_each(|(t, e)| *t = e.as_vec3().to_array());
+    bins.texels
+}
+
+/// ¼ ½ ¼ along one axis, the missing quarter folded back at the ends (flux is kept).
+fn smooth(image: &[DVec3], dims: [usize; 3], axis: usize) -> Vec<DVec3> {
+    let stride = [1, dims[0], dims[0] * dims[1]][axis];
+    let n = dims[axis];
+    (0..image.len())
+        .map(|i| {
+            let at = i / stride % n;
+            let before = if at > 0 { image[i - stride] } else { image[i] };
+            let after = if at + 1 < n { image[i + stride] } else { image[i] };
+            0.25 * before + 0.5 * image[i] + 0.25 * after
+        })
+        .collect()
+}

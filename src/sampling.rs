@@ -1,0 +1,115 @@
+//! Where radiance is sampled: the strategies of [BB09 §3], and the grid's own nodes.
+
+use crate::error::Result;
+use crate::field::Field;
+use crate::isosurface;
+use crate::rng::{Rng, Sobol, Stage};
+use glam::{DVec3, Vec3};
+use rayon::prelude::*;
+
+/// A way to place radiance samples.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Strategy {
+    /// Strategy 3: uniform over Ω (low-discrepancy).
+    Uniform,
+    /// Strategy 1: uniform by area over the level sets at these isovalues, in units of the sweep.
+    LevelSets(Vec<f64>),
+    /// Strategy 2: uniform over this many parallel planes across the diagonal of Ω.
+    Planes(usize),
+    /// At the nodes of the illumination grid: no interpolation.
+    Nodes,
+}
+
+/// Batches of 2²⁰ points that a uniform search for samples on the sweep may take: 4·10⁹ points.
+const MAX_BATCHES: usize = 4096;
+
+/// `count` positions in the local frame. The level set through each is the one it samples; positions whose isovalue
+/// lies outside the sweep are left out, so the result may be shorter for planes and level sets, and for uniform samples
+/// of a sweep that fills less than about `count` / 4·10⁹ of Ω. [`Strategy::Nodes`] gives none: the grid knows its nodes.
+///
+/// # Errors
+/// From extracting level sets.
+#[allow(clippy::cast_possible_truncation, reason = "positions are f32, indices below 2³²")]
+pub fn positions(field: &Field, strategy: &Strategy, count: u64, seed: u64) -> Result<Vec<Vec3>> {
+    let far = field.lattice().far();
+    let on_sweep = |p: &Vec3| (0.0..=1.0).contains(&field.value(p.as_dvec3()));
+    let uniform = |i: usize| {
+        let set = Sobol::set(seed, Stage::Sample, (i >> 32) as u64);
+        let [x, y] = set.point2(i as u32, 0);
+        far * DVec3::new(x, y, set.coordinate(i as u32, 2))
+    };
+    match strategy {
+        Strategy::Nodes => Ok(Vec::new()),
+        Strategy::Uniform => {
+            // Batches until enough lie on the sweep, in the order of the sequence.
+            const BATCH: usize = 1 << 20;
+            let mut found: Vec<Vec3> = Vec::new();
+            for batch in 0..MAX_BATCHES {
+                let range = batch * BATCH..(batch + 1) * BATCH;
+                found.par_extend(range.into_par_iter().map(|i| uniform(i).as_vec3()).filter(on_sweep));
+                if found.len() as u64 >= count {
+                    found.truncate(count as usize);
+                    break;
+                }
+            }
+            Ok(found)
+        }
+        Strategy::Planes(planes) => Ok((0..count as usize)
+            .into_par_iter()
+            .filter_map(|i| {
+                // (1,1,1) in units of Ω: each point of a slab goes straight to the plane in the slab's middle.
+                let p = uniform(i) / far;
+                let s = p.element_sum() / 3.0;
+                let plane = ((s * *planes as f64).floor() + 0.5) / *planes as f64;
+                let q = p + (plane - s);
+                (q.cmpge(DVec3::ZERO).all() && q.cmple(DVec3::ONE).all()).then(|| (q * far).as_vec3())
+            })
+            .filter(on_sweep)
+            .collect()),
+        Strategy::LevelSets(isovalues) => level_set_positions(field, isovalues, count, seed),
+    }
+}
+
+/// Points uniform by world area over the triangles of the level sets, then moved along ∇h onto the trilinear surface.
+#[allow(clippy::cast_possible_truncation, reason = "positions and isovalues are f32")]
+fn level_set_positions(field: &Field, isovalues: &[f64], count: u64, seed: u64) -> Result<Vec<Vec3>> {
+    let lattice = field.lattice();
+    let mut corners: Vec<([DVec3; 3], f64)> = Vec::new();
+    let mut cumulative: Vec<f64> = Vec::new();
+    let mut total = 0.0;
+    for &c in isovalues {
+        let mesh = isosurface::extract(lattice.dims(), field.samples(), c as f32)?;
+        for t in &mesh.triangles {
+            let v = t.map(|i| mesh.vertices[i as usize]);
+            let w = v.map(|p| lattice.to_world(p));
+            total += 0.5 * (w[1] - w[0]).cross(w[2] - w[0]).length();
+            corners.push((v, c));
+            cumulative.push(total);
+        }
+    }
+    if corners.is_empty() {
+        return Ok(Vec::new());
+    }
+    Ok((0..count as usize)
+        .into_par_iter()
+        .map(|i| {
+            let mut rng = Rng::stream(seed, Stage::Sample, i as u64);
+            let x = (i as f64 + rng.unit()) / count as f64 * total;
+            let ([a, b, c], isovalue) = corners[cumulative.partition_point(|&s| s <= x).min(corners.len() - 1)];
+            let [s, t] = crate::warp::triangle(rng.unit2());
+            let mut p = a + s * (b - a) + t * (c - a);
+            for _ in 0..4 {
+                let g = field.gradient(p);
+                let step = (field.value(p) - isovalue) / g.length_squared();
+                if step.is_finite() {
+                    // Never farther than a cell: beyond, the linear model of h means nothing.
+                    let d = lattice.direction_to_index(-g * step);
+                    p += d * (1.0 / d.abs().max_element()).min(1.0);
+                    p = p.clamp(DVec3::ZERO, lattice.far());
+                }
+            }
+            p.as_vec3()
+        })
+        .filter(|p| (0.0..=1.0).contains(&field.value(p.as_dvec3())))
+        .collect())
+}
