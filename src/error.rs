@@ -50,6 +50,16 @@ impl Error {
         Error::NotSupported(format!("{}: {message}", path.as_ref().display()))
     }
 
+    /// The same error with the file's name in front, for checks that do not know which file they serve.
+    #[must_use]
+    pub fn in_file(self, path: impl AsRef<Path>) -> Self {
+        match self {
+            Error::Invalid(message) => Error::invalid(path, message),
+            Error::NotSupported(message) => Error::not_supported(path, message),
+            other => other,
+        }
+    }
+
     /// The exit code of the command line: 2 for bad usage or input, 130 when interrupted, 1 for the rest.
     pub fn exit_code(&self) -> u8 {
         match self {

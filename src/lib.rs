@@ -7,4 +7,5 @@
 //! `docs/references.md`.
 
 pub mod error;
+mod files;
 pub mod volume;

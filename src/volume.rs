@@ -1,6 +1,8 @@
 //! A scalar volume as its file gives it: a regular lattice placed in the world, and samples in their source type.
 //! Readers live below, one per format; generators make volumes with exact value and gradient.
 
+pub mod nifti;
+
 use crate::error::{Error, Result};
 use glam::{DMat3, DVec3};
 
@@ -196,6 +198,8 @@ macro_rules! each_sample_type {
     };
 }
 
+pub(crate) use each_sample_type;
+
 impl ElementType {
     /// Bytes per element.
     pub fn size(self) -> usize {
@@ -260,6 +264,14 @@ impl Samples {
             ElementType::I64 => Samples::I64(decode!(i64)),
             ElementType::F32 => Samples::F32(decode!(f32)),
             ElementType::F64 => Samples::F64(decode!(f64)),
+        }
+    }
+
+    /// [`Samples::from_bytes`] that keeps the buffer where its bytes are the samples.
+    pub fn from_vec(bytes: Vec<u8>, element: ElementType, endian: Endian) -> Self {
+        match element {
+            ElementType::U8 => Samples::U8(bytes),
+            _ => Self::from_bytes(&bytes, element, endian),
         }
     }
 
