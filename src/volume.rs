@@ -1,7 +1,9 @@
 //! A scalar volume as its file gives it: a regular lattice placed in the world, and samples in their source type.
 //! Readers live below, one per format; generators make volumes with exact value and gradient.
 
+pub(crate) mod ascii;
 pub mod nifti;
+pub mod nrrd;
 
 use crate::error::{Error, Result};
 use glam::{DMat3, DVec3};
