@@ -2,9 +2,11 @@
 //! Readers live below, one per format; generators make volumes with exact value and gradient.
 
 pub(crate) mod ascii;
+pub mod generate;
 pub mod nifti;
 pub mod nrrd;
 pub mod raw;
+pub mod statistics;
 pub mod vti;
 
 use crate::error::{Error, Result};
@@ -189,16 +191,16 @@ pub enum Endian {
 macro_rules! each_sample_type {
     ($samples:expr, $v:ident => $body:expr) => {
         match $samples {
-            Samples::U8($v) => $body,
-            Samples::I8($v) => $body,
-            Samples::U16($v) => $body,
-            Samples::I16($v) => $body,
-            Samples::U32($v) => $body,
-            Samples::I32($v) => $body,
-            Samples::U64($v) => $body,
-            Samples::I64($v) => $body,
-            Samples::F32($v) => $body,
-            Samples::F64($v) => $body,
+            $crate::volume::Samples::U8($v) => $body,
+            $crate::volume::Samples::I8($v) => $body,
+            $crate::volume::Samples::U16($v) => $body,
+            $crate::volume::Samples::I16($v) => $body,
+            $crate::volume::Samples::U32($v) => $body,
+            $crate::volume::Samples::I32($v) => $body,
+            $crate::volume::Samples::U64($v) => $body,
+            $crate::volume::Samples::I64($v) => $body,
+            $crate::volume::Samples::F32($v) => $body,
+            $crate::volume::Samples::F64($v) => $body,
         }
     };
 }
