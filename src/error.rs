@@ -31,8 +31,8 @@ pub enum Error {
     Failed(String),
 }
 
-/// `Result` with [`Error`].
-pub type Result<T> = std::result::Result<T, Error>;
+/// `Result` with [`Error`] unless another error is named.
+pub type Result<T, E = Error> = std::result::Result<T, E>;
 
 impl Error {
     /// An [`Error::Io`] at `path`.
@@ -48,6 +48,16 @@ impl Error {
     /// An [`Error::NotSupported`] that begins with the file's name.
     pub fn not_supported(path: impl AsRef<Path>, message: impl std::fmt::Display) -> Self {
         Error::NotSupported(format!("{}: {message}", path.as_ref().display()))
+    }
+
+    /// The same error with the file's name in front, for checks that do not know which file they serve.
+    #[must_use]
+    pub fn in_file(self, path: impl AsRef<Path>) -> Self {
+        match self {
+            Error::Invalid(message) => Error::invalid(path, message),
+            Error::NotSupported(message) => Error::not_supported(path, message),
+            other => other,
+        }
     }
 
     /// The exit code of the command line: 2 for bad usage or input, 130 when interrupted, 1 for the rest.

@@ -1,7 +1,6 @@
 //! Writers of what users take away: textured meshes and pictures. Every file appears under its name only when it is
 //! complete.
 
-pub mod atomic;
 pub mod obj;
 pub mod picture;
 pub mod ply;

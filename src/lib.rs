@@ -8,6 +8,8 @@
 
 // Numerics, no knowledge of volumes; progress of long work.
 pub mod error;
+pub mod atomic;
+mod files;
 pub mod rng;
 pub mod stats;
 pub mod warp;

@@ -1,8 +1,17 @@
 //! A scalar volume as its file gives it: a regular lattice placed in the world, and samples in their source type.
 //! Readers live below, one per format; generators make volumes with exact value and gradient.
 
+pub(crate) mod ascii;
+pub mod generate;
+pub mod nifti;
+pub mod nrrd;
+pub mod raw;
+pub mod statistics;
+pub mod vti;
+
 use crate::error::{Error, Result};
 use glam::{DMat3, DVec3};
+use std::path::Path;
 
 /// A regular lattice of `dims` samples, vertex-centred: sample (i, j, k) stands at `origin + axes · (i, j, k)`.
 ///
@@ -182,19 +191,21 @@ pub enum Endian {
 macro_rules! each_sample_type {
     ($samples:expr, $v:ident => $body:expr) => {
         match $samples {
-            Samples::U8($v) => $body,
-            Samples::I8($v) => $body,
-            Samples::U16($v) => $body,
-            Samples::I16($v) => $body,
-            Samples::U32($v) => $body,
-            Samples::I32($v) => $body,
-            Samples::U64($v) => $body,
-            Samples::I64($v) => $body,
-            Samples::F32($v) => $body,
-            Samples::F64($v) => $body,
+            $crate::volume::Samples::U8($v) => $body,
+            $crate::volume::Samples::I8($v) => $body,
+            $crate::volume::Samples::U16($v) => $body,
+            $crate::volume::Samples::I16($v) => $body,
+            $crate::volume::Samples::U32($v) => $body,
+            $crate::volume::Samples::I32($v) => $body,
+            $crate::volume::Samples::U64($v) => $body,
+            $crate::volume::Samples::I64($v) => $body,
+            $crate::volume::Samples::F32($v) => $body,
+            $crate::volume::Samples::F64($v) => $body,
         }
     };
 }
+
+pub(crate) use each_sample_type;
 
 impl ElementType {
     /// Bytes per element.
@@ -263,6 +274,14 @@ impl Samples {
         }
     }
 
+    /// [`Samples::from_bytes`] that keeps the buffer where its bytes are the samples.
+    pub fn from_vec(bytes: Vec<u8>, element: ElementType, endian: Endian) -> Self {
+        match element {
+            ElementType::U8 => Samples::U8(bytes),
+            _ => Self::from_bytes(&bytes, element, endian),
+        }
+    }
+
     /// Number of samples.
     pub fn len(&self) -> usize {
         each_sample_type!(self, v => v.len())
@@ -325,6 +344,55 @@ impl Volume {
         Ok(Self { name, lattice, samples })
     }
 
+    /// Reads a file by its extension, whatever its case: `.nii`, `.nii.gz`, `.nrrd`, `.nhdr` or `.vti`. Of a `.vti` it
+    /// takes the scalars that [`vti::VtiFile::into_scalars`] names. Files without a header go through
+    /// [`raw::RawLayout::read`].
+    ///
+    /// # Errors
+    /// `Io` for a missing file, `NotSupported` with the list of extensions, or what the format's reader returns.
+    pub fn open(path: impl AsRef<Path>) -> Result<Self> {
+        let path = path.as_ref();
+        let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        let has = |extension: &str| name.ends_with(extension);
+        // A missing file is the better complaint, whatever its extension.
+        std::fs::metadata(path).map_err(|e| Error::io(path, e))?;
+        if has(".nii") || has(".nii.gz") {
+            nifti::read(path)
+        } else if has(".nrrd") || has(".nhdr") {
+            nrrd::read(path)
+        } else if has(".vti") {
+            let (lattice, samples) = vti::VtiFile::read(path)?.into_scalars().map_err(|e| e.in_file(path))?;
+            Self::new(path.display().to_string(), lattice, samples)
+        } else if has(".raw") {
+            Err(Error::invalid(path, "has no header: give its dimensions, sample type, byte order and spacing too"))
+        } else {
+            Err(Error::not_supported(
+                path,
+                "unknown extension; .nii, .nii.gz, .nrrd, .nhdr and .vti are read, and .raw with its layout given",
+            ))
+        }
+    }
+
+    /// Writes a `.vti` (one point array `value`, active) or a `.nrrd`, by the extension. The file appears under its
+    /// name only when it is complete.
+    ///
+    /// # Errors
+    /// `NotSupported` for another extension; `Io`.
+    pub fn write(&self, path: impl AsRef<Path>) -> Result<()> {
+        let path = path.as_ref();
+        let extension = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        match extension.as_str() {
+            "vti" => vti::VtiWriter::new(&self.lattice)
+                .point_data("value", 1, &self.samples)
+                .active_scalars("value")
+                .write(path),
+            "nrrd" => nrrd::write(self, path),
+            _ => {
+                Err(Error::not_supported(path, "volumes are written as .vti or .nrrd; give it one of these extensions"))
+            }
+        }
+    }
+
     /// The samples, x fastest.
     pub fn samples(&self) -> &Samples {
         &self.samples
@@ -350,6 +418,37 @@ impl Volume {
             Samples::F32(v) => v.iter().filter(|v| !v.is_finite()).count(),
             Samples::F64(v) => v.iter().filter(|v| !v.is_finite()).count(),
             _ => 0,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_are_told_apart_by_their_extension() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        let lattice = Lattice::aligned([2, 3, 2], DVec3::new(1.0, 2.0, 3.0), DVec3::new(0.5, 1.0, 4.0)).unwrap();
+        let volume = Volume::new("made", lattice, Samples::I16((0..12).map(|i| i * 100 - 500).collect())).unwrap();
+        for name in ["a.VTI", "b.nrrd"] {
+            volume.write(at(name)).unwrap();
+            let read = Volume::open(at(name)).unwrap();
+            assert_eq!((&read.lattice, read.samples()), (&volume.lattice, volume.samples()));
+        }
+        assert!(matches!(volume.write(at("c.png")), Err(Error::NotSupported(_))));
+        assert!(!at("c.png").exists());
+        std::fs::write(at("d.xyz"), []).unwrap();
+        let message = Volume::open(at("d.xyz")).unwrap_err().to_string();
+        assert!(message.contains("d.xyz") && message.contains(".nii.gz"), "{message}");
+        assert!(matches!(Volume::open(at("none.vti")), Err(Error::Io { .. })));
+        std::fs::write(at("e.raw"), []).unwrap();
+        assert!(Volume::open(at("e.raw")).unwrap_err().to_string().contains("no header"));
+        for name in ["f.nii", "f.nii.gz", "f.nhdr", "f.vti"] {
+            std::fs::write(at(name), []).unwrap();
+            let message = Volume::open(at(name)).unwrap_err().to_string();
+            assert!(message.contains(name), "{message}");
         }
     }
 }

@@ -1,7 +1,7 @@
 //! Wavefront OBJ with vertex colours, for tools that read nothing better. Positions keep all digits of f64.
 
 use super::Mesh;
-use super::atomic::AtomicFile;
+use crate::atomic::AtomicFile;
 use crate::error::Result;
 use std::io::{self, Write};
 use std::path::Path;

@@ -1,6 +1,6 @@
 //! Pictures: linear RGB in memory, PNG for the eye, EXR for numbers.
 
-use super::atomic::AtomicFile;
+use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
 use exr::meta::attribute::{AttributeValue, Text};
 use exr::prelude::WritableImage;

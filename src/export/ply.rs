@@ -4,7 +4,7 @@
 //! it), the face list is `uchar int`, and positions are `float`: with coordinates of 1e6 their steps are 0.06.
 
 use super::Mesh;
-use super::atomic::AtomicFile;
+use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
 use std::io::{self, Write};
 use std::path::Path;

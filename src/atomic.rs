@@ -73,7 +73,7 @@ impl AtomicFile {
     }
 
     /// Commits what `written` says was written well; its failure becomes an [`Error::Io`] at the file.
-    pub(super) fn finish(self, written: io::Result<()>) -> Result<()> {
+    pub(crate) fn finish(self, written: io::Result<()>) -> Result<()> {
         written.map_err(|e| Error::io(&self.target, e))?;
         self.commit()
     }

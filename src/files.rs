@@ -1,0 +1,230 @@
+//! Reading and writing whole files: no promise of a header is believed before the bytes are there, and no half
+//! file ever stands under its final name.
+
+use crate::atomic::AtomicFile;
+use crate::error::{Error, Result};
+use flate2::read::MultiGzDecoder;
+use std::fs::File;
+use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::path::Path;
+
+/// What may be allocated on the word of a header alone, beyond twice the file's size.
+const TRUSTED: u64 = 64 << 20;
+
+/// DEFLATE cannot expand further than this (RFC 1951: 258 bytes from 2 bits).
+const DEFLATE_LIMIT: u64 = 1032;
+
+/// Where the samples of a file begin, and how they are packed.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Section {
+    /// Stored bytes before the section.
+    pub(crate) start: u64,
+    /// Whether the section is a gzip stream.
+    pub(crate) gzip: bool,
+    /// Bytes to pass over, after unpacking.
+    pub(crate) skip: u64,
+}
+
+/// Opens a file for reading.
+///
+/// # Errors
+/// `Io` with the path.
+pub(crate) fn open(path: &Path) -> Result<File> {
+    File::open(path).map_err(|e| Error::io(path, e))
+}
+
+/// Reads a whole file.
+///
+/// # Errors
+/// `Io` with the path.
+pub(crate) fn read(path: &Path) -> Result<Vec<u8>> {
+    std::fs::read(path).map_err(|e| Error::io(path, e))
+}
+
+/// Length of a file in bytes.
+///
+/// # Errors
+/// `Io` with the path.
+pub(crate) fn length(path: &Path) -> Result<u64> {
+    Ok(open(path)?.metadata().map_err(|e| Error::io(path, e))?.len())
+}
+
+/// Whether a file begins like a gzip stream.
+///
+/// # Errors
+/// `Io` with the path.
+pub(crate) fn is_gzip(path: &Path) -> Result<bool> {
+    let mut head = Vec::new();
+    open(path)?.take(2).read_to_end(&mut head).map_err(|e| Error::io(path, e))?;
+    Ok(head == [0x1f, 0x8b])
+}
+
+/// Opens a section of a file, unpacked.
+fn open_section(path: &Path, section: Section) -> Result<Box<dyn Read>> {
+    let mut file = open(path)?;
+    file.seek(SeekFrom::Start(section.start)).map_err(|e| Error::io(path, e))?;
+    Ok(if section.gzip { Box::new(MultiGzDecoder::new(BufReader::new(file))) } else { Box::new(file) })
+}
+
+/// Reads at most the first `n` bytes of a section.
+///
+/// # Errors
+/// `Io` with the path; `Invalid` if a gzip stream is damaged within them.
+pub(crate) fn read_head(path: &Path, section: Section, n: u64) -> Result<Vec<u8>> {
+    let mut head = Vec::new();
+    match open_section(path, section)?.take(section.skip + n).read_to_end(&mut head) {
+        Ok(_) => Ok(head.split_off(head.len().min(section.skip as usize))),
+        Err(e) => Err(broken(path, section, head.len() as u64, section.skip + n, e)),
+    }
+}
+
+/// Reads exactly the `promised` bytes of a section.
+///
+/// Before it is known that they exist, at most twice the file's size + 64 MB are held: a plain section is compared
+/// with the file's length, a packed one is unpacked once without keeping it. A gzip stream is read to its end, so
+/// that its checksum is checked. Further bytes behind the promised ones are let pass.
+///
+/// # Errors
+/// `Io` with the path; `Invalid` if the section holds less, or its gzip stream breaks off or is damaged.
+pub(crate) fn read_section(path: &Path, section: Section, promised: u64) -> Result<Vec<u8>> {
+    let length = length(path)?;
+    let stored = length.saturating_sub(section.start);
+    let total = promised.saturating_add(section.skip);
+    let most = if section.gzip { stored.saturating_mul(DEFLATE_LIMIT) } else { stored };
+    if total > most {
+        return Err(Error::invalid(
+            path,
+            format!(
+                "the header promises {promised} bytes of samples from byte {} on, but the file's {length} bytes cannot \
+                 hold more than {}; it is cut short or its header is wrong",
+                section.start + section.skip,
+                most.saturating_sub(section.skip)
+            ),
+        ));
+    }
+    if section.gzip && total > length.saturating_mul(2).saturating_add(TRUSTED) {
+        let mut reader = open_section(path, section)?.take(total);
+        let mut counted = 0;
+        let mut buffer = vec![0; 1 << 16];
+        loop {
+            match reader.read(&mut buffer) {
+                Ok(0) => break,
+                Ok(n) => counted += n as u64,
+                Err(e) if e.kind() == std::io::ErrorKind::Interrupted => {}
+                Err(e) => return Err(broken(path, section, counted, total, e)),
+            }
+        }
+        if counted < total {
+            return Err(short(path, section, counted, total));
+        }
+    }
+
+    let mut reader = open_section(path, section)?;
+    let skipped = std::io::copy(&mut (&mut reader).take(section.skip), &mut std::io::sink())
+        .map_err(|e| broken(path, section, 0, total, e))?;
+    let mut bytes = Vec::with_capacity(promised as usize);
+    if let Err(e) = (&mut reader).take(promised).read_to_end(&mut bytes) {
+        return Err(broken(path, section, skipped + bytes.len() as u64, total, e));
+    }
+    if (bytes.len() as u64) < promised {
+        return Err(short(path, section, skipped + bytes.len() as u64, total));
+    }
+    if section.gzip {
+        std::io::copy(&mut reader, &mut std::io::sink()).map_err(|e| broken(path, section, total, total, e))?;
+    }
+    Ok(bytes)
+}
+
+/// The error of a section that ends too early.
+fn short(path: &Path, section: Section, found: u64, total: u64) -> Error {
+    let kind = if section.gzip { "unpacked " } else { "" };
+    Error::invalid(path, format!("{total} {kind}bytes promised, {found} found; it is cut short or its header is wrong"))
+}
+
+/// The error of a reader that failed: the gzip stream's fault, or the system's.
+fn broken(path: &Path, section: Section, found: u64, total: u64, source: std::io::Error) -> Error {
+    use std::io::ErrorKind as K;
+    match source.kind() {
+        K::UnexpectedEof | K::InvalidData | K::InvalidInput if section.gzip => Error::invalid(
+            path,
+            format!("the gzip stream is cut short or damaged ({source}) after {found} of {total} unpacked bytes"),
+        ),
+        _ => Error::io(path, source),
+    }
+}
+
+/// Writes a file under a temporary name in the same folder and renames it when it is complete, so that `path` holds
+/// either its old content or the whole new one, whenever the program is stopped.
+///
+/// # Errors
+/// `Io` with the path, or what `write` returns; the temporary file is removed then.
+pub(crate) fn write_atomically(
+    path: &Path,
+    write: impl FnOnce(&mut AtomicFile) -> std::io::Result<()>,
+) -> Result<()> {
+    let mut file = AtomicFile::create(path)?;
+    let written = write(&mut file);
+    file.finish(written)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use flate2::{Compression, write::GzEncoder};
+
+    fn gz(bytes: &[u8]) -> Vec<u8> {
+        let mut e = GzEncoder::new(Vec::new(), Compression::fast());
+        e.write_all(bytes).unwrap();
+        e.finish().unwrap()
+    }
+
+    #[test]
+    fn sections_are_exact() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a");
+        std::fs::write(&path, [9, 9, 1, 2, 3, 4]).unwrap();
+        let plain = Section { start: 2, gzip: false, skip: 1 };
+        assert_eq!(read_section(&path, plain, 3).unwrap(), [2, 3, 4]);
+        assert_eq!(read_section(&path, plain, 2).unwrap(), [2, 3]);
+        assert!(matches!(read_section(&path, plain, 4), Err(Error::Invalid(_))));
+
+        let mut stored = vec![7];
+        stored.extend(gz(&[1, 2, 3, 4]));
+        std::fs::write(&path, &stored).unwrap();
+        let packed = Section { start: 1, gzip: true, skip: 1 };
+        assert_eq!(read_section(&path, packed, 3).unwrap(), [2, 3, 4]);
+        assert_eq!(read_head(&path, packed, 2).unwrap(), [2, 3]);
+        assert!(matches!(read_section(&path, packed, 4), Err(Error::Invalid(_))));
+        // Cut inside the checksum: all samples are there, but nothing vouches for them.
+        std::fs::write(&path, &stored[..stored.len() - 3]).unwrap();
+        assert!(matches!(read_section(&path, packed, 3), Err(Error::Invalid(_))));
+    }
+
+    #[test]
+    fn a_large_promise_is_checked_before_it_is_believed() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a");
+        // 100 MB of zeros pack into 0.4 MB, so a promise of 300 MB passes DEFLATE's own limit and needs the count.
+        std::fs::write(&path, gz(&vec![0; 100 << 20])).unwrap();
+        let section = Section { start: 0, gzip: true, skip: 0 };
+        let message = read_section(&path, section, 300 << 20).unwrap_err().to_string();
+        assert!(message.contains("104857600 found"), "{message}");
+        assert_eq!(read_section(&path, section, 100 << 20).unwrap().len(), 100 << 20);
+        let message = read_section(&path, section, 1 << 40).unwrap_err().to_string();
+        assert!(message.contains("cannot hold"), "{message}");
+    }
+
+    #[test]
+    fn a_failed_write_leaves_the_old_file_and_no_temporary() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a");
+        write_atomically(&path, |w| w.write_all(b"old")).unwrap();
+        let failed = write_atomically(&path, |w| {
+            w.write_all(b"new")?;
+            Err(std::io::Error::other("full"))
+        });
+        assert!(matches!(failed, Err(Error::Io { .. })));
+        assert_eq!(std::fs::read(&path).unwrap(), b"old");
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+}

@@ -1,0 +1,375 @@
+//! Scene files (TOML), and how a volume, a scene file and flags become a [`Scene`].
+
+use crate::bake::BakeOptions;
+use crate::error::{Error, Result};
+use crate::field::{Field, Sweep};
+use crate::flattened::Side;
+use crate::polygon::Polygon;
+use crate::scene::{Boundary, Scene, Surface, cornell_box, read_obj};
+use crate::volume::generate::Generator;
+use crate::volume::raw::RawLayout;
+use crate::volume::statistics::VolumeStatistics;
+use crate::volume::{ElementType, Endian, Volume};
+use glam::DVec3;
+use serde::Deserialize;
+use std::path::{Path, PathBuf};
+
+/// A scene file: what [`Scene`] needs and how to bake it. Flags of the same names override it.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+pub struct SceneFile {
+    /// The volume.
+    pub volume: VolumeSource,
+    /// The sweep [lo, hi] in source units; a suggestion from the data if absent.
+    pub isovalues: Option<[f64; 2]>,
+    /// Material and sides.
+    #[serde(default)]
+    pub surface: SurfaceOptions,
+    /// Walls and luminaires.
+    #[serde(default, rename = "box")]
+    pub surroundings: BoxOptions,
+    /// How to bake.
+    #[serde(default)]
+    pub bake: BakeOptions,
+}
+
+/// `[volume]`: a file or a generator.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+pub struct VolumeSource {
+    /// A volume file, relative to the scene file.
+    pub file: Option<PathBuf>,
+    /// How to read a headerless file.
+    pub raw: Option<RawOptions>,
+    /// Name of a generator instead of a file.
+    pub generator: Option<String>,
+    /// Samples along each edge of a generated volume.
+    pub size: Option<usize>,
+}
+
+/// The layout of a headerless file.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize, clap::Args)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+pub struct RawOptions {
+    /// Samples of a headerless file along x, y, z (x fastest)
+    #[arg(long = "raw-dims", value_name = "NX,NY,NZ", value_delimiter = ',')]
+    pub dims: Option<Vec<usize>>,
+    /// Sample type of a headerless file: u8, i8, u16 … f32, f64
+    #[arg(long = "raw-type", value_name = "TYPE")]
+    #[serde(rename = "type")]
+    pub element: Option<String>,
+    /// Byte order of a headerless file: little or big
+    #[arg(long = "raw-endian", value_name = "ORDER")]
+    pub endian: Option<String>,
+    /// World distance between samples of a headerless file
+    #[arg(long = "raw-spacing", value_name = "DX,DY,DZ", value_delimiter = ',')]
+    pub spacing: Option<Vec<f64>>,
+    /// World position of the first sample of a headerless file
+    #[arg(long = "raw-origin", value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true)]
+    pub origin: Option<Vec<f64>>,
+    /// Bytes to skip at the start of a headerless file
+    #[arg(long = "raw-skip", value_name = "BYTES")]
+    pub skip: Option<u64>,
+}
+
+impl RawOptions {
+    /// The layout.
+    ///
+    /// # Errors
+    /// `Invalid` with the key that is missing or wrong.
+    pub fn layout(&self, path: &Path) -> Result<RawLayout> {
+        let fail = |what: &str| Error::invalid(path, format!("raw layout: {what}"));
+        let triple = |v: &Option<Vec<f64>>, name: &str| match v.as_deref() {
+            None => Ok(None),
+            Some(&[x, y, z]) => Ok(Some(DVec3::new(x, y, z))),
+            Some(v) => Err(fail(&format!("{name} needs three numbers, found {}", v.len()))),
+        };
+        let dims = match self.dims.as_deref() {
+            Some(&[x, y, z]) => [x, y, z],
+            Some(v) => return Err(fail(&format!("dims needs three counts, found {}", v.len()))),
+            None => return Err(fail("dims is missing; give the samples along x, y, z")),
+        };
+        let name = self.element.as_deref().unwrap_or("u8");
+        let element = ElementType::from_name(name)
+            .ok_or_else(|| fail(&format!("type '{name}' is unknown; use u8, i8, u16, i16, u32, i32, u64, i64, f32 or f64")))?;
+        let mut layout = RawLayout::new(dims, element);
+        layout.endian = match self.endian.as_deref() {
+            None | Some("little") => Endian::Little,
+            Some("big") => Endian::Big,
+            Some(other) => return Err(fail(&format!("endian '{other}' is neither little nor big"))),
+        };
+        layout.spacing = triple(&self.spacing, "spacing")?.unwrap_or(DVec3::ONE);
+        layout.origin = triple(&self.origin, "origin")?.unwrap_or(DVec3::ZERO);
+        layout.header_bytes = self.skip.unwrap_or(0);
+        Ok(layout)
+    }
+
+    fn given(&self) -> bool {
+        *self != Self::default()
+    }
+}
+
+/// A number for all channels, or three.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[serde(untagged)]
+pub enum Rgb {
+    /// The same in all channels.
+    Grey(f64),
+    /// Red, green, blue.
+    Channels([f64; 3]),
+}
+
+impl Rgb {
+    /// As a vector.
+    pub fn vector(self) -> DVec3 {
+        match self {
+            Rgb::Grey(x) => DVec3::splat(x),
+            Rgb::Channels(c) => DVec3::from_array(c),
+        }
+    }
+}
+
+impl std::str::FromStr for Rgb {
+    type Err = String;
+
+    fn from_str(text: &str) -> std::result::Result<Self, String> {
+        let v: Option<Vec<f64>> = text.split(',').map(|w| w.trim().parse().ok()).collect();
+        match v.as_deref() {
+            Some(&[x]) => Ok(Rgb::Grey(x)),
+            Some(&[r, g, b]) => Ok(Rgb::Channels([r, g, b])),
+            _ => Err(format!("'{text}' is no colour; write one number or three such as 0.8,0.7,0.6")),
+        }
+    }
+}
+
+/// Which side of the level sets is outside.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+#[allow(missing_docs, reason = "the names say it")]
+pub enum OutsideName {
+    Lower,
+    Higher,
+}
+
+/// Which sides are stored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum SidesName {
+    /// The outside only.
+    Outside,
+    /// Two grids.
+    Both,
+}
+
+/// What the volume's faces do.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum BoundaryName {
+    /// Cut level sets open.
+    Open,
+    /// Close them.
+    Capped,
+}
+
+/// `[surface]`, and the flags of the same names.
+#[derive(Clone, Debug, Default, Deserialize, clap::Args)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+pub struct SurfaceOptions {
+    /// Diffuse reflectance of the isosurfaces: one number or R,G,B in [0, 1] (default 0.75)
+    #[arg(long, value_name = "RGB")]
+    pub albedo: Option<Rgb>,
+    /// Radiance that the isosurfaces emit (default 0)
+    #[arg(long, value_name = "RGB")]
+    pub emission: Option<Rgb>,
+    /// The side of the surface that is outside: where values are lower (default) or higher
+    #[arg(long)]
+    pub outside: Option<OutsideName>,
+    /// Sides to store (default: outside)
+    #[arg(long)]
+    pub sides: Option<SidesName>,
+    /// What the volume's faces do to surfaces that run into them (default: open)
+    #[arg(long)]
+    pub boundary: Option<BoundaryName>,
+}
+
+/// `[box]`, and the flags of the same names.
+#[derive(Clone, Debug, Default, Deserialize, clap::Args)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+pub struct BoxOptions {
+    /// Surroundings: cornell (default), none, or an OBJ file with walls and luminaires
+    #[arg(long = "box", value_name = "BOX")]
+    pub kind: Option<String>,
+    /// Gap between the volume and the Cornell box, as a fraction of the volume's edges (default 0)
+    #[arg(long, value_name = "FRACTION")]
+    pub margin: Option<f64>,
+}
+
+/// What flags say about a scene; they override its file.
+#[derive(Clone, Debug, Default, clap::Args)]
+pub struct SceneOptions {
+    /// The sweep: lowest and highest isovalue, in the volume's units (default: suggested from the data)
+    #[arg(long, num_args = 2, value_names = ["LO", "HI"], allow_negative_numbers = true)]
+    pub isovalues: Option<Vec<f64>>,
+    #[command(flatten)]
+    #[allow(missing_docs, reason = "a doc comment would become the group's help")]
+    pub surface: SurfaceOptions,
+    #[command(flatten)]
+    #[allow(missing_docs, reason = "a doc comment would become the group's help")]
+    pub surroundings: BoxOptions,
+    #[command(flatten)]
+    #[allow(missing_docs, reason = "a doc comment would become the group's help")]
+    pub raw: RawOptions,
+}
+
+/// A scene ready to bake, and the volume it came from.
+pub struct Loaded {
+    /// The volume in source units.
+    pub volume: Volume,
+    /// The scene.
+    pub scene: Scene,
+    /// The file's `[bake]` table.
+    pub bake: BakeOptions,
+}
+
+impl SceneFile {
+    /// Reads and checks a scene file.
+    ///
+    /// # Errors
+    /// `Io`; `Invalid` with file, line and key.
+    pub fn read(path: &Path) -> Result<Self> {
+        let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+        toml::from_str(&text).map_err(|e| {
+            let line = e.span().map_or(1, |s| text[..s.start.min(text.len())].matches('\n').count() + 1);
+            let message = e.message().replace('\n', " ");
+            Error::Invalid(format!("{}:{line}: {message}", path.display()))
+        })
+    }
+}
+
+/// Loads a volume, or a scene file (`.toml`), with flags laid over it.
+///
+/// # Errors
+/// `Io`, `Invalid` or `NotSupported`; messages name the file and what is wrong in it.
+pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
+    let is_scene = input.extension().is_some_and(|e| e.eq_ignore_ascii_case("toml"));
+    let (file, folder) = if is_scene {
+        (SceneFile::read(input)?, input.parent().unwrap_or(Path::new("")).to_path_buf())
+    } else {
+        let volume = VolumeSource { file: Some(input.to_path_buf()), ..VolumeSource::default() };
+        (SceneFile { volume, ..SceneFile::default() }, PathBuf::new())
+    };
+    let volume = load_volume(input, &file.volume, &folder, &options.raw)?;
+    let isovalues = match (options.isovalues.as_deref(), file.isovalues) {
+        (Some(&[lo, hi]), _) => [lo, hi],
+        (_, Some(range)) => range,
+        _ => VolumeStatistics::of(&volume).sweep.ok_or_else(|| match volume.range() {
+            None => Error::invalid(&volume.name, "none of its samples is finite"),
+            Some((v, _)) => Error::invalid(&volume.name, format!("every sample is {v}: it holds no isosurface")),
+        })?,
+    };
+    let where_ = |e: Error| if is_scene && options.isovalues.is_none() { e.in_file(input) } else { e };
+    let sweep = Sweep::new(isovalues[0], isovalues[1]).map_err(where_)?;
+    let field = Field::new(&volume, sweep)?;
+    let polygons = surroundings(&file.surroundings, &options.surroundings, &folder, &field)?;
+    let (surface, boundary) = surface(&file.surface, &options.surface);
+    let scene = Scene::new(field, surface, boundary, polygons).map_err(|e| if is_scene { e.in_file(input) } else { e })?;
+    Ok(Loaded { volume, scene, bake: file.bake })
+}
+
+fn load_volume(input: &Path, source: &VolumeSource, folder: &Path, raw: &RawOptions) -> Result<Volume> {
+    match (&source.file, &source.generator) {
+        (Some(file), None) => {
+            let path = folder.join(file);
+            let layout = if raw.given() { Some(raw) } else { source.raw.as_ref() };
+            match layout {
+                Some(layout) => layout.layout(&path)?.read(&path),
+                None => Volume::open(&path),
+            }
+        }
+        (None, Some(name)) => {
+            let generator = Generator::from_name(name).map_err(|e| e.in_file(input))?;
+            generator.sample([source.size.unwrap_or(101); 3]).map_err(|e| e.in_file(input))
+        }
+        _ => Err(Error::invalid(input, "[volume] needs either file or generator")),
+    }
+}
+
+fn surroundings(file: &BoxOptions, flags: &BoxOptions, folder: &Path, field: &Field) -> Result<Vec<Polygon>> {
+    let margin = flags.margin.or(file.margin);
+    // A path in a scene file is relative to it, one in a flag to the working folder.
+    let (kind, folder) = match (&flags.kind, &file.kind) {
+        (Some(kind), _) => (kind.as_str(), Path::new("")),
+        (None, Some(kind)) => (kind.as_str(), folder),
+        (None, None) => ("cornell", folder),
+    };
+    match kind {
+        "cornell" => cornell_box(field.lattice(), margin.unwrap_or(0.0)),
+        _ if margin.is_some() => Err(Error::Invalid(format!("box margin: only the Cornell box has one, not '{kind}'"))),
+        "none" => Ok(Vec::new()),
+        path => read_obj(&folder.join(path)),
+    }
+}
+
+fn surface(file: &SurfaceOptions, flags: &SurfaceOptions) -> (Surface, Boundary) {
+    let default = Surface::default();
+    let outside = flags.outside.or(file.outside).map_or(default.outside, |o| match o {
+        OutsideName::Lower => Side::Lower,
+        OutsideName::Higher => Side::Higher,
+    });
+    let surface = Surface {
+        albedo: flags.albedo.or(file.albedo).map_or(default.albedo, Rgb::vector),
+        emission: flags.emission.or(file.emission).map_or(default.emission, Rgb::vector),
+        outside,
+        both_sides: flags.sides.or(file.sides) == Some(SidesName::Both),
+    };
+    let boundary = match flags.boundary.or(file.boundary) {
+        Some(BoundaryName::Capped) => Boundary::Capped,
+        _ => Boundary::Open,
+    };
+    (surface, boundary)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn error_of(text: &str) -> String {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scene.toml");
+        std::fs::write(&path, text).unwrap();
+        match load(&path, &SceneOptions::default()) {
+            Ok(_) => panic!("accepted: {text}"),
+            Err(e) => e.to_string(),
+        }
+    }
+
+    #[test]
+    fn a_whole_scene() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scene.toml");
+        let text = "isovalues = [3.6, 95]\n[volume]\ngenerator = \"bumps\"\nsize = 17\n[surface]\nalbedo = [0.1, 0.2, 0.3]\n\
+                    outside = \"higher\"\nsides = \"both\"\nboundary = \"capped\"\n[box]\nmargin = 0.1\n[bake]\ngather = 0\n\
+                    grid = \"2x\"\npreset = \"preview\"\n";
+        std::fs::write(&path, text).unwrap();
+        let loaded = load(&path, &SceneOptions::default()).unwrap();
+        assert_eq!(loaded.scene.surface.albedo, DVec3::new(0.1, 0.2, 0.3));
+        assert_eq!((loaded.scene.surface.outside, loaded.scene.surface.both_sides), (Side::Higher, true));
+        assert_eq!((loaded.scene.boundary, loaded.bake.gather_rays), (Boundary::Capped, Some(0)));
+        assert_eq!(loaded.scene.field.sweep().hi(), 95.0);
+        let options = SceneOptions { isovalues: Some(vec![10.0, 20.0]), ..SceneOptions::default() };
+        assert_eq!(load(&path, &options).unwrap().scene.field.sweep().lo(), 10.0, "flags win");
+    }
+
+    #[test]
+    fn errors_name_file_line_and_key() {
+        let e = error_of("[volume]\ngenerator = \"bumps\"\ncolour = 3\n");
+        assert!(e.contains("scene.toml:3:") && e.contains("colour") && !e.contains('\n'), "{e}");
+        let e = error_of("isovalues = [5, 5]\n[volume]\ngenerator = \"bumps\"\nsize = 9\n");
+        assert!(e.contains("scene.toml") && e.contains("isovalues"), "{e}");
+        let e = error_of("[volume]\nfile = \"nowhere.vti\"\n");
+        assert!(e.contains("nowhere.vti"), "{e}");
+        assert!(error_of("[volume]\n").contains("file or generator"));
+        let e = error_of("isovalues = [200, 300]\n[volume]\ngenerator = \"bumps\"\nsize = 9\n");
+        assert!(e.contains("outside the data"), "{e}");
+    }
+}

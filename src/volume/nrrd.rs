@@ -1,0 +1,344 @@
+//! NRRD volumes, attached (`.nrrd`) and detached (`.nhdr`, or a `.nrrd` that names a data file).
+//!
+//! The world is the one of the file's own `space`, whatever it is called: the `space directions` and the
+//! `space origin` are taken as numbers, and a left-posterior-superior file is not turned into RAS.
+
+use crate::error::{Error, Result};
+use crate::files::{self, Section};
+use crate::volume::{ElementType, Endian, Lattice, Samples, Volume, ascii, each_sample_type};
+use glam::{DMat3, DVec3};
+use std::collections::HashMap;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::path::{Path, PathBuf};
+
+/// A header longer than this is not one.
+const HEADER_LIMIT: u64 = 1 << 20;
+
+/// The fields of a header and where it ends.
+struct Header<'a> {
+    path: &'a Path,
+    fields: HashMap<String, String>,
+    /// Bytes up to and with the empty line.
+    length: u64,
+}
+
+/// Reads a 3D scalar volume (or a 4D one with an axis of a single sample). Samples keep the file's type.
+///
+/// Encodings raw, gzip and ascii; versions NRRD0001 to NRRD0005. Without `space directions`, `spacings` and
+/// `axis mins` (or `axis maxs`) place the lattice; a missing spacing is 1.
+///
+/// # Errors
+/// `Io`; `Invalid` for a broken header, too few bytes (known before they are allocated) or a damaged stream;
+/// `NotSupported` for vectors, other dimensions, other encodings and split data files.
+pub fn read(path: &Path) -> Result<Volume> {
+    let header = Header::read(path)?;
+    let keep = header.kept_axes()?;
+    let sizes: Vec<usize> = header.list("sizes")?;
+    let dims = keep.map(|a| sizes[a]);
+    let lattice = header.lattice(dims, keep).map_err(|e| e.in_file(path))?;
+    let element = header.element()?;
+    let samples = header.samples(lattice.len(), element)?;
+    Volume::new(path.display().to_string(), lattice, samples)
+}
+
+/// Writes a volume as an attached, raw, little-endian NRRD. The file's world is the lattice's, without a name.
+///
+/// The file appears under its name only when it is complete.
+///
+/// # Errors
+/// `Io`.
+pub fn write(volume: &Volume, path: &Path) -> Result<()> {
+    let lattice = &volume.lattice;
+    let [nx, ny, nz] = lattice.dims();
+    let kind = match volume.samples().element_type() {
+        ElementType::U8 => "uint8",
+        ElementType::I8 => "int8",
+        ElementType::U16 => "uint16",
+        ElementType::I16 => "int16",
+        ElementType::U32 => "uint32",
+        ElementType::I32 => "int32",
+        ElementType::U64 => "uint64",
+        ElementType::I64 => "int64",
+        ElementType::F32 => "float",
+        ElementType::F64 => "double",
+    };
+    let vector = |v: DVec3| format!("({},{},{})", v.x, v.y, v.z);
+    let axes = lattice.axes();
+    files::write_atomically(path, |out| {
+        write!(
+            out,
+            "NRRD0004\n# written by isolume\ntype: {kind}\ndimension: 3\nspace dimension: 3\nsizes: {nx} {ny} {nz}\n\
+             space directions: {} {} {}\nkinds: domain domain domain\nendian: little\nencoding: raw\n\
+             space origin: {}\n\n",
+            vector(axes.x_axis),
+            vector(axes.y_axis),
+            vector(axes.z_axis),
+            vector(lattice.origin()),
+        )?;
+        each_sample_type!(volume.samples(), v => v.iter().try_for_each(|s| out.write_all(&s.to_le_bytes())))
+    })
+}
+
+impl<'a> Header<'a> {
+    /// Reads the lines up to the first empty one.
+    fn read(path: &'a Path) -> Result<Self> {
+        let mut reader = BufReader::new(files::open(path)?.take(HEADER_LIMIT));
+        let mut fields = HashMap::new();
+        let mut length = 0;
+        let mut line = Vec::new();
+        for number in 1.. {
+            line.clear();
+            length += reader.read_until(b'\n', &mut line).map_err(|e| Error::io(path, e))? as u64;
+            if number == 1 && !line.starts_with(b"NRRD000") {
+                return Err(Error::invalid(path, "does not begin with NRRD0001 … NRRD0005, so it is no NRRD file"));
+            }
+            if line.is_empty() {
+                // A detached header may end without an empty line; an attached one that long is none.
+                if length >= HEADER_LIMIT {
+                    return Err(Error::invalid(path, format!("the header does not end within {HEADER_LIMIT} bytes")));
+                }
+                break;
+            }
+            let text = String::from_utf8_lossy(&line);
+            let text = text.trim_end_matches(['\r', '\n']);
+            if text.is_empty() {
+                break;
+            }
+            if number == 1 {
+                if !matches!(&text[7..], "1" | "2" | "3" | "4" | "5") {
+                    return Err(Error::not_supported(path, format!("{text}: only NRRD0001 … NRRD0005 are read")));
+                }
+                continue;
+            }
+            // `key:=value` pairs are the user's own notes.
+            let Some((key, value)) = text.split_once(':').filter(|(_, v)| !v.starts_with('=')) else {
+                if text.starts_with('#') || text.contains(":=") {
+                    continue;
+                }
+                return Err(Error::invalid(path, format!("line {number}, `{text}`, is no `field: value`")));
+            };
+            if !text.starts_with('#') {
+                // "data file" and "datafile" are the same field.
+                fields.insert(key.replace(' ', "").to_ascii_lowercase(), value.trim().to_string());
+            }
+        }
+        Ok(Self { path, fields, length })
+    }
+
+    fn get(&self, key: &str) -> Option<&str> {
+        self.fields.get(key).map(String::as_str)
+    }
+
+    fn need(&self, key: &str) -> Result<&str> {
+        self.get(key).ok_or_else(|| Error::invalid(self.path, format!("the header has no field `{key}`")))
+    }
+
+    fn invalid(&self, key: &str, wanted: &str) -> Error {
+        Error::invalid(self.path, format!("field `{key}` is `{}`; {wanted}", self.get(key).unwrap_or("")))
+    }
+
+    /// A field with one number per axis.
+    fn list<T: std::str::FromStr>(&self, key: &str) -> Result<Vec<T>> {
+        let n: usize = self.need("dimension")?.parse().map_err(|_| self.invalid("dimension", "it must be a number"))?;
+        let values: Option<Vec<T>> = self.need(key)?.split_whitespace().map(|w| w.parse().ok()).collect();
+        values
+            .filter(|v| v.len() == n)
+            .ok_or_else(|| self.invalid(key, &format!("it must hold {n} numbers, one per axis")))
+    }
+
+    /// One world vector per axis (`None` for `none`), by the parentheses.
+    fn vectors(&self, key: &str) -> Result<Vec<Option<DVec3>>> {
+        let wanted = "it must hold vectors like `(1,0,0)` of three numbers, or `none`";
+        let mut vectors = Vec::new();
+        let mut rest = self.need(key)?.trim();
+        while !rest.is_empty() {
+            if let Some(tail) = rest.strip_prefix("none") {
+                vectors.push(None);
+                rest = tail.trim_start();
+                continue;
+            }
+            let (inside, tail) =
+                rest.strip_prefix('(').and_then(|r| r.split_once(')')).ok_or_else(|| self.invalid(key, wanted))?;
+            let numbers: Option<Vec<f64>> = inside.split(',').map(|w| w.trim().parse().ok()).collect();
+            let numbers: [f64; 3] = numbers.and_then(|n| n.try_into().ok()).ok_or_else(|| self.invalid(key, wanted))?;
+            vectors.push(Some(DVec3::from_array(numbers)));
+            rest = tail.trim_start();
+        }
+        Ok(vectors)
+    }
+
+    /// The three axes of space. Of four, one of a single sample is dropped: the one without a direction if it can be.
+    fn kept_axes(&self) -> Result<[usize; 3]> {
+        let sizes: Vec<usize> = self.list("sizes")?;
+        match sizes.len() {
+            3 => Ok([0, 1, 2]),
+            4 => {
+                let directions =
+                    if self.get("spacedirections").is_some() { self.vectors("spacedirections")? } else { vec![] };
+                let single = |a: &usize| sizes[*a] == 1;
+                let drop = (0..4)
+                    .find(|a| single(a) && directions.get(*a) == Some(&None))
+                    .or_else(|| (0..4).find(single))
+                    .ok_or_else(|| {
+                        Error::not_supported(
+                            self.path,
+                            format!("sizes {sizes:?}: vectors and series are not read; extract one scalar volume"),
+                        )
+                    })?;
+                let kept: Vec<usize> = (0..4).filter(|&a| a != drop).collect();
+                Ok([kept[0], kept[1], kept[2]])
+            }
+            n => Err(Error::not_supported(self.path, format!("dimension {n}: only 3D scalar volumes are read"))),
+        }
+    }
+
+    fn lattice(&self, dims: [usize; 3], keep: [usize; 3]) -> Result<Lattice> {
+        if self.get("spacedirections").is_some() {
+            let vectors = self.vectors("spacedirections")?;
+            let column = |a: usize| {
+                vectors.get(keep[a]).copied().flatten().ok_or_else(|| {
+                    self.invalid("spacedirections", "every axis of the volume needs its vector `(x,y,z)`")
+                })
+            };
+            let axes = DMat3::from_cols(column(0)?, column(1)?, column(2)?);
+            let origin = match self.get("spaceorigin") {
+                Some(_) => self.vectors("spaceorigin")?[..]
+                    .first()
+                    .copied()
+                    .flatten()
+                    .ok_or_else(|| self.invalid("spaceorigin", "it must be one vector `(x,y,z)`"))?,
+                None => DVec3::ZERO,
+            };
+            return Lattice::new(dims, origin, axes);
+        }
+        let per_axis = |key: &str| -> Result<[f64; 3]> {
+            let values: Vec<f64> =
+                if self.get(key).is_some() { self.list(key)? } else { vec![f64::NAN; keep[2].max(3) + 1] };
+            Ok(keep.map(|a| values[a]))
+        };
+        let (spacings, mins, maxs) = (per_axis("spacings")?, per_axis("axismins")?, per_axis("axismaxs")?);
+        let centers: Vec<&str> =
+            self.get("centerings").or(self.get("centers")).unwrap_or("").split_whitespace().collect();
+        let (mut step, mut origin) = (DVec3::ONE, DVec3::ZERO);
+        for a in 0..3 {
+            // Cell-centred samples stand half a step inside the axis' ends; node-centred ones, the default, on them.
+            let cell = centers.get(keep[a]) == Some(&"cell");
+            let steps = if cell { dims[a] as f64 } else { dims[a].saturating_sub(1) as f64 };
+            if !spacings[a].is_nan() {
+                step[a] = spacings[a];
+            } else if !mins[a].is_nan() && !maxs[a].is_nan() {
+                step[a] = (maxs[a] - mins[a]) / steps;
+            }
+            if !mins[a].is_nan() {
+                origin[a] = mins[a] + if cell { 0.5 * step[a] } else { 0.0 };
+            }
+        }
+        Lattice::aligned(dims, origin, step)
+    }
+
+    fn element(&self) -> Result<ElementType> {
+        Ok(match self.need("type")?.to_ascii_lowercase().as_str() {
+            "signed char" | "int8" | "int8_t" => ElementType::I8,
+            "uchar" | "unsigned char" | "uint8" | "uint8_t" => ElementType::U8,
+            "short" | "short int" | "signed short" | "signed short int" | "int16" | "int16_t" => ElementType::I16,
+            "ushort" | "unsigned short" | "unsigned short int" | "uint16" | "uint16_t" => ElementType::U16,
+            "int" | "signed int" | "int32" | "int32_t" => ElementType::I32,
+            "uint" | "unsigned int" | "uint32" | "uint32_t" => ElementType::U32,
+            "longlong"
+            | "long long"
+            | "long long int"
+            | "signed long long"
+            | "signed long long int"
+            | "int64"
+            | "int64_t" => ElementType::I64,
+            "ulonglong" | "unsigned long long" | "unsigned long long int" | "uint64" | "uint64_t" => ElementType::U64,
+            "float" => ElementType::F32,
+            "double" => ElementType::F64,
+            other => {
+                return Err(Error::not_supported(
+                    self.path,
+                    format!("type `{other}`: integers of 8 to 64 bits, float and double are read"),
+                ));
+            }
+        })
+    }
+
+    fn samples(&self, count: usize, element: ElementType) -> Result<Samples> {
+        let (path, start) = match self.get("datafile") {
+            None => (self.path.to_path_buf(), self.length),
+            Some(name) if name.starts_with("LIST") || name.contains('%') => {
+                return Err(Error::not_supported(
+                    self.path,
+                    format!("data file `{name}`: samples split over several files are not read; join them"),
+                ));
+            }
+            Some(name) => (self.path.parent().map_or_else(|| PathBuf::from(name), |p| p.join(name)), 0),
+        };
+        let encoding = self.need("encoding")?.to_ascii_lowercase();
+        let gzip = match encoding.as_str() {
+            "raw" | "ascii" | "text" | "txt" => false,
+            "gzip" | "gz" => true,
+            other => {
+                return Err(Error::not_supported(
+                    self.path,
+                    format!("encoding `{other}`: raw, gzip and ascii are read; convert it with `unu save -e gzip`"),
+                ));
+            }
+        };
+        let number = |key: &str| -> Result<i64> {
+            self.get(key).map_or(Ok(0), |v| v.parse().map_err(|_| self.invalid(key, "it must be a whole number")))
+        };
+        let start = start + skip_lines(&path, start, number("lineskip")?)?;
+        let promised = (count as u64).saturating_mul(element.size() as u64);
+        let skip = match number("byteskip")? {
+            n if n >= 0 => n as u64,
+            // -1: the samples are the end of the file.
+            -1 if encoding == "raw" => {
+                let stored = files::length(&path)?.saturating_sub(start);
+                stored.checked_sub(promised).ok_or_else(|| {
+                    Error::invalid(&path, format!("{promised} bytes of samples promised, {stored} found"))
+                })?
+            }
+            _ => return Err(self.invalid("byteskip", "it must not be negative (-1 is for the raw encoding only)")),
+        };
+        if matches!(encoding.as_str(), "ascii" | "text" | "txt") {
+            let text = files::read(&path)?;
+            let from = usize::try_from(start.saturating_add(skip)).unwrap_or(usize::MAX).min(text.len());
+            return ascii::parse(&text[from..], element, count).map_err(|e| Error::invalid(&path, e));
+        }
+        let endian = match self.get("endian").map(str::to_ascii_lowercase).as_deref() {
+            Some("little") => Endian::Little,
+            Some("big") => Endian::Big,
+            None if element.size() == 1 => Endian::Little,
+            Some(_) => return Err(self.invalid("endian", "it must be `little` or `big`")),
+            None => return Err(Error::invalid(self.path, "samples of several bytes need the field `endian`")),
+        };
+        let bytes = files::read_section(&path, Section { start, gzip, skip }, promised)?;
+        Ok(Samples::from_vec(bytes, element, endian))
+    }
+}
+
+/// Length of the first `lines` lines behind `start`.
+fn skip_lines(path: &Path, start: u64, lines: i64) -> Result<u64> {
+    if lines < 0 {
+        return Err(Error::invalid(path, format!("line skip is {lines}; it must not be negative")));
+    }
+    if lines == 0 {
+        return Ok(0);
+    }
+    let mut reader = BufReader::new(files::open(path)?);
+    let io = |e| Error::io(path, e);
+    reader.seek_relative(start as i64).map_err(io)?;
+    let mut length = 0;
+    for _ in 0..lines {
+        match reader.skip_until(b'\n').map_err(io)? {
+            0 => return Err(Error::invalid(path, format!("line skip is {lines}, but the file has fewer lines"))),
+            n => length += n as u64,
+        }
+    }
+    Ok(length)
+}
+
+#[cfg(test)]
+#[path = "nrrd_tests.rs"]
+mod tests;

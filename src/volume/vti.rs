@@ -1,0 +1,295 @@
+//! VTK XML image data (`.vti`): any point data and field data, reader and writer.
+//!
+//! The lattice's axes are VTK's `Direction` · diag(`Spacing`), and its origin is where the first sample of the extent
+//! stands, wherever the extent starts.
+
+mod codec;
+mod writer;
+
+pub use writer::{SamplesRef, VtiWriter};
+
+use crate::error::{Error, Result};
+use crate::files;
+use crate::volume::{ElementType, Lattice, Samples, ascii};
+use codec::Encoding;
+use glam::{DMat3, DVec3};
+use roxmltree::{Document, Node};
+use std::path::Path;
+
+/// A named array of a file. Sample t of component c is element `t · components + c`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct VtiArray {
+    /// The array's name.
+    pub name: String,
+    /// Values per sample: 1 for scalars, 3 for vectors and colours.
+    pub components: usize,
+    /// The values, components fastest, then x, y, z.
+    pub samples: Samples,
+}
+
+/// All that isolume reads from a `.vti` file. Cell data are left out.
+#[derive(Clone, Debug, PartialEq)]
+pub struct VtiFile {
+    /// Where the samples stand.
+    pub lattice: Lattice,
+    /// Arrays with one tuple per sample.
+    pub point_data: Vec<VtiArray>,
+    /// Numeric arrays about the whole file.
+    pub field_data: Vec<VtiArray>,
+    /// Texts about the whole file; an array of several strings gives one pair each.
+    pub field_strings: Vec<(String, String)>,
+    /// The point data's `Scalars` attribute.
+    pub active_scalars: Option<String>,
+}
+
+impl VtiFile {
+    /// Reads a file of one piece: ascii, inline base64, appended raw or base64; plain or zlib; either byte order.
+    ///
+    /// # Errors
+    /// `Io`; `Invalid` for broken XML or arrays, or fewer bytes than promised (memory grows with the bytes that are
+    /// there, not with the promise); `NotSupported` for several pieces, other compressors and other data sets.
+    pub fn read(path: &Path) -> Result<Self> {
+        Self::parse(&files::read(path)?).map_err(|e| e.in_file(path))
+    }
+
+    /// The scalars to render: the active ones, else an array named `value`, else the only one of 1 component.
+    ///
+    /// # Errors
+    /// `Invalid` with the list of arrays.
+    pub fn into_scalars(self) -> Result<(Lattice, Samples)> {
+        let scalar = |a: &&VtiArray| a.components == 1;
+        let named = |name: &str| self.point_data.iter().filter(scalar).position(|a| a.name == name);
+        let scalars = self.point_data.iter().filter(scalar).count();
+        let chosen = (self.active_scalars.as_deref().and_then(named))
+            .or_else(|| named("value"))
+            .or_else(|| (scalars == 1).then_some(0));
+        let Some(chosen) = chosen else {
+            let list: Vec<String> =
+                self.point_data.iter().map(|a| format!("`{}` ({} components)", a.name, a.components)).collect();
+            return Err(Error::Invalid(format!(
+                "cannot tell which point data to use: {}. Mark a 1-component array as Scalars, or name it `value` \
+                 (cell data are not read: convert them to point data)",
+                if list.is_empty() { "there are none".to_string() } else { list.join(", ") }
+            )));
+        };
+        let array = self.point_data.into_iter().filter(|a| a.components == 1).nth(chosen).expect("found above");
+        Ok((self.lattice, array.samples))
+    }
+
+    /// Reads the bytes of a file.
+    ///
+    /// # Errors
+    /// As [`VtiFile::read`], without the file's name.
+    pub fn parse(bytes: &[u8]) -> Result<Self> {
+        let (text, appended) = split_appended(bytes)?;
+        let document = Document::parse(&text).map_err(|e| Error::Invalid(format!("is no well-formed XML: {e}")))?;
+        let root = document.root_element();
+        if root.tag_name().name() != "VTKFile" || root.attribute("type") != Some("ImageData") {
+            return Err(Error::NotSupported(format!(
+                "holds <{} type=\"{}\">; only VTKFile ImageData is read (resample other data sets to an image)",
+                root.tag_name().name(),
+                root.attribute("type").unwrap_or("")
+            )));
+        }
+        let reader = Reader { encoding: Encoding::of(root)?, appended };
+        let image = child(root, "ImageData")?;
+        let mut pieces = image.children().filter(|n| n.has_tag_name("Piece"));
+        let piece = pieces.next().ok_or_else(|| Error::Invalid("has no <Piece>".into()))?;
+        if pieces.next().is_some() {
+            return Err(Error::NotSupported("has several pieces; write it as one (serial) file".into()));
+        }
+        let extent: [i64; 6] = numbers(piece, "Extent")?;
+        let whole: [i64; 6] = match image.attribute("WholeExtent") {
+            Some(_) => numbers(image, "WholeExtent")?,
+            None => extent,
+        };
+        if extent != whole {
+            return Err(Error::NotSupported(format!("the piece {extent:?} covers only part of the image {whole:?}")));
+        }
+        let lattice = lattice(image, extent)?;
+
+        let mut file =
+            Self { lattice, point_data: vec![], field_data: vec![], field_strings: vec![], active_scalars: None };
+        if let Some(points) = piece.children().find(|n| n.has_tag_name("PointData")) {
+            file.active_scalars = points.attribute("Scalars").filter(|s| !s.is_empty()).map(str::to_string);
+            for node in points.children().filter(|n| n.has_tag_name("DataArray")) {
+                file.point_data.push(reader.array(node, file.lattice.len())?);
+            }
+        }
+        let fields = root.descendants().filter(|n| n.has_tag_name("FieldData")).flat_map(|n| n.children());
+        for node in fields.filter(|n| n.has_tag_name("DataArray") || n.has_tag_name("Array")) {
+            let tuples = node.attribute("NumberOfTuples").and_then(|t| t.trim().parse().ok()).ok_or_else(|| {
+                Error::Invalid(format!("field array `{}` has no number in NumberOfTuples", name(node)))
+            })?;
+            if node.attribute("type") == Some("String") {
+                let texts = reader.strings(node, tuples)?;
+                file.field_strings.extend(texts.into_iter().map(|t| (name(node).to_string(), t)));
+            } else {
+                file.field_data.push(reader.array(node, tuples)?);
+            }
+        }
+        Ok(file)
+    }
+}
+
+/// Splits off the appended data, which need not be XML: the document without them, and the bytes behind their `_`.
+fn split_appended(bytes: &[u8]) -> Result<(std::borrow::Cow<'_, str>, &[u8])> {
+    const TAG: &[u8] = b"<AppendedData";
+    let at = bytes.windows(TAG.len()).position(|w| w == TAG);
+    let text = std::str::from_utf8(&bytes[..at.unwrap_or(bytes.len())])
+        .map_err(|e| Error::Invalid(format!("is no UTF-8 XML text: {e}")))?;
+    let text = text.trim_start_matches('\u{feff}');
+    let Some(at) = at else { return Ok((text.into(), &[])) };
+    let end = bytes[at..].iter().position(|&b| b == b'>').map(|e| at + e + 1);
+    let mark = end.and_then(|end| bytes[end..].iter().position(|&b| b == b'_').map(|m| (end, end + m + 1)));
+    let Some((end, data)) = mark else {
+        return Err(Error::Invalid(
+            "<AppendedData> does not hold a `_` followed by data; the file is cut short".into(),
+        ));
+    };
+    let tag = String::from_utf8_lossy(&bytes[at..end]);
+    Ok((format!("{text}{tag}</AppendedData></VTKFile>").into(), &bytes[data..]))
+}
+
+fn child<'a, 'i>(node: Node<'a, 'i>, tag: &str) -> Result<Node<'a, 'i>> {
+    node.children()
+        .find(|n| n.has_tag_name(tag))
+        .ok_or_else(|| Error::Invalid(format!("<{}> has no <{tag}>", node.tag_name().name())))
+}
+
+fn name<'a>(node: Node<'a, '_>) -> &'a str {
+    node.attribute("Name").unwrap_or("")
+}
+
+/// The numbers of an attribute.
+fn numbers<T: std::str::FromStr, const N: usize>(node: Node, key: &str) -> Result<[T; N]> {
+    let text = node.attribute(key).unwrap_or("");
+    let values: Option<Vec<T>> = text.split_ascii_whitespace().map(|w| w.parse().ok()).collect();
+    values.and_then(|v| v.try_into().ok()).ok_or_else(|| {
+        Error::Invalid(format!("<{}> has {key}=\"{text}\"; it must hold {N} numbers", node.tag_name().name()))
+    })
+}
+
+/// The lattice of an image's extent.
+fn lattice(image: Node, extent: [i64; 6]) -> Result<Lattice> {
+    let vector = |key: &str, missing: DVec3| {
+        if image.has_attribute(key) { numbers(image, key).map(DVec3::from_array) } else { Ok(missing) }
+    };
+    let spacing = vector("Spacing", DVec3::ONE)?;
+    let direction = match image.attribute("Direction") {
+        // The file has it by rows.
+        Some(_) => DMat3::from_cols_array(&numbers(image, "Direction")?).transpose(),
+        None => DMat3::IDENTITY,
+    };
+    let axes = direction * DMat3::from_diagonal(spacing);
+    let first = DVec3::new(extent[0] as f64, extent[2] as f64, extent[4] as f64);
+    let mut dims = [0; 3];
+    for (a, n) in dims.iter_mut().enumerate() {
+        *n = (extent[2 * a + 1].checked_sub(extent[2 * a]))
+            .and_then(|n| usize::try_from(n.checked_add(1)?).ok())
+            .ok_or_else(|| Error::Invalid(format!("Extent {extent:?}: a last index stands before its first")))?;
+    }
+    Lattice::new(dims, vector("Origin", DVec3::ZERO)? + axes * first, axes)
+}
+
+/// What all arrays of a file need.
+struct Reader<'a> {
+    encoding: Encoding,
+    /// The bytes behind the `_`.
+    appended: &'a [u8],
+}
+
+impl Reader<'_> {
+    /// A numeric array of so many tuples.
+    fn array(&self, node: Node, tuples: usize) -> Result<VtiArray> {
+        let fault = |message: String| Error::Invalid(format!("array `{}`: {message}", name(node)));
+        let components: usize = match node.attribute("NumberOfComponents") {
+            Some(n) => n.trim().parse().map_err(|_| fault(format!("NumberOfComponents is `{n}`")))?,
+            None => 1,
+        };
+        let element = match node.attribute("type").unwrap_or("") {
+            "Int8" => ElementType::I8,
+            "UInt8" => ElementType::U8,
+            "Int16" => ElementType::I16,
+            "UInt16" => ElementType::U16,
+            "Int32" => ElementType::I32,
+            "UInt32" => ElementType::U32,
+            "Int64" => ElementType::I64,
+            "UInt64" => ElementType::U64,
+            "Float32" => ElementType::F32,
+            "Float64" => ElementType::F64,
+            other => {
+                return Err(Error::NotSupported(format!(
+                    "array `{}` has type `{other}`; Int8 … UInt64, Float32 and Float64 are read",
+                    name(node)
+                )));
+            }
+        };
+        let count = tuples.checked_mul(components).filter(|n| n.checked_mul(element.size()).is_some());
+        let count = count.ok_or_else(|| fault(format!("{tuples} tuples of {components} do not fit the memory")))?;
+        let samples = match self.bytes(node).map_err(fault)? {
+            Stored::Text(text) => ascii::parse(text.as_bytes(), element, count).map_err(fault)?,
+            Stored::Packed(packed) => {
+                let bytes = self.encoding.unpack(packed, Some(count * element.size())).map_err(fault)?;
+                Samples::from_vec(bytes, element, self.encoding.endian)
+            }
+        };
+        Ok(VtiArray { name: name(node).to_string(), components, samples })
+    }
+
+    /// An array of 0-terminated strings, which VTK writes as their character codes.
+    fn strings(&self, node: Node, tuples: usize) -> Result<Vec<String>> {
+        let fault = |message: String| Error::Invalid(format!("field array `{}`: {message}", name(node)));
+        let codes: Vec<u8> = match self.bytes(node).map_err(fault)? {
+            // VTK writes characters beyond 127 as negative numbers; readers of it may meet either form.
+            Stored::Text(text) => text
+                .split_ascii_whitespace()
+                .map(|w| w.parse::<i16>().ok().filter(|c| (-128..256).contains(c)).map(|c| c as u8))
+                .collect::<Option<_>>()
+                .ok_or_else(|| fault("its text is no list of character codes".into()))?,
+            Stored::Packed(packed) => self.encoding.unpack(packed, None).map_err(fault)?,
+        };
+        let mut texts: Vec<String> =
+            codes.split(|&c| c == 0).map(|s| String::from_utf8_lossy(s).into_owned()).collect();
+        // What stands behind the last 0 is no string.
+        texts.pop();
+        if texts.len() != tuples {
+            return Err(fault(format!("{tuples} strings promised, {} found", texts.len())));
+        }
+        Ok(texts)
+    }
+
+    /// Where an array's values stand.
+    fn bytes<'a>(&'a self, node: Node<'a, '_>) -> Result<Stored<'a>, String> {
+        match node.attribute("format").unwrap_or("ascii") {
+            "ascii" => Ok(Stored::Text(node.text().unwrap_or(""))),
+            "binary" => Ok(Stored::Packed(codec::Packed::Base64(node.text().unwrap_or("").as_bytes()))),
+            "appended" => {
+                let offset = node.attribute("offset").unwrap_or("");
+                let at = offset.trim().parse::<usize>().ok().filter(|&at| at < self.appended.len());
+                let data = at.map(|at| &self.appended[at..]).ok_or_else(|| {
+                    format!("offset \"{offset}\" is not within the {} bytes of appended data", self.appended.len())
+                })?;
+                match node.document().descendants().find(|n| n.has_tag_name("AppendedData")) {
+                    Some(n) if n.attribute("encoding") == Some("raw") => Ok(Stored::Packed(codec::Packed::Raw(data))),
+                    // The closing tag's `<` ends the text.
+                    _ => {
+                        let end = data.iter().position(|&b| b == b'<').unwrap_or(data.len());
+                        Ok(Stored::Packed(codec::Packed::Base64(&data[..end])))
+                    }
+                }
+            }
+            other => Err(format!("format `{other}` is none of ascii, binary and appended")),
+        }
+    }
+}
+
+/// An array's values as they are stored.
+enum Stored<'a> {
+    Text(&'a str),
+    Packed(codec::Packed<'a>),
+}
+
+#[cfg(test)]
+#[path = "vti/tests.rs"]
+mod tests;

@@ -1,0 +1,325 @@
+//! Writes `.vti`: appended raw, 64-bit headers, zlib blocks. The arrays are borrowed and never copied whole.
+
+use crate::error::{Error, Result};
+use crate::files;
+use crate::volume::{ElementType, Lattice, Samples};
+use flate2::{Compression, write::ZlibEncoder};
+use rayon::prelude::*;
+use std::fmt::Write as _;
+use std::io::{Seek, SeekFrom, Write};
+use std::path::Path;
+
+/// Unpacked bytes of a block.
+const BLOCK: usize = 1 << 20;
+
+/// Blocks packed at once: the memory a writer needs.
+const BATCH: usize = 64;
+
+/// Borrowed values of one of the types VTK knows.
+#[derive(Clone, Copy, Debug)]
+#[allow(missing_docs, reason = "the variants are the element types")]
+pub enum SamplesRef<'a> {
+    U8(&'a [u8]),
+    I8(&'a [i8]),
+    U16(&'a [u16]),
+    I16(&'a [i16]),
+    U32(&'a [u32]),
+    I32(&'a [i32]),
+    U64(&'a [u64]),
+    I64(&'a [i64]),
+    F32(&'a [f32]),
+    F64(&'a [f64]),
+}
+
+/// Runs `$body` with `$v` bound to the slice, and the same for conversions into [`SamplesRef`].
+macro_rules! each_type {
+    ($samples:expr, $v:ident => $body:expr) => {
+        match $samples {
+            SamplesRef::U8($v) => $body,
+            SamplesRef::I8($v) => $body,
+            SamplesRef::U16($v) => $body,
+            SamplesRef::I16($v) => $body,
+            SamplesRef::U32($v) => $body,
+            SamplesRef::I32($v) => $body,
+            SamplesRef::U64($v) => $body,
+            SamplesRef::I64($v) => $body,
+            SamplesRef::F32($v) => $body,
+            SamplesRef::F64($v) => $body,
+        }
+    };
+}
+
+macro_rules! conversions {
+    ($($variant:ident $t:ty),*) => {
+        $(impl<'a> From<&'a [$t]> for SamplesRef<'a> {
+            fn from(v: &'a [$t]) -> Self {
+                SamplesRef::$variant(v)
+            }
+        })*
+
+        impl<'a> From<&'a Samples> for SamplesRef<'a> {
+            fn from(samples: &'a Samples) -> Self {
+                match samples {
+                    $(Samples::$variant(v) => SamplesRef::$variant(v),)*
+                }
+            }
+        }
+
+        impl SamplesRef<'_> {
+            /// The element type.
+            pub fn element_type(&self) -> ElementType {
+                match self {
+                    $(SamplesRef::$variant(_) => ElementType::$variant,)*
+                }
+            }
+        }
+    };
+}
+
+conversions!(U8 u8, I8 i8, U16 u16, I16 i16, U32 u32, I32 i32, U64 u64, I64 i64, F32 f32, F64 f64);
+
+impl SamplesRef<'_> {
+    /// Number of values.
+    pub fn len(&self) -> usize {
+        each_type!(self, v => v.len())
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// VTK's name of the type.
+    fn vtk_type(&self) -> &'static str {
+        match self.element_type() {
+            ElementType::U8 => "UInt8",
+            ElementType::I8 => "Int8",
+            ElementType::U16 => "UInt16",
+            ElementType::I16 => "Int16",
+            ElementType::U32 => "UInt32",
+            ElementType::I32 => "Int32",
+            ElementType::U64 => "UInt64",
+            ElementType::I64 => "Int64",
+            ElementType::F32 => "Float32",
+            ElementType::F64 => "Float64",
+        }
+    }
+
+    /// Block `b`, little-endian and packed.
+    fn pack(&self, b: usize) -> std::io::Result<Vec<u8>> {
+        let per = BLOCK / self.element_type().size();
+        let raw: Vec<u8> = each_type!(self, v => {
+            v[b * per..v.len().min((b + 1) * per)].iter().flat_map(|s| s.to_le_bytes()).collect()
+        });
+        let mut encoder = ZlibEncoder::new(Vec::new(), Compression::fast());
+        encoder.write_all(&raw)?;
+        encoder.finish()
+    }
+}
+
+struct Array<'a> {
+    name: String,
+    components: usize,
+    samples: SamplesRef<'a>,
+}
+
+/// Collects what a `.vti` file is to hold, and writes it.
+///
+/// The same content gives the same bytes, for every number of threads. VTK, ParaView, PyVista and
+/// [`super::VtiFile`] read it.
+pub struct VtiWriter<'a> {
+    lattice: &'a Lattice,
+    point_data: Vec<Array<'a>>,
+    field_data: Vec<Array<'a>>,
+    field_strings: Vec<(String, String)>,
+    active_scalars: Option<String>,
+}
+
+impl<'a> VtiWriter<'a> {
+    /// A file without arrays.
+    pub fn new(lattice: &'a Lattice) -> Self {
+        Self { lattice, point_data: vec![], field_data: vec![], field_strings: vec![], active_scalars: None }
+    }
+
+    /// Adds an array with `components` values per lattice sample, components fastest.
+    #[must_use]
+    pub fn point_data(mut self, name: &str, components: usize, samples: impl Into<SamplesRef<'a>>) -> Self {
+        self.point_data.push(Array { name: name.into(), components, samples: samples.into() });
+        self
+    }
+
+    /// Marks the point data that viewers colour by and [`crate::volume::Volume::open`] reads.
+    #[must_use]
+    pub fn active_scalars(mut self, name: &str) -> Self {
+        self.active_scalars = Some(name.into());
+        self
+    }
+
+    /// Adds a numeric array about the whole file, `components` values per tuple.
+    #[must_use]
+    pub fn field_data(mut self, name: &str, components: usize, samples: impl Into<SamplesRef<'a>>) -> Self {
+        self.field_data.push(Array { name: name.into(), components, samples: samples.into() });
+        self
+    }
+
+    /// Adds a text about the whole file.
+    #[must_use]
+    pub fn field_string(mut self, name: &str, text: &str) -> Self {
+        self.field_strings.push((name.into(), text.into()));
+        self
+    }
+
+    /// Writes the file; it appears under its name only when it is complete.
+    ///
+    /// # Errors
+    /// `Invalid` if an array's length is not its components times the lattice's samples (of field data: a multiple of
+    /// its components), if the active scalars are none of the arrays, or a text holds a 0 character; `Io`.
+    pub fn write(&self, path: &Path) -> Result<()> {
+        self.check().map_err(|message| Error::invalid(path, message))?;
+        let (text, slots) = self.document();
+        files::write_atomically(path, |out| {
+            out.write_all(text.as_bytes())?;
+            let data = text.len() as u64;
+            let mut offsets = Vec::with_capacity(slots.len());
+            let mut end = data;
+            for array in self.field_data.iter().chain(&self.point_data) {
+                offsets.push(end - data);
+                // The sizes of the packed blocks stand before them, but are known after.
+                let length = array.samples.len() * array.samples.element_type().size();
+                let blocks = length.div_ceil(BLOCK);
+                let mut header = vec![blocks as u64, BLOCK as u64, (length % BLOCK) as u64];
+                if blocks == 0 {
+                    header.truncate(1);
+                }
+                let start = end;
+                end += 8 * (header.len() + blocks) as u64;
+                out.seek(SeekFrom::Start(end))?;
+                for first in (0..blocks).step_by(BATCH) {
+                    let packed: std::io::Result<Vec<_>> =
+                        (first..blocks.min(first + BATCH)).into_par_iter().map(|b| array.samples.pack(b)).collect();
+                    for block in packed? {
+                        out.write_all(&block)?;
+                        header.push(block.len() as u64);
+                        end += block.len() as u64;
+                    }
+                }
+                out.seek(SeekFrom::Start(start))?;
+                out.write_all(&header.iter().flat_map(|w| w.to_le_bytes()).collect::<Vec<_>>())?;
+                out.seek(SeekFrom::Start(end))?;
+            }
+            out.write_all(b"\n  </AppendedData>\n</VTKFile>\n")?;
+            for (slot, offset) in slots.iter().zip(offsets) {
+                out.seek(SeekFrom::Start(*slot as u64))?;
+                write!(out, "{offset}\"")?;
+            }
+            Ok(())
+        })
+    }
+
+    fn check(&self) -> Result<(), String> {
+        for a in &self.point_data {
+            if Some(a.samples.len()) != self.lattice.len().checked_mul(a.components) {
+                return Err(format!(
+                    "point data `{}` has {} values, but {} samples of {} components need {}",
+                    a.name,
+                    a.samples.len(),
+                    self.lattice.len(),
+                    a.components,
+                    self.lattice.len().saturating_mul(a.components)
+                ));
+            }
+        }
+        for a in &self.field_data {
+            if a.components == 0 || !a.samples.len().is_multiple_of(a.components) {
+                let (name, n, c) = (&a.name, a.samples.len(), a.components);
+                return Err(format!("field data `{name}` has {n} values, which are no tuples of {c} components"));
+            }
+        }
+        if let Some(name) = self.active_scalars.as_ref().filter(|s| self.point_data.iter().all(|a| a.name != **s)) {
+            return Err(format!("the active scalars `{name}` are none of the point data"));
+        }
+        match self.field_strings.iter().find(|(_, text)| text.contains('\0')) {
+            Some((name, _)) => Err(format!("field text `{name}` holds a 0 character, which ends texts in VTK")),
+            None => Ok(()),
+        }
+    }
+
+    /// The document up to the `_` of the appended data, and where in it each array's offset is to be filled in.
+    fn document(&self) -> (String, Vec<usize>) {
+        let l = self.lattice;
+        let cells = l.cells();
+        let extent = format!("0 {} 0 {} 0 {}", cells[0], cells[1], cells[2]);
+        let (origin, mut spacing, axes) = (l.origin(), l.spacing(), l.axes());
+        let diagonal = glam::DMat3::from_diagonal(spacing);
+        let mut direction = String::new();
+        if axes != diagonal {
+            // Column a is the unit vector of axis a; VTK stores rows.
+            let d = axes * glam::DMat3::from_diagonal(spacing.recip());
+            let rows = d.transpose().to_cols_array().map(|v| v.to_string());
+            direction = format!(" Direction=\"{}\"", rows.join(" "));
+        } else {
+            spacing = axes.diagonal();
+        }
+        let mut t = String::from(
+            "<?xml version=\"1.0\"?>\n<VTKFile type=\"ImageData\" version=\"1.0\" byte_order=\"LittleEndian\" \
+             header_type=\"UInt64\" compressor=\"vtkZLibDataCompressor\">\n",
+        );
+        let _ = writeln!(
+            t,
+            "  <ImageData WholeExtent=\"{extent}\" Origin=\"{} {} {}\" Spacing=\"{} {} {}\"{direction}>",
+            origin.x, origin.y, origin.z, spacing.x, spacing.y, spacing.z
+        );
+        let mut slots = Vec::new();
+        let mut array = |t: &mut String, a: &Array, tuples: String| {
+            let (kind, name, n) = (a.samples.vtk_type(), escape(&a.name), a.components);
+            let _ = write!(
+                t,
+                "      <DataArray type=\"{kind}\" Name=\"{name}\"{tuples} NumberOfComponents=\"{n}\" \
+                 format=\"appended\" offset=\""
+            );
+            slots.push(t.len());
+            // Room for any 64-bit offset and the closing quote; XML ignores the spaces that stay.
+            let _ = writeln!(t, "{:21}/>", "");
+        };
+        t.push_str("    <FieldData>\n");
+        for a in &self.field_data {
+            let tuples = format!(" NumberOfTuples=\"{}\"", a.samples.len() / a.components);
+            array(&mut t, a, tuples);
+        }
+        for (name, text) in &self.field_strings {
+            // As VTK writes them: signed character codes.
+            let codes: Vec<String> = text.bytes().map(|c| (c as i8).to_string()).collect();
+            let _ = writeln!(
+                t,
+                "      <Array type=\"String\" Name=\"{}\" NumberOfTuples=\"1\" format=\"ascii\">\n        {} 0\n      \
+                 </Array>",
+                escape(name),
+                codes.join(" ")
+            );
+        }
+        let scalars = self.active_scalars.as_ref().map(|s| format!(" Scalars=\"{}\"", escape(s))).unwrap_or_default();
+        let _ = writeln!(t, "    </FieldData>\n    <Piece Extent=\"{extent}\">\n      <PointData{scalars}>");
+        for a in &self.point_data {
+            array(&mut t, a, String::new());
+        }
+        t.push_str("      </PointData>\n      <CellData/>\n    </Piece>\n  </ImageData>\n");
+        t.push_str("  <AppendedData encoding=\"raw\">\n   _");
+        (t, slots)
+    }
+}
+
+/// Text for an XML attribute.
+fn escape(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            '&' => out.push_str("&amp;"),
+            '<' => out.push_str("&lt;"),
+            '>' => out.push_str("&gt;"),
+            '"' => out.push_str("&quot;"),
+            '\n' | '\r' | '\t' => out.push(' '),
+            c => out.push(c),
+        }
+    }
+    out
+}
