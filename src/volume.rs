@@ -46,7 +46,12 @@ impl Lattice {
         let size: f64 = (0..3).map(|a| axes.col(a).length()).product();
         let inverse = axes.inverse();
         let determinant = axes.determinant();
-        if !origin.is_finite() || !axes.is_finite() || !(determinant.abs() > 1e-9 * size) || !inverse.is_finite() {
+        if !origin.is_finite()
+            || !axes.is_finite()
+            || determinant.is_nan()
+            || determinant.abs() <= 1e-9 * size
+            || !inverse.is_finite()
+        {
             return Err(Error::Invalid(format!(
                 "lattice axes {:?}, {:?}, {:?} with origin {origin}: they must be finite and linearly independent",
                 axes.x_axis, axes.y_axis, axes.z_axis

@@ -1,4 +1,4 @@
-//! Analytic fields on [0,1]³ with exact value and gradient: what the tests know the answers of.
+//! Analytic fields on `[0,1]³` with exact value and gradient: what the tests know the answers of.
 
 use crate::error::{Error, Result};
 use crate::volume::{Lattice, Samples, Volume};
@@ -25,7 +25,7 @@ const CYLINDER_POWER: i32 = 8;
 /// Gap of the `two-cylinders` when none is given: half a radius.
 const CYLINDER_GAP: f64 = 0.04;
 
-/// A field on [0,1]³.
+/// A field on `[0,1]³`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Generator {
     /// A large Gaussian bump under three small ones that shadow it; values 0 … 100, sweep [3.6, 95].
@@ -121,7 +121,7 @@ impl Generator {
         }
     }
 
-    /// Samples the field, as f32, on a vertex-centred lattice over [0,1]³.
+    /// Samples the field, as f32, on a vertex-centred lattice over `[0,1]³`.
     ///
     /// # Errors
     /// `Invalid` as [`Lattice::new`].

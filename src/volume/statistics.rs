@@ -61,7 +61,7 @@ impl VolumeStatistics {
     /// more than 16 bits), with the same result for every number of threads.
     ///
     /// The suggested sweep leaves out background and noise. Its upper end holds back ½ % of all isosurface area
-    /// (∫|∇h| dV, by the coarea formula) and 2 % of the range; its lower end stands above the commonest value, past
+    /// (∫|∇h| dV, by the coarea formula) and 2 % of the range; its lower end stands above the background (the commonest value), past
     /// 5 % of the area, and where the field becomes coherent: gradients taken over ±1 and over ±2 samples agree on
     /// surfaces and are independent in noise. For a background brighter than the middle of the range the two ends change
     /// roles. Both ends lie strictly inside the range, so that no isosurface of a volume of finite samples is empty.
@@ -97,7 +97,9 @@ impl VolumeStatistics {
         let survey = sweep::Survey::of(volume, [min, max]);
         statistics.flat = survey.flat;
         let integer = !matches!(volume.samples(), Samples::F32(_) | Samples::F64(_));
-        statistics.sweep = survey.suggest(commonest, integer);
+        // Measured fields may never take the same value twice; then the fullest bin tells the background.
+        let background = if share >= 0.01 { commonest } else { distribution.fullest() };
+        statistics.sweep = survey.suggest(background, integer);
         statistics
     }
 
@@ -253,6 +255,21 @@ impl Distribution {
             before = n;
         }
         (best, most as f64 / self.total() as f64)
+    }
+
+    /// The middle of the histogram's fullest bin; of the first and last, the range's end.
+    fn fullest(&self) -> f64 {
+        let (min, max) = (self.values[0], self.values[self.values.len() - 1]);
+        let histogram = self.histogram();
+        let most = histogram.iter().copied().max();
+        match histogram.iter().position(|&n| Some(n) == most).unwrap_or(0) {
+            0 => min,
+            b if b == BINS - 1 => max,
+            b => {
+                let t = (b as f64 + 0.5) / BINS as f64;
+                min * (1.0 - t) + max * t
+            }
+        }
     }
 
     fn histogram(&self) -> Vec<u64> {

@@ -83,11 +83,11 @@ impl Survey {
             return Some(sorted(middle(0.25), middle(0.75)));
         }
         let sweep = sorted(near, far);
-        let rounded = nice(sweep, if integer { 20.0 } else { 200.0 });
-        // Rounding must not undo what was decided, and both ends must stay inside the range.
+        // Rounding must not undo what was decided, and both ends must stay inside the range: try finer steps then.
         let kept = |c: f64| c > min && c < max && (c - background) * span > 0.0;
-        let valid = rounded[0] < rounded[1] && kept(rounded[0]) && kept(rounded[1]);
-        Some(if valid { rounded } else { sweep })
+        let parts: [f64; 3] = if integer { [20.0, 50.0, 100.0] } else { [200.0, 500.0, 1000.0] };
+        let mut tries = parts.into_iter().map(|p| nice(sweep, p));
+        Some(tries.find(|r| r[0] < r[1] && kept(r[0]) && kept(r[1])).unwrap_or(sweep))
     }
 
     /// The first value between background and `far` from which on the field is coherent.

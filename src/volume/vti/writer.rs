@@ -173,7 +173,8 @@ impl<'a> VtiWriter<'a> {
     ///
     /// # Errors
     /// `Invalid` if an array's length is not its components times the lattice's samples (of field data: a multiple of
-    /// its components), if the active scalars are none of the arrays, or a text holds a 0 character; `Io`.
+    /// its components), if an array is empty, if the active scalars are none of the arrays, or if a text holds a 0
+    /// character; `Io`.
     pub fn write(&self, path: &Path) -> Result<()> {
         self.check().map_err(|message| Error::invalid(path, message))?;
         let (text, slots) = self.document();
@@ -188,9 +189,6 @@ impl<'a> VtiWriter<'a> {
                 let length = array.samples.len() * array.samples.element_type().size();
                 let blocks = length.div_ceil(BLOCK);
                 let mut header = vec![blocks as u64, BLOCK as u64, (length % BLOCK) as u64];
-                if blocks == 0 {
-                    header.truncate(1);
-                }
                 let start = end;
                 end += 8 * (header.len() + blocks) as u64;
                 out.seek(SeekFrom::Start(end))?;
@@ -217,6 +215,10 @@ impl<'a> VtiWriter<'a> {
     }
 
     fn check(&self) -> Result<(), String> {
+        // VTK 9.7's reader was seen to crash on an array without values.
+        if let Some(a) = self.field_data.iter().chain(&self.point_data).find(|a| a.samples.is_empty()) {
+            return Err(format!("array `{}` has no values, which VTK cannot read; leave it out", a.name));
+        }
         for a in &self.point_data {
             if Some(a.samples.len()) != self.lattice.len().checked_mul(a.components) {
                 return Err(format!(
