@@ -1,6 +1,7 @@
 //! Writers of what users take away: textured meshes and pictures. Every file appears under its name only when it is
 //! complete.
 
+pub mod bake_file;
 pub mod obj;
 pub mod picture;
 pub mod ply;

@@ -158,10 +158,7 @@ fn broken(path: &Path, section: Section, found: u64, total: u64, source: std::io
 ///
 /// # Errors
 /// `Io` with the path, or what `write` returns; the temporary file is removed then.
-pub(crate) fn write_atomically(
-    path: &Path,
-    write: impl FnOnce(&mut AtomicFile) -> std::io::Result<()>,
-) -> Result<()> {
+pub(crate) fn write_atomically(path: &Path, write: impl FnOnce(&mut AtomicFile) -> std::io::Result<()>) -> Result<()> {
     let mut file = AtomicFile::create(path)?;
     let written = write(&mut file);
     file.finish(written)

@@ -46,5 +46,9 @@ pub mod sampling;
 pub mod radiance;
 pub mod illumination_grid;
 pub mod bake;
+pub mod scene_file;
 // Products.
 pub mod export;
+pub mod render;
+// Verbs.
+pub mod cli;

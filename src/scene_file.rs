@@ -90,8 +90,9 @@ impl RawOptions {
             None => return Err(fail("dims is missing; give the samples along x, y, z")),
         };
         let name = self.element.as_deref().unwrap_or("u8");
-        let element = ElementType::from_name(name)
-            .ok_or_else(|| fail(&format!("type '{name}' is unknown; use u8, i8, u16, i16, u32, i32, u64, i64, f32 or f64")))?;
+        let element = ElementType::from_name(name).ok_or_else(|| {
+            fail(&format!("type '{name}' is unknown; use u8, i8, u16, i16, u32, i32, u64, i64, f32 or f64"))
+        })?;
         let mut layout = RawLayout::new(dims, element);
         layout.endian = match self.endian.as_deref() {
             None | Some("little") => Endian::Little,
@@ -272,7 +273,8 @@ pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
     let field = Field::new(&volume, sweep)?;
     let polygons = surroundings(&file.surroundings, &options.surroundings, &folder, &field)?;
     let (surface, boundary) = surface(&file.surface, &options.surface);
-    let scene = Scene::new(field, surface, boundary, polygons).map_err(|e| if is_scene { e.in_file(input) } else { e })?;
+    let scene =
+        Scene::new(field, surface, boundary, polygons).map_err(|e| if is_scene { e.in_file(input) } else { e })?;
     Ok(Loaded { volume, scene, bake: file.bake })
 }
 

@@ -1,0 +1,353 @@
+//! The command line: verbs, flags, and what they print. No physics here.
+
+use crate::bake::{BakeOptions, BakeSettings, bake};
+use crate::embree::Device;
+use crate::error::{Error, Result};
+use crate::export::bake_file::{self, BakedVolume};
+use crate::progress::{self, Progress};
+use crate::render::{Camera, Shading, render};
+use crate::scene_file::{RawOptions, SceneOptions, load};
+use crate::volume::Volume;
+use crate::volume::generate::Generator;
+use crate::volume::statistics::VolumeStatistics;
+use clap::{Parser, Subcommand};
+use glam::DVec3;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+/// Global illumination for every isosurface of a volume at once.
+#[derive(Parser, Debug)]
+#[command(
+    version,
+    about,
+    max_term_width = 100,
+    after_help = "\
+Examples:
+  isolume info head.nii.gz                               what a volume holds, and a suggested sweep
+  isolume bake head.nii.gz --isovalues 15 200 -o head.vti   illuminate every isosurface from 15 to 200
+  isolume render head.vti --isovalue 80 -o head.png      a picture of one of them
+  isolume generate bumps -o bumps.vti                    a volume to play with
+
+Exit codes: 0 done, 1 failed, 2 wrong usage or input, 130 interrupted."
+)]
+pub struct Cli {
+    /// Worker threads (default: all cores)
+    #[arg(long, global = true, value_name = "N")]
+    threads: Option<usize>,
+    /// No progress and no summary
+    #[arg(long, short, global = true)]
+    quiet: bool,
+    #[command(subcommand)]
+    verb: Verb,
+}
+
+#[derive(Subcommand, Debug)]
+enum Verb {
+    /// Print what a volume holds: lattice, type, range, percentiles, histogram, a suggested sweep
+    Info(Info),
+    /// Make a volume from a formula
+    Generate(Generate),
+    /// Illuminate every isosurface of a volume or scene and write one file that holds both
+    Bake(Bake),
+    /// Draw an isosurface of a bake inside its box
+    Render(Render),
+}
+
+#[derive(clap::Args, Debug)]
+struct Info {
+    /// Volume: .nii, .nii.gz, .nrrd, .nhdr, .vti, or a headerless file with --raw-dims
+    file: PathBuf,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    raw: RawOptions,
+}
+
+#[derive(clap::Args, Debug)]
+struct Generate {
+    /// bumps, sphere, linear[:a,b,c], xyz, or two-cylinders[:gap]
+    kind: String,
+    /// Samples along each edge
+    #[arg(long, default_value_t = 101, value_name = "N")]
+    size: usize,
+    /// Output: .vti or .nrrd
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+}
+
+#[derive(clap::Args, Debug)]
+#[command(after_help = "\
+The result holds point data `value` (contour on it), `rgb` (colour by it, without lighting and without a colour map),
+`radiance` (linear), `std_error` and `mask`, the walls' light as field data, and every setting.
+
+Examples:
+  isolume bake ch2.nii.gz --isovalues 15 200 -o head.vti --report head.json
+  isolume bake scene.toml -o out.vti --preset preview
+  isolume bake scan.raw --raw-dims 305,224,14 --raw-spacing 0.24,0.24,1 -o scan.vti")]
+struct Bake {
+    /// Volume, or scene file (.toml)
+    input: PathBuf,
+    /// Output: .vti
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// Write seconds, rays, counts and settings as JSON
+    #[arg(long, value_name = "FILE")]
+    report: Option<PathBuf>,
+    #[command(flatten)]
+    scene: SceneOptions,
+    #[command(flatten)]
+    bake: BakeOptions,
+}
+
+#[derive(clap::Args, Debug)]
+struct Render {
+    /// A bake (.vti)
+    file: PathBuf,
+    /// The isosurface to draw, in the volume's units
+    #[arg(long, value_name = "C", allow_negative_numbers = true)]
+    isovalue: f64,
+    /// Output: .png (exposed, sRGB) or .exr (linear radiance)
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// Plain local shading of the same view, for comparison
+    #[arg(long)]
+    local: bool,
+    /// Pixels from top to bottom
+    #[arg(long, default_value_t = 600, value_name = "PIXELS")]
+    height: usize,
+    /// Pixels across (default: by the box's aspect)
+    #[arg(long, value_name = "PIXELS")]
+    width: Option<usize>,
+    /// Rays per pixel
+    #[arg(long, default_value_t = 16, value_name = "N")]
+    samples: u32,
+    /// Camera position in the world (default: in front of the box)
+    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true)]
+    eye: Option<Vec<f64>>,
+    /// Point the camera looks at (default: the box's centre if --eye is given)
+    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true)]
+    target: Option<Vec<f64>>,
+    /// Up direction (default: 0,0,1)
+    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true)]
+    up: Option<Vec<f64>>,
+    /// Vertical field of view in degrees
+    #[arg(long, default_value_t = 40.0, value_name = "DEGREES")]
+    fov: f64,
+    /// Brightness: multiplies the bake's exposure
+    #[arg(long, default_value_t = 1.0, value_name = "FACTOR")]
+    exposure: f64,
+}
+
+impl Cli {
+    /// Runs the verb.
+    ///
+    /// # Errors
+    /// Whatever the verb meets; [`Error::exit_code`] says how the process should end.
+    pub fn run(self) -> Result<()> {
+        if let Some(threads) = self.threads {
+            if threads == 0 {
+                return Err(Error::Invalid("--threads 0: must be at least 1".into()));
+            }
+            rayon::ThreadPoolBuilder::new()
+                .num_threads(threads)
+                .build_global()
+                .map_err(|e| Error::Failed(format!("cannot start {threads} threads: {e}")))?;
+        }
+        // A second signal ends the process at once.
+        let _ = ctrlc::set_handler(|| {
+            if progress::interrupted() {
+                std::process::exit(130);
+            }
+            progress::interrupt();
+        });
+        let progress = if self.quiet { Progress::Quiet } else { Progress::Shown };
+        match self.verb {
+            Verb::Info(v) => v.run(),
+            Verb::Generate(v) => v.run(progress),
+            Verb::Bake(v) => v.run(progress),
+            Verb::Render(v) => v.run(progress),
+        }
+    }
+}
+
+/// Fails now if `path` could not be written later.
+fn writable(path: &Path) -> Result<()> {
+    crate::atomic::AtomicFile::create(path).map(drop)
+}
+
+fn expect_extension(path: &Path, known: &[&str]) -> Result<()> {
+    let found = path.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
+    if known.contains(&found.as_str()) {
+        return Ok(());
+    }
+    Err(Error::invalid(path, format!("cannot write '.{found}'; name a file that ends in .{}", known.join(" or ."))))
+}
+
+fn device() -> Result<Device> {
+    // Embree builds with its own threads: as many as ours, so that the two pools never fight.
+    Device::new(rayon::current_num_threads())
+}
+
+impl Info {
+    fn run(self) -> Result<()> {
+        let volume = if self.raw == RawOptions::default() {
+            Volume::open(&self.file)?
+        } else {
+            self.raw.layout(&self.file)?.read(&self.file)?
+        };
+        let statistics = VolumeStatistics::of(&volume);
+        if self.json {
+            println!("{}", serde_json::to_string_pretty(&statistics).expect("statistics are plain data"));
+        } else {
+            print!("{}", statistics.to_text());
+        }
+        Ok(())
+    }
+}
+
+impl Generate {
+    fn run(self, progress: Progress) -> Result<()> {
+        let generator = Generator::from_name(&self.kind)?;
+        expect_extension(&self.output, &["vti", "nrrd"])?;
+        writable(&self.output)?;
+        let volume = generator.sample([self.size; 3])?;
+        volume.write(&self.output)?;
+        if progress == Progress::Shown {
+            eprintln!("{}: {} of {} samples", self.output.display(), generator.name(), volume.samples().len());
+        }
+        Ok(())
+    }
+}
+
+impl Bake {
+    fn run(self, progress: Progress) -> Result<()> {
+        let begun = Instant::now();
+        expect_extension(&self.output, &["vti"])?;
+        writable(&self.output)?;
+        if let Some(report) = &self.report {
+            writable(report)?;
+        }
+        let loaded = load(&self.input, &self.scene)?;
+        let load_seconds = begun.elapsed().as_secs_f64();
+        let settings = BakeSettings::new(&self.bake.or(&loaded.bake))?;
+        let sweep = loaded.scene.field.sweep();
+        if progress == Progress::Shown {
+            let [nx, ny, nz] = loaded.volume.lattice.dims();
+            eprintln!(
+                "{}: {nx}×{ny}×{nz}, isovalues {} … {}, {} luminaire(s), {} threads",
+                self.input.display(),
+                sweep.lo(),
+                sweep.hi(),
+                loaded.scene.luminaires().len(),
+                rayon::current_num_threads()
+            );
+            if loaded.scene.luminaires().is_empty() && loaded.scene.surface.emission == DVec3::ZERO {
+                eprintln!("warning: nothing emits light; everything will be black");
+            }
+        }
+        let device = device()?;
+        let mut result = bake(&loaded.scene, &settings, &device, progress)?;
+        result.report.seconds.load = load_seconds;
+        let export = Instant::now();
+        result.report.seconds.total = begun.elapsed().as_secs_f64();
+        bake_file::write(&self.output, &loaded.scene, &loaded.volume, &result)?;
+        result.report.seconds.export = export.elapsed().as_secs_f64();
+        result.report.seconds.total = begun.elapsed().as_secs_f64();
+        if let Some(path) = &self.report {
+            let mut file = crate::atomic::AtomicFile::create(path)?;
+            serde_json::to_writer_pretty(&mut file, &result.report).map_err(|e| Error::io(path, e.into()))?;
+            file.commit()?;
+        }
+        if progress == Progress::Shown {
+            let r = &result.report;
+            eprintln!(
+                "{:>14}  {:.2} s: {} rays ({:.1} M/s), {} photons stored, {} samples",
+                "total",
+                r.seconds.total,
+                r.rays,
+                r.rays_per_second / 1e6,
+                r.photons.stored,
+                r.samples
+            );
+            eprintln!(
+                "{:>14}  {} masked ({} filled), {} gather misses, {} without gradient, {} not finite",
+                "counts",
+                r.masked,
+                r.filled,
+                r.misses,
+                r.samples_without_gradient,
+                r.non_finite + r.non_finite_voxels
+            );
+            eprintln!("{:>14}  {}", "written", self.output.display());
+        }
+        Ok(())
+    }
+}
+
+fn triple(values: Option<&Vec<f64>>, name: &str) -> Result<Option<DVec3>> {
+    match values.map(Vec::as_slice) {
+        None => Ok(None),
+        Some(&[x, y, z]) => Ok(Some(DVec3::new(x, y, z))),
+        Some(v) => Err(Error::Invalid(format!("--{name}: needs three numbers X,Y,Z, found {}", v.len()))),
+    }
+}
+
+impl Render {
+    fn run(self, progress: Progress) -> Result<()> {
+        expect_extension(&self.output, &["png", "exr"])?;
+        writable(&self.output)?;
+        let begun = Instant::now();
+        if !(1..=16384).contains(&self.height) || self.width.is_some_and(|w| !(1..=16384).contains(&w)) {
+            return Err(Error::Invalid("--height, --width: 1 to 16384 pixels".into()));
+        }
+        if !(1..=1 << 16).contains(&self.samples) {
+            return Err(Error::Invalid("--samples: 1 to 65536 rays per pixel".into()));
+        }
+        let baked = BakedVolume::read(&self.file)?;
+        let mut camera = Camera::facing(&baked.scene, self.height);
+        camera.fov = self.fov;
+        if let Some(width) = self.width {
+            camera.size[0] = width;
+        }
+        if let Some(up) = triple(self.up.as_ref(), "up")? {
+            camera.up = up;
+        }
+        let [lo, hi] = baked.scene.bounds();
+        if let Some(eye) = triple(self.eye.as_ref(), "eye")? {
+            (camera.eye, camera.target) = (eye, 0.5 * (lo + hi));
+        }
+        if let Some(target) = triple(self.target.as_ref(), "target")? {
+            camera.target = target;
+        }
+        let shading = if self.local { Shading::Local } else { Shading::Baked };
+        let rendered = render(&baked, self.isovalue, &camera, shading, self.samples, &device()?)?;
+        let exposure = baked.exposure * self.exposure;
+        if self.output.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr")) {
+            let attributes = [
+                ("software".to_owned(), format!("isolume {} ({})", env!("CARGO_PKG_VERSION"), env!("ISOLUME_COMMIT"))),
+                ("bake".to_owned(), self.file.display().to_string()),
+                ("isovalue".to_owned(), self.isovalue.to_string()),
+                ("exposure".to_owned(), exposure.to_string()),
+                ("samplesPerPixel".to_owned(), self.samples.to_string()),
+                ("renderTimeSeconds".to_owned(), begun.elapsed().as_secs_f64().to_string()),
+                ("report".to_owned(), baked.report.to_string()),
+            ];
+            rendered.picture.write_exr(&self.output, &attributes)?;
+        } else {
+            #[allow(clippy::cast_possible_truncation, reason = "a brightness")]
+            rendered.picture.write_png(&self.output, exposure as f32)?;
+        }
+        if progress == Progress::Shown {
+            let seconds = begun.elapsed().as_secs_f64();
+            eprintln!("{}: {}×{} in {seconds:.2} s", self.output.display(), camera.size[0], camera.size[1]);
+            if rendered.unbaked > 0.001 {
+                eprintln!(
+                    "warning: {:.1} % of the picture shows the surface's inside, which was not baked; use --sides both",
+                    100.0 * rendered.unbaked
+                );
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,293 @@
+//! The bake as one `.vti`: the volume, its illumination, the box's light and every setting, for viewers and for
+//! `render`, `compare` and `view`.
+
+use super::picture::srgb_encode;
+use crate::bake::Bake;
+use crate::error::{Error, Result};
+use crate::field::{Field, Sweep};
+use crate::flat::{self, FlatTexture};
+use crate::flattened::Side;
+use crate::illumination_grid::IlluminationGrid;
+use crate::mask::{Mask, local_position};
+use crate::polygon::Polygon;
+use crate::scene::{Boundary, Scene, Surface};
+use crate::volume::vti::{VtiArray, VtiFile, VtiWriter};
+use crate::volume::{Lattice, Samples, Volume};
+use glam::DVec3;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+/// Name of the field string that holds scene and report as JSON.
+const DESCRIPTION: &str = "isolume";
+
+/// A scene without its samples: enough to draw the box and to trace the stored volume again.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct Description {
+    isovalues: [f64; 2],
+    exposure: f64,
+    albedo: DVec3,
+    emission: DVec3,
+    outside: String,
+    both_sides: bool,
+    capped: bool,
+    polygons: Vec<PolygonDescription>,
+    /// Texels (u, v, isovalue) of each flat's texture, by array name.
+    textures: Vec<(usize, String, [usize; 3])>,
+    report: serde_json::Value,
+}
+
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct PolygonDescription {
+    name: String,
+    vertices: Vec<DVec3>,
+    albedo: DVec3,
+    emission: DVec3,
+}
+
+/// Suffix of the arrays of stored side number `i`: the outside has none.
+fn suffix(i: usize) -> &'static str {
+    if i == 0 { "" } else { "_inside" }
+}
+
+/// Writes a bake. Point data: `value` (source units, active scalars), `radiance` (linear RGB), `rgb` (exposed, clamped,
+/// sRGB-encoded), `std_error` (of luminance), `mask` ([`Mask`]); with both sides also `radiance_inside` and so on. Field
+/// data: `wall_<name>` radiance over (u, v, isovalue), exposure, every number of the report, and all of it as JSON.
+///
+/// # Errors
+/// `Io` if the file cannot be written.
+#[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+pub fn write(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result<()> {
+    let report = serde_json::to_value(&bake.report).expect("the report is plain data");
+    let lattice = &bake.lattice;
+    let own = lattice == &volume.lattice;
+    let sweep = scene.field.sweep();
+    let values: Vec<f32> = (0..lattice.len())
+        .into_par_iter()
+        .map(|o| {
+            let p = local_position(&scene.field, lattice, o);
+            if own { volume.value(o) as f32 } else { sweep.from_unit(scene.field.value(p)) as f32 }
+        })
+        .collect();
+    let exposure = bake.exposure as f32;
+    let sides: Vec<(Vec<f32>, Vec<f32>, Vec<u8>)> = bake
+        .sides
+        .iter()
+        .map(|(_, grid)| {
+            let radiance: Vec<f32> = grid.radiance.concat();
+            let rgb = radiance.par_iter().map(|&x| srgb_encode((x * exposure).clamp(0.0, 1.0))).collect();
+            (radiance, rgb, grid.mask.iter().map(|&m| m as u8).collect())
+        })
+        .collect();
+    let mut textures = Vec::new();
+    let texels: Vec<(usize, String, Vec<f32>)> = bake
+        .flats
+        .iter()
+        .enumerate()
+        .filter_map(|(n, t)| {
+            let t = t.as_ref()?;
+            let name = format!("wall_{}", flat_name(scene, n));
+            textures.push((n, name.clone(), t.dims));
+            Some((n, name, t.texels.concat()))
+        })
+        .collect();
+    let description = Description {
+        isovalues: [sweep.lo(), sweep.hi()],
+        exposure: bake.exposure,
+        albedo: scene.surface.albedo,
+        emission: scene.surface.emission,
+        outside: if scene.surface.outside == Side::Lower { "lower" } else { "higher" }.into(),
+        both_sides: scene.surface.both_sides,
+        capped: scene.boundary == Boundary::Capped,
+        polygons: scene
+            .polygons()
+            .iter()
+            .map(|p| PolygonDescription {
+                name: p.name.clone(),
+                vertices: p.vertices().to_vec(),
+                albedo: p.albedo,
+                emission: p.emission,
+            })
+            .collect(),
+        textures,
+        report: report.clone(),
+    };
+    let json = serde_json::to_string(&description).expect("the description is plain data");
+
+    let masks: Vec<Samples> = sides.iter().map(|s| Samples::U8(s.2.clone())).collect();
+    let range = [sweep.lo(), sweep.hi()];
+    let mut numbers = Vec::new();
+    flatten("", &report, &mut numbers);
+    let mut writer = VtiWriter::new(lattice).point_data("value", 1, &values[..]).active_scalars("value");
+    for (i, (((_, grid), side), mask)) in bake.sides.iter().zip(&sides).zip(&masks).enumerate() {
+        let s = suffix(i);
+        writer = writer
+            .point_data(&format!("radiance{s}"), 3, &side.0[..])
+            .point_data(&format!("rgb{s}"), 3, &side.1[..])
+            .point_data(&format!("std_error{s}"), 1, &grid.std_error[..])
+            .point_data(&format!("mask{s}"), 1, mask);
+    }
+    for (_, name, data) in &texels {
+        writer = writer.field_data(name, 3, &data[..]);
+    }
+    let constants: Vec<(String, Samples)> = numbers
+        .into_iter()
+        .chain([("exposure".to_owned(), vec![bake.exposure]), ("isovalues".to_owned(), range.to_vec())])
+        .map(|(name, v)| (name, Samples::F64(v)))
+        .collect();
+    for (name, samples) in &constants {
+        writer = writer.field_data(name, 1, samples);
+    }
+    writer.field_string(DESCRIPTION, &json).write(path)
+}
+
+/// Every number of a JSON tree by its dotted path.
+fn flatten(prefix: &str, value: &serde_json::Value, out: &mut Vec<(String, Vec<f64>)>) {
+    match value {
+        serde_json::Value::Object(map) => {
+            for (key, v) in map {
+                flatten(&if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") }, v, out);
+            }
+        }
+        serde_json::Value::Number(n) => out.push((prefix.to_owned(), vec![n.as_f64().unwrap_or(f64::NAN)])),
+        serde_json::Value::Array(items) if !items.is_empty() && items.iter().all(serde_json::Value::is_number) => {
+            out.push((prefix.to_owned(), items.iter().filter_map(serde_json::Value::as_f64).collect()));
+        }
+        _ => {}
+    }
+}
+
+fn flat_name(scene: &Scene, n: usize) -> String {
+    match scene.polygons().get(n) {
+        Some(p) => p.name.clone(),
+        None => format!("cap_{}", n - scene.polygons().len()),
+    }
+}
+
+/// A bake read back.
+pub struct BakedVolume {
+    /// The stored volume as a scene: its level sets on the grid's lattice, and the box.
+    pub scene: Scene,
+    /// One grid per stored side, the outside first.
+    pub sides: Vec<(Side, IlluminationGrid)>,
+    /// The flats' radiance, by flat number.
+    pub flats: Vec<Option<FlatTexture>>,
+    /// Display exposure.
+    pub exposure: f64,
+    /// The report, as written.
+    pub report: serde_json::Value,
+}
+
+impl BakedVolume {
+    /// Reads a bake.
+    ///
+    /// # Errors
+    /// `Io`; `Invalid` if the file is no bake or is damaged.
+    pub fn read(path: &Path) -> Result<Self> {
+        let file = VtiFile::read(path)?;
+        let text = file.field_strings.iter().find(|(name, _)| name == DESCRIPTION).map(|(_, text)| text.clone());
+        let Some(text) = text else {
+            return Err(Error::invalid(path, "is no bake: it holds no illumination; make one with `isolume bake`"));
+        };
+        Self::from_parts(path, file, &text).map_err(|e| e.in_file(path))
+    }
+
+    fn from_parts(path: &Path, file: VtiFile, text: &str) -> Result<Self> {
+        let d: Description =
+            serde_json::from_str(text).map_err(|e| Error::Invalid(format!("field data '{DESCRIPTION}': {e}")))?;
+        let points = file.lattice.len();
+        let array = |arrays: &[VtiArray], name: &str| -> Result<Samples> {
+            let found = arrays.iter().find(|a| a.name == name);
+            found.map(|a| a.samples.clone()).ok_or_else(|| Error::Invalid(format!("the array '{name}' is missing")))
+        };
+        let floats = |arrays: &[VtiArray], name: &str, count: usize| -> Result<Vec<f32>> {
+            match array(arrays, name)? {
+                Samples::F32(v) if v.len() == count => Ok(v),
+                other => {
+                    Err(Error::Invalid(format!("the array '{name}' holds {} values, not {count} floats", other.len())))
+                }
+            }
+        };
+        let triples = |v: Vec<f32>| -> Vec<[f32; 3]> { v.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect() };
+        let outside = if d.outside == "higher" { Side::Higher } else { Side::Lower };
+        let surface = Surface { albedo: d.albedo, emission: d.emission, outside, both_sides: d.both_sides };
+        let mut sides = Vec::new();
+        for (i, side) in surface.stored_sides().into_iter().enumerate() {
+            let s = suffix(i);
+            let mask = match array(&file.point_data, &format!("mask{s}"))? {
+                Samples::U8(v) if v.len() == points => v,
+                _ => return Err(Error::Invalid(format!("the array 'mask{s}' does not hold a byte per point"))),
+            };
+            let grid = IlluminationGrid {
+                radiance: triples(floats(&file.point_data, &format!("radiance{s}"), 3 * points)?),
+                std_error: floats(&file.point_data, &format!("std_error{s}"), points)?,
+                mask: mask
+                    .into_iter()
+                    .map(|m| match m {
+                        1 => Mask::Valid,
+                        2 => Mask::Filled,
+                        _ => Mask::Empty,
+                    })
+                    .collect(),
+            };
+            sides.push((side, grid));
+        }
+        let values = floats(&file.point_data, "value", points)?;
+        let volume = Volume::new(path.display().to_string(), file.lattice, Samples::F32(values))?;
+        let field = Field::new(&volume, Sweep::new(d.isovalues[0], d.isovalues[1])?)?;
+        let polygons = d
+            .polygons
+            .into_iter()
+            .map(|p| Polygon::new(&p.name, p.vertices, p.albedo, p.emission))
+            .collect::<Result<Vec<_>>>()?;
+        let boundary = if d.capped { Boundary::Capped } else { Boundary::Open };
+        let scene = Scene::new(field, surface, boundary, polygons)?;
+        let mut flats = vec![None; flat::count(&scene)];
+        for (n, name, dims) in d.textures {
+            let texels = triples(floats(&file.field_data, &name, 3 * dims.iter().product::<usize>())?);
+            if let Some(slot) = flats.get_mut(n) {
+                *slot = Some(FlatTexture { dims, texels });
+            }
+        }
+        Ok(Self { scene, sides, flats, exposure: d.exposure, report: d.report })
+    }
+
+    /// The grid's lattice.
+    pub fn lattice(&self) -> &Lattice {
+        self.scene.lattice()
+    }
+
+    /// Radiance of `side` at local `p`: trilinear over the points of the cell that hold something, as a 3D texture
+    /// would give it; `None` if the side is not stored.
+    pub fn radiance(&self, side: Side, p: DVec3) -> Option<DVec3> {
+        let (_, grid) = self.sides.iter().find(|(s, _)| *s == side)?;
+        Some(interpolate(self.lattice(), grid, p))
+    }
+}
+
+/// Trilinear interpolation of a grid's radiance at index coordinates `p` of its lattice, over points that hold something.
+pub fn interpolate(lattice: &Lattice, grid: &IlluminationGrid, p: DVec3) -> DVec3 {
+    let far = lattice.far();
+    let p = p.clamp(DVec3::ZERO, far);
+    let base = p.floor().min(far - 1.0);
+    let u = p - base;
+    let cell = [base.x, base.y, base.z].map(|x| {
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "inside the lattice")]
+        let i = x as usize;
+        i
+    });
+    let (mut sum, mut weight) = (DVec3::ZERO, 0.0);
+    for corner in 0..8 {
+        let [x, y, z] = [corner & 1, corner >> 1 & 1, corner >> 2];
+        let o = lattice.offset(cell[0] + x, cell[1] + y, cell[2] + z);
+        if grid.mask[o] == Mask::Empty {
+            continue;
+        }
+        let w = (if x == 1 { u.x } else { 1.0 - u.x })
+            * (if y == 1 { u.y } else { 1.0 - u.y })
+            * (if z == 1 { u.z } else { 1.0 - u.z });
+        sum += w * DVec3::from_array(grid.radiance[o].map(f64::from));
+        weight += w;
+    }
+    if weight > 0.0 { sum / weight } else { DVec3::ZERO }
+}

@@ -1,0 +1,195 @@
+//! Pictures: the isosurface of a baked volume, coloured by its grid, inside its box.
+
+use crate::direct::luminance;
+use crate::embree::{Device, GraphTracer};
+use crate::error::{Error, Result};
+use crate::export::bake_file::BakedVolume;
+use crate::export::picture::Picture;
+use crate::flat;
+use crate::flattened::{FlattenedHit, FlattenedRay, Side, Target};
+use crate::rng::{Sobol, Stage};
+use crate::scene::Scene;
+use crate::tracer::Tracer;
+use glam::DVec3;
+use rayon::prelude::*;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// A perspective camera in the world.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Camera {
+    /// Where it stands.
+    pub eye: DVec3,
+    /// What it looks at.
+    pub target: DVec3,
+    /// What is up.
+    pub up: DVec3,
+    /// Vertical field of view, degrees.
+    pub fov: f64,
+    /// Pixels across and down.
+    pub size: [usize; 2],
+}
+
+impl Camera {
+    /// The default view: on the box's axis, looking along +y with z up, vertical field of view 40°, as far out as lets
+    /// the front face just fill the frame; `height` pixels tall, aspect Lx : Lz.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "pixel counts")]
+    pub fn facing(scene: &Scene, height: usize) -> Self {
+        let [lo, hi] = scene.bounds();
+        let (centre, size) = (0.5 * (lo + hi), hi - lo);
+        let fov = 40.0;
+        let distance = 0.5 * size.z / f64::to_radians(0.5 * fov).tan();
+        let eye = DVec3::new(centre.x, lo.y - distance, centre.z);
+        let width = ((height as f64 * size.x / size.z).round() as usize).max(1);
+        Self { eye, target: eye + DVec3::Y, up: DVec3::Z, fov, size: [width, height] }
+    }
+
+    /// Unit direction through image coordinates: x from the left, y from the top, in pixels.
+    ///
+    /// # Errors
+    /// `Invalid` if eye and target coincide or the view runs along up.
+    fn basis(&self) -> Result<[DVec3; 3]> {
+        let fail = || Error::Invalid("camera: the eye, the target and up must span a plane".into());
+        let forward = (self.target - self.eye).try_normalize().ok_or_else(fail)?;
+        let right = forward.cross(self.up).try_normalize().ok_or_else(fail)?;
+        if !(self.fov > 0.0 && self.fov < 179.0) || self.size.contains(&0) {
+            return Err(Error::Invalid(format!(
+                "camera: a field of view of {}° over {}×{} pixels; it must be above 0 and below 179, the picture not empty",
+                self.fov, self.size[0], self.size[1]
+            )));
+        }
+        let scale = f64::to_radians(0.5 * self.fov).tan() * 2.0 / self.size[1] as f64;
+        Ok([forward, right * scale, right.cross(forward) * scale])
+    }
+}
+
+/// How surfaces get their colours.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Shading {
+    /// By the baked radiance.
+    Baked,
+    /// By a headlight and a constant: what viewers do without a bake.
+    Local,
+}
+
+/// What a picture says about itself.
+#[derive(Clone, Debug)]
+pub struct Rendered {
+    /// Linear radiance.
+    pub picture: Picture,
+    /// Share of primary rays that met a side of the surface that was not baked.
+    pub unbaked: f64,
+}
+
+/// Renders the isosurface at `isovalue` (source units) with `samples` rays per pixel.
+///
+/// # Errors
+/// `Invalid` for an isovalue outside the sweep or an impossible camera; `Embree`.
+pub fn render(
+    baked: &BakedVolume,
+    isovalue: f64,
+    camera: &Camera,
+    shading: Shading,
+    samples: u32,
+    device: &Device,
+) -> Result<Rendered> {
+    let scene = &baked.scene;
+    let sweep = scene.field.sweep();
+    if !(isovalue >= sweep.lo() && isovalue <= sweep.hi()) {
+        return Err(Error::Invalid(format!(
+            "isovalue {isovalue} lies outside the baked sweep {} … {}; choose one inside, or bake a wider sweep",
+            sweep.lo(),
+            sweep.hi()
+        )));
+    }
+    let tracer = GraphTracer::new(device, scene)?;
+    let c = sweep.isovalue(isovalue);
+    let unbaked = AtomicU64::new(0);
+    let shade = |ray: &FlattenedRay, hit: FlattenedHit, direction: DVec3| match shading {
+        Shading::Local => local(scene, ray, hit, direction) / baked.exposure,
+        Shading::Baked => radiance(baked, ray, hit).unwrap_or_else(|| {
+            unbaked.fetch_add(1, Ordering::Relaxed);
+            DVec3::ZERO
+        }),
+    };
+    let picture = trace_picture(scene, &tracer, c, camera, samples, &shade)?;
+    let total = (camera.size[0] * camera.size[1]) as f64 * f64::from(samples);
+    Ok(Rendered { picture, unbaked: unbaked.into_inner() as f64 / total })
+}
+
+/// Sends `samples` stratified rays through each pixel of hyperplane `c` and averages what `shade` makes of the hits;
+/// misses are black.
+///
+/// # Errors
+/// `Invalid` for an impossible camera.
+pub fn trace_picture<T: Tracer>(
+    scene: &Scene,
+    tracer: &T,
+    c: f32,
+    camera: &Camera,
+    samples: u32,
+    shade: &(dyn Fn(&FlattenedRay, FlattenedHit, DVec3) -> DVec3 + Sync),
+) -> Result<Picture> {
+    let [forward, right, down] = camera.basis().map(|[f, r, u]| [f, r, -u])?;
+    let [width, height] = camera.size;
+    let eye = scene.lattice().to_index(camera.eye).as_vec3();
+    let mut picture = Picture::new(width, height);
+    picture.rgb.par_iter_mut().enumerate().with_min_len(64).for_each(|(i, pixel)| {
+        let set = Sobol::set(0, Stage::Picture, i as u64);
+        let mut sum = DVec3::ZERO;
+        for s in 0..samples {
+            let [x, y] = set.point2(s, 0);
+            let (x, y) = ((i % width) as f64 + x - 0.5 * width as f64, (i / width) as f64 + y - 0.5 * height as f64);
+            let direction = (forward + right * x + down * y).normalize();
+            let ray = scene.ray(eye, direction, c, crate::flattened::Departure::Free);
+            if let Some(hit) = tracer.intersect(&ray) {
+                sum += shade(&ray, hit, direction);
+            }
+        }
+        *pixel = (sum / f64::from(samples)).as_vec3().to_array();
+    });
+    Ok(picture)
+}
+
+/// Baked radiance at a hit; `None` on a side that is not stored.
+fn radiance(baked: &BakedVolume, ray: &FlattenedRay, hit: FlattenedHit) -> Option<DVec3> {
+    let scene = &baked.scene;
+    let p = ray.at(hit.t);
+    let texture = |number: usize, uv: [f64; 2]| {
+        let t = baked.flats.get(number)?.as_ref()?;
+        Some(t.lookup([uv[0], uv[1], f64::from(ray.isovalue)]))
+    };
+    match hit.target {
+        Target::Surface(side) => baked.radiance(side, p),
+        Target::Cap(_, Side::Higher) => Some(DVec3::ZERO),
+        Target::Cap(face, Side::Lower) => {
+            texture(scene.polygons().len() + usize::from(face), flat::face_texture(scene, face, p))
+        }
+        Target::Polygon(id) => {
+            let polygon = &scene.polygons()[id as usize];
+            // From behind, only luminaires are seen: black.
+            let seen = scene.lattice().axes() * ray.direction.as_dvec3();
+            if seen.dot(polygon.normal()) > 0.0 {
+                return Some(DVec3::ZERO);
+            }
+            let uv = polygon.texture(scene.lattice().to_world(p));
+            Some(polygon.emission + texture(id as usize, uv).unwrap_or(DVec3::ZERO))
+        }
+    }
+}
+
+/// Headlight shading, already exposed: ρ (0.15 + 0.85 |cos|).
+fn local(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit, direction: DVec3) -> DVec3 {
+    let p = ray.at(hit.t);
+    let (albedo, normal) = match hit.target {
+        Target::Surface(side) => (scene.surface.albedo, scene.normal(p, side)),
+        Target::Cap(face, _) => (scene.surface.albedo, Some(scene.face_normal(face))),
+        Target::Polygon(id) => {
+            let polygon = &scene.polygons()[id as usize];
+            if polygon.emission != DVec3::ZERO {
+                return DVec3::splat(luminance(polygon.emission).signum());
+            }
+            (polygon.albedo, Some(polygon.normal()))
+        }
+    };
+    albedo * (0.15 + 0.85 * normal.map_or(0.0, |n| n.dot(direction).abs()))
+}
