@@ -2,6 +2,7 @@
 
 use crate::embree::{Device, GraphTracer};
 use crate::error::{Error, Result};
+use crate::fitted_grid::fit;
 use crate::flat::FlatTexture;
 use crate::flattened::Side;
 use crate::illumination_grid::{GridSize, IlluminationGrid, shepard};
@@ -46,6 +47,17 @@ pub enum StrategyName {
     Nodes,
 }
 
+/// How samples become grid values.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum Interpolation {
+    /// Modified Shepard: the nearest samples blended, as BB09.
+    Shepard,
+    /// Least squares: the grid whose interpolation on isosurfaces is nearest to the samples.
+    #[default]
+    Fit,
+}
+
 /// What a user may set about a bake, in a scene file's `[bake]` table or by flags of the same names. Unset values come
 /// from the preset.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, clap::Args)]
@@ -82,6 +94,9 @@ pub struct BakeOptions {
     /// Nearest samples that Shepard interpolation blends
     #[arg(long, value_name = "K")]
     pub neighbours: Option<usize>,
+    /// How samples become grid values
+    #[arg(long)]
+    pub interpolation: Option<Interpolation>,
     /// Size of the illumination grid: a factor of the volume's such as 2x, or NX,NY,NZ points
     #[arg(long, value_name = "SIZE")]
     #[serde(default, with = "grid_text")]
@@ -126,6 +141,7 @@ impl BakeOptions {
             shadow_rays: self.shadow_rays.or(other.shadow_rays),
             gather_rays: self.gather_rays.or(other.gather_rays),
             neighbours: self.neighbours.or(other.neighbours),
+            interpolation: self.interpolation.or(other.interpolation),
             grid: self.grid.or(other.grid),
             wall_resolution: self.wall_resolution.or(other.wall_resolution),
             seed: self.seed.or(other.seed),
@@ -160,6 +176,8 @@ pub struct BakeSettings {
     pub cache_shadow_rays: u32,
     /// Samples blended per grid point.
     pub neighbours: usize,
+    /// How samples become grid values.
+    pub interpolation: Interpolation,
     /// Grid size, as text.
     #[serde(serialize_with = "grid_size_text")]
     pub grid: GridSize,
@@ -206,6 +224,7 @@ impl BakeSettings {
             gather_rays: o.gather_rays.unwrap_or(gather),
             cache_shadow_rays: cache,
             neighbours: o.neighbours.unwrap_or(8),
+            interpolation: o.interpolation.unwrap_or_default(),
             grid: o.grid.unwrap_or(GridSize::Factor(1)),
             wall_resolution: o.wall_resolution.unwrap_or(wall),
             wall_isovalues: isovalues,
@@ -384,13 +403,18 @@ pub fn bake(scene: &Scene, settings: &BakeSettings, device: &Device, progress: P
         rays += sampled.rays;
         without_gradient += sampled.without_gradient;
 
-        let stage = progress.stage("interpolate", lattice.len() as u64);
+        let passes = 1 + u64::from(settings.interpolation == Interpolation::Fit);
+        let stage = progress.stage("interpolate", passes * lattice.len() as u64);
         let mut grid = match owners {
             Some(owners) => collect(&masks, &owners, &sampled.samples),
             None => {
                 let samples: Vec<RadianceSample> = sampled.samples.into_iter().flatten().collect();
                 sample_count += samples.len() as u64;
-                shepard(&scene.field, &lattice, &masks, &samples, settings.neighbours, &|n| stage.tick(n))
+                let grid = shepard(&scene.field, &lattice, &masks, &samples, settings.neighbours, &|n| stage.tick(n));
+                match settings.interpolation {
+                    Interpolation::Shepard => grid,
+                    Interpolation::Fit => fit(&scene.field, &lattice, &samples, grid, &|n| stage.tick(n)),
+                }
             }
         };
         if settings.strategy == StrategyName::Nodes {

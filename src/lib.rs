@@ -45,6 +45,7 @@ pub mod gather;
 pub mod sampling;
 pub mod radiance;
 pub mod illumination_grid;
+pub mod fitted_grid;
 pub mod bake;
 pub mod scene_file;
 // Products.
