@@ -325,7 +325,7 @@ impl Render {
         let exposure = baked.exposure * self.exposure;
         if self.output.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr")) {
             let attributes = [
-                ("software".to_owned(), format!("isolume {} ({})", env!("CARGO_PKG_VERSION"), env!("ISOLUME_COMMIT"))),
+                ("isolume".to_owned(), format!("{} ({})", env!("CARGO_PKG_VERSION"), env!("ISOLUME_COMMIT"))),
                 ("bake".to_owned(), self.file.display().to_string()),
                 ("isovalue".to_owned(), self.isovalue.to_string()),
                 ("exposure".to_owned(), exposure.to_string()),
