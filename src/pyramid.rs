@@ -1,312 +1,303 @@
 //! The min/max hierarchy over all cells, valid for every isovalue, and the walk of a flattened ray through it.
 //!
-//! The walk is watertight by signs (design: geometry): it goes from face crossing to face crossing, the state at a
-//! crossing (inside: h ≥ c) comes from an expression both neighbours share, and a cell whose two crossings differ
-//! *must* give a hit. Blocks whose range excludes c are skipped whole; all their samples are on one side, so the
-//! state on their faces needs no arithmetic.
+//! A node has 4×4×4 children, and their 64 ranges of h stand together in a [`Tile`]: so one step of the walk finds, as
+//! the bits of a word, all children of a node that both hold the isovalue and lie on the ray (`walk`).
 
-use crate::cell::Cell;
+mod avx512;
+mod children;
+mod walk;
+
 use crate::field::Field;
-use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target};
-use glam::DVec3;
+use crate::flattened::{FlattenedHit, FlattenedRay};
+use avx512::Avx512;
+use children::Scalar;
 use rayon::prelude::*;
 
-/// log₂ of the cells along an edge of a level's block: cells themselves, then 4, 16, 64.
-const SHIFTS: [u32; 4] = [0, 2, 4, 6];
-const TOP: usize = SHIFTS.len() - 1;
+/// Levels at most: children are cells, then blocks of 4³, 16³ and 64³ cells.
+const LEVELS: usize = 4;
 
-/// Ranges of one level: 16-bit minimum in the low half, maximum in the high half; x fastest.
+/// Ranges of h over the 4×4×4 children of a node, x fastest, quantised by [`quantise`].
+#[derive(Clone, Copy, Debug)]
+#[repr(C, align(64))]
+struct Tile {
+    lo: [u16; 64],
+    hi: [u16; 64],
+}
+
+impl Tile {
+    /// Children without surface: they exclude every isovalue.
+    const EMPTY: Self = Self { lo: [u16::MAX; 64], hi: [0; 64] };
+
+    /// The range of all children.
+    #[inline]
+    fn range(&self) -> (u16, u16) {
+        (self.lo.iter().fold(u16::MAX, |a, &b| a.min(b)), self.hi.iter().fold(0, |a, &b| a.max(b)))
+    }
+}
+
+/// All nodes of a level, x fastest.
 #[derive(Clone, Debug)]
 struct Level {
     dims: [usize; 3],
-    ranges: Vec<u32>,
+    tiles: Vec<Tile>,
 }
 
-/// Min/max of h over cells and blocks of 4³, 16³, 64³ cells, quantised to 16 bits over the sweep, rounded so that no
-/// block that holds a piece of L(h, c) is ever excluded. 4.07 bytes per cell.
+impl Level {
+    #[inline]
+    fn tile(&self, [i, j, k]: [usize; 3]) -> &Tile {
+        &self.tiles[(k * self.dims[1] + j) * self.dims[0] + i]
+    }
+}
+
+/// Min/max of h over cells and blocks of 4³, 16³ and 64³ cells, quantised to 16 bits over the sweep, so that no block
+/// that holds a piece of L(h, c) is ever excluded. 4.1 bytes per cell.
 #[derive(Clone, Debug)]
 pub struct Pyramid {
-    levels: [Level; SHIFTS.len()],
+    cells: [usize; 3],
+    levels: Vec<Level>,
     capped: bool,
+    wide: Option<Avx512>,
 }
-
-/// The range of a block without surface: excludes every c.
-const EMPTY: u32 = 0x0000_ffff;
 
 /// A monotone map of isovalues to 16 bits; everything outside the sweep clamps, NaN is 0.
 #[inline]
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the cast saturates")]
-fn quantise(s: f32) -> u32 {
-    u32::from((s * 65535.0) as u16)
-}
-
-#[inline]
-fn excludes(range: u32, c: u32) -> bool {
-    c < (range & 0xffff) || c > range >> 16
-}
-
-#[inline]
-fn union(a: u32, b: u32) -> u32 {
-    (a & 0xffff).min(b & 0xffff) | (a >> 16).max(b >> 16) << 16
+fn quantise(s: f32) -> u16 {
+    (s * 65535.0) as u16
 }
 
 impl Pyramid {
     /// Builds all levels in one pass over the samples and one over each finer level. Cells that touch a non-finite
     /// sample hold no surface. `capped`: outside Ω counts as below every c, so Ω's faces close what they cut.
     pub fn new(field: &Field, capped: bool) -> Self {
-        let [nx, ny, _] = field.lattice().dims();
         let cells = field.lattice().cells();
-        let samples = field.samples();
-        let mut ranges = vec![EMPTY; cells.iter().product()];
-        ranges.par_chunks_mut(cells[0] * cells[1]).enumerate().for_each(|(k, slab)| {
-            // Columns of four samples (2×2 over y and z) are shared by the two cells beside them.
-            for j in 0..cells[1] {
-                let row = |dy: usize, dz: usize| &samples[((k + dz) * ny + j + dy) * nx..][..nx];
-                let rows = [row(0, 0), row(1, 0), row(0, 1), row(1, 1)];
-                let column = |i: usize| {
-                    let [a, b, c, d] = rows.map(|r| r[i]);
-                    (a.min(b).min(c.min(d)), a.max(b).max(c.max(d)), (a + b) + (c + d))
-                };
-                let mut left = column(0);
-                for (i, range) in slab[j * cells[0]..][..cells[0]].iter_mut().enumerate() {
-                    let right = column(i + 1);
-                    // A sum is NaN if a sample is: min and max would hide it.
-                    if !(left.2 + right.2).is_nan() {
-                        *range = quantise(left.0.min(right.0)) | quantise(left.1.max(right.1)) << 16;
-                    }
-                    left = right;
-                }
-            }
-        });
-        let finest = Level { dims: cells, ranges };
-        let second = coarser(&finest, 4);
-        let third = coarser(&second, 4);
-        let fourth = coarser(&third, 4);
-        Self { levels: [finest, second, third, fourth], capped }
+        let mut levels = vec![finest(field)];
+        while levels.len() < LEVELS && levels[levels.len() - 1].tiles.len() > 1 {
+            levels.push(coarser(&levels[levels.len() - 1]));
+        }
+        Self { cells, levels, capped, wide: Avx512::detect() }
+    }
+
+    /// The same without SIMD, as on a machine that has none: the same hits, slower.
+    #[must_use]
+    pub fn scalar(mut self) -> Self {
+        self.wide = None;
+        self
     }
 
     /// Bytes of all levels.
     pub fn bytes(&self) -> usize {
-        self.levels.iter().map(|l| 4 * l.ranges.len()).sum()
+        self.levels.iter().map(|l| size_of::<Tile>() * l.tiles.len()).sum()
     }
 
     /// The first hit of `ray` with t ≤ `reach`, or `None`. `field` must be the one the pyramid was built from.
     #[inline]
     pub fn intersect(&self, field: &Field, ray: &FlattenedRay, reach: f64) -> Option<FlattenedHit> {
-        self.walk::<false>(field, ray, reach)
+        match self.wide {
+            Some(wide) => wide.walk::<false>(self, field, ray, reach),
+            None => self.walk::<false, _>(Scalar, field, ray, reach),
+        }
     }
 
     /// Whether [`Pyramid::intersect`] would find a hit; cheaper, since a sign change inside the reach proves one.
     #[inline]
     pub fn occluded(&self, field: &Field, ray: &FlattenedRay, reach: f64) -> bool {
-        self.walk::<true>(field, ray, reach).is_some()
+        match self.wide {
+            Some(wide) => wide.walk::<true>(self, field, ray, reach).is_some(),
+            None => self.walk::<true, _>(Scalar, field, ray, reach).is_some(),
+        }
     }
+}
 
-    /// The walk. With `ANY`, the t of the hit is only a bound.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped cell numbers; t leaves as f32")]
-    fn walk<const ANY: bool>(&self, field: &Field, ray: &FlattenedRay, reach: f64) -> Option<FlattenedHit> {
-        let n = self.levels[0].dims;
-        let o = ray.origin.as_dvec3().to_array();
-        let d = ray.direction.as_dvec3().to_array();
-        let inv = d.map(|x| 1.0 / x);
-        // Clip to Ω. A component 0 (or −0) never crosses a plane: its slab holds the whole line or nothing of it.
-        let (mut t, mut t_out, mut entry) = (0f64, reach, None);
-        for a in 0..3 {
-            let far = n[a] as f64;
-            if d[a] == 0.0 {
-                if !(o[a] >= 0.0 && o[a] <= far) {
-                    return None;
+/// The nodes of 4³ cells.
+fn finest(field: &Field) -> Level {
+    let [nx, ny, _] = field.lattice().dims();
+    let cells = field.lattice().cells();
+    let samples = field.samples();
+    let dims = cells.map(|n| n.div_ceil(4));
+    let mut tiles = vec![Tile::EMPTY; dims.iter().product()];
+    tiles.par_chunks_mut(dims[0]).enumerate().for_each_init(
+        || (vec![(0f32, 0f32, 0f32); nx], vec![(u16::MAX, 0u16); 4 * dims[0]]),
+        |(columns, ranges), (row, tiles)| {
+            let (bj, bk) = (row % dims[1], row / dims[1]);
+            for (j, k) in (0..16).map(|n| (4 * bj + n % 4, 4 * bk + n / 4)) {
+                if j >= cells[1] || k >= cells[2] {
+                    continue;
                 }
-                continue;
-            }
-            let (near_plane, far_plane) = if d[a] > 0.0 { (0.0, far) } else { (far, 0.0) };
-            let t0 = (near_plane - o[a]) * inv[a];
-            if t0 > t {
-                (t, entry) = (t0, Some(a));
-            }
-            t_out = t_out.min((far_plane - o[a]) * inv[a]);
-        }
-        if !(t <= t_out) || d == [0.0; 3] {
-            return None;
-        }
-        let mut cell = [0i64; 3];
-        for a in 0..3 {
-            let p = o[a] + t * d[a];
-            // On a shared plane the ray is in the cell it goes to.
-            let below = d[a] < 0.0 && p == p.floor();
-            cell[a] = (p.floor() as i64 - i64::from(below)).clamp(0, n[a] as i64 - 1);
-        }
-
-        // The isovalue: h at the start if the ray starts on the surface, so that its root there is exactly 0.
-        let mut c = f64::from(ray.isovalue);
-        let mut departing = None;
-        if let (Departure::Surface(side), None) = (ray.departure, entry) {
-            let local = DVec3::from_array(std::array::from_fn(|a| (o[a] - cell[a] as f64).clamp(0.0, 1.0)));
-            let here = Cell { s: field.corners(cell.map(|i| i as usize)) }.value(local);
-            if here.is_finite() {
-                c = here;
-                departing = Some(side);
-            }
-        }
-        let quantised = quantise(c as f32);
-
-        // The state at the current crossing where known; a skipped block leaves it open, since it may hold NaN cells.
-        let mut inside: Option<bool> = None;
-        if let (Some(axis), true) = (entry, self.capped) {
-            let corners = Cell { s: field.corners(cell.map(|i| i as usize)) };
-            if crossing_inside(&corners, axis, d[axis] < 0.0, cell, &o, &d, t, c) {
-                return Some(FlattenedHit { t: t as f32, target: cap(axis, d[axis] < 0.0, Side::Lower) });
-            }
-        }
-        let mut level = TOP;
-        loop {
-            let shift = SHIFTS[level];
-            let grid = &self.levels[level];
-            let block = cell.map(|i| i as usize >> shift);
-            let range = grid.ranges[(block[2] * grid.dims[1] + block[1]) * grid.dims[0] + block[0]];
-            let skip = departing.is_none() && excludes(range, quantised);
-            if !skip && level > 0 {
-                level -= 1;
-                continue;
-            }
-
-            // Where the ray leaves the block.
-            let (mut axis, mut t_exit) = (0, f64::INFINITY);
-            for a in 0..3 {
-                if d[a] != 0.0 {
-                    let plane = if d[a] > 0.0 { ((block[a] + 1) << shift).min(n[a]) } else { block[a] << shift };
-                    let t_plane = (plane as f64 - o[a]) * inv[a];
-                    if t_plane < t_exit {
-                        (axis, t_exit) = (a, t_plane);
-                    }
+                // Columns of four samples (2×2 over y and z) are shared by the two cells beside them.
+                let line = |dy: usize, dz: usize| &samples[((k + dz) * ny + j + dy) * nx..][..nx];
+                let (p, q, r, s) = (line(0, 0), line(1, 0), line(0, 1), line(1, 1));
+                for (i, column) in columns.iter_mut().enumerate() {
+                    let (a, b, c, d) = (p[i], q[i], r[i], s[i]);
+                    *column = (a.min(b).min(c.min(d)), a.max(b).max(c.max(d)), (a + b) + (c + d));
                 }
-            }
-            let t_exit = t_exit.max(t);
-
-            if skip {
-                inside = None;
-            } else {
-                let corners = Cell { s: field.corners(cell.map(|i| i as usize)) };
-                if departing.is_some() || corners.straddles(c) {
-                    let last = t_exit >= reach;
-                    let t_end = if last { reach } else { t_exit };
-                    let local =
-                        DVec3::from_array(std::array::from_fn(|a| (o[a] + t * d[a] - cell[a] as f64).clamp(0.0, 1.0)));
-                    let mut cubic = corners.cubic(c, local, DVec3::from_array(d));
-                    let start = match departing.take() {
-                        Some(side) => {
-                            // f(t) = t q(t): the sign of q is the sign of h − c once the ray has left.
-                            cubic = cubic.deflate();
-                            let leaves_inside = cubic.c.iter().find(|&&x| x != 0.0).is_none_or(|&x| x > 0.0);
-                            if leaves_inside != (side == Side::Higher) {
-                                return Some(FlattenedHit { t: 0.0, target: Target::Surface(side) });
-                            }
-                            leaves_inside
-                        }
-                        None => inside.unwrap_or_else(|| match entry {
-                            Some(a) => crossing_inside(&corners, a, d[a] < 0.0, cell, &o, &d, t, c),
-                            None => cubic.value(0.0) >= 0.0,
-                        }),
-                    };
-                    let span = (t_end - t).max(0.0);
-                    let end = if last {
-                        cubic.value(span) >= 0.0
+                for (pair, range) in columns.windows(2).zip(ranges.iter_mut()) {
+                    let (left, right) = (pair[0], pair[1]);
+                    // A sum is NaN if a sample is: min and max would hide it.
+                    *range = if (left.2 + right.2).is_nan() {
+                        (u16::MAX, 0)
                     } else {
-                        crossing_inside(&corners, axis, d[axis] > 0.0, cell, &o, &d, t_exit, c)
+                        (quantise(left.0.min(right.0)), quantise(left.1.max(right.1)))
                     };
-                    let crossing = if ANY && start != end { Some(0.0) } else { cubic.first_crossing(span, start, end) };
-                    if let Some(dt) = crossing {
-                        let side = if start { Side::Higher } else { Side::Lower };
-                        return Some(FlattenedHit { t: (t + dt).min(reach) as f32, target: Target::Surface(side) });
-                    }
-                    inside = Some(end);
-                } else {
-                    inside = None;
                 }
-            }
-
-            // Into the next cell.
-            if t_exit >= reach {
-                return None;
-            }
-            let mut next = cell;
-            for a in 0..3 {
-                let (lo, hi) = ((block[a] << shift) as i64, (((block[a] + 1) << shift).min(n[a]) - 1) as i64);
-                next[a] = if a == axis {
-                    if d[a] > 0.0 { hi + 1 } else { lo - 1 }
-                } else if shift == 0 {
-                    cell[a]
-                } else {
-                    ((o[a] + t_exit * d[a]).floor() as i64).clamp(lo, hi)
-                };
-            }
-            if next[axis] < 0 || next[axis] >= n[axis] as i64 {
-                if self.capped {
-                    let corner_cell: [usize; 3] =
-                        std::array::from_fn(|a| if a == axis { cell_beside(next[a], n[a]) } else { next[a] as usize });
-                    let corners = Cell { s: field.corners(corner_cell) };
-                    let inside_cell = corner_cell.map(|i| i as i64);
-                    if crossing_inside(&corners, axis, d[axis] > 0.0, inside_cell, &o, &d, t_exit, c) {
-                        return Some(FlattenedHit { t: t_exit as f32, target: cap(axis, d[axis] > 0.0, Side::Higher) });
+                let at = 4 * (j % 4) + 16 * (k % 4);
+                for (tile, four) in tiles.iter_mut().zip(ranges.chunks_exact(4)) {
+                    for (x, &(lo, hi)) in four.iter().enumerate() {
+                        (tile.lo[at + x], tile.hi[at + x]) = (lo, hi);
                     }
                 }
-                return None;
             }
-            // A coarser block is worth a look only when a new one was entered.
-            while level < TOP && (next[axis] ^ cell[axis]) >> SHIFTS[level + 1] != 0 {
-                level += 1;
+        },
+    );
+    Level { dims, tiles }
+}
+
+/// The level whose children are the nodes of `fine`.
+fn coarser(fine: &Level) -> Level {
+    let dims = fine.dims.map(|n| n.div_ceil(4));
+    let mut tiles = vec![Tile::EMPTY; dims.iter().product()];
+    tiles.par_chunks_mut(dims[0]).enumerate().for_each(|(row, tiles)| {
+        let (bj, bk) = (row % dims[1], row / dims[1]);
+        for (j, k) in (0..16).map(|n| (4 * bj + n % 4, 4 * bk + n / 4)) {
+            if j >= fine.dims[1] || k >= fine.dims[2] {
+                continue;
             }
-            (cell, t, entry) = (next, t_exit, Some(axis));
-        }
-    }
-}
-
-/// The border cell that a step out of Ω came from.
-#[inline]
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
-fn cell_beside(outside: i64, n: usize) -> usize {
-    outside.clamp(0, n as i64 - 1) as usize
-}
-
-#[inline]
-fn cap(axis: usize, far: bool, side: Side) -> Target {
-    #[allow(clippy::cast_possible_truncation, reason = "an axis is below 3")]
-    Target::Cap(axis as u8 + 3 * u8::from(far), side)
-}
-
-/// The shared state of a crossing: whether h ≥ c where the ray meets the face of `cell` across `axis`.
-#[inline]
-#[allow(clippy::too_many_arguments, reason = "the ray's arrays stay in registers")]
-fn crossing_inside(
-    corners: &Cell,
-    axis: usize,
-    far: bool,
-    cell: [i64; 3],
-    o: &[f64; 3],
-    d: &[f64; 3],
-    t: f64,
-    c: f64,
-) -> bool {
-    let (b, e) = ((axis + 1) % 3, (axis + 2) % 3);
-    let u = (o[b] + t * d[b] - cell[b] as f64).clamp(0.0, 1.0);
-    let v = (o[e] + t * d[e] - cell[e] as f64).clamp(0.0, 1.0);
-    corners.face_inside(axis, far, c, u, v)
-}
-
-/// A level whose blocks unite `factor`³ blocks of `fine`.
-fn coarser(fine: &Level, factor: usize) -> Level {
-    let dims = fine.dims.map(|n| n.div_ceil(factor));
-    let mut ranges = vec![EMPTY; dims.iter().product()];
-    ranges.par_chunks_mut(dims[0] * dims[1]).enumerate().for_each(|(k, slab)| {
-        for z in factor * k..(factor * (k + 1)).min(fine.dims[2]) {
-            for y in 0..fine.dims[1] {
-                let row = &fine.ranges[(z * fine.dims[1] + y) * fine.dims[0]..][..fine.dims[0]];
-                let out = &mut slab[y / factor * dims[0]..][..dims[0]];
-                for (chunk, range) in row.chunks(factor).zip(out) {
-                    *range = chunk.iter().fold(*range, |r, &x| union(r, x));
-                }
+            let line = &fine.tiles[(k * fine.dims[1] + j) * fine.dims[0]..][..fine.dims[0]];
+            let at = 4 * (j % 4) + 16 * (k % 4);
+            for (i, child) in line.iter().enumerate() {
+                (tiles[i / 4].lo[at + i % 4], tiles[i / 4].hi[at + i % 4]) = child.range();
             }
         }
     });
-    Level { dims, ranges }
+    Level { dims, tiles }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::Sweep;
+    use crate::flattened::{Departure, Side};
+    use crate::rng::{Rng, Stage};
+    use crate::volume::{Lattice, Samples, Volume};
+    use crate::warp;
+    use glam::{DVec3, Vec3};
+
+    /// Smooth enough for long ways, with plateaus and a NaN.
+    fn field(dims: [usize; 3], levels: f64) -> Field {
+        let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::ONE).unwrap();
+        let mut samples: Vec<f32> = (0..lattice.len())
+            .map(|o| {
+                let x = DVec3::from_array(lattice.ijk(o).map(|i| i as f64));
+                let wave = (0.31 * x.x).sin() + (0.23 * x.y + 0.1 * x.z).cos() + (0.17 * x.z).sin();
+                ((wave / 6.0 + 0.5) * levels).round() as f32
+            })
+            .collect();
+        samples[lattice.offset(dims[0] / 2, 1, 1)] = f32::NAN;
+        let volume = Volume::new("waves", lattice, Samples::F32(samples)).unwrap();
+        Field::new(&volume, Sweep::new(0.0, levels).unwrap()).unwrap()
+    }
+
+    /// From inside, outside and the surface, on planes and along them.
+    fn ray(field: &Field, rng: &mut Rng, levels: f64) -> FlattenedRay {
+        let far = field.lattice().far();
+        let mut p = (DVec3::new(rng.unit(), rng.unit(), rng.unit()) * 1.4 - 0.2) * far;
+        let mut d = warp::sphere(rng.unit2()) * 10f64.powf(4.0 * rng.unit() - 2.0);
+        for a in 0..3 {
+            match rng.bits() % 12 {
+                0 => p[a] = p[a].round(),
+                1 => d[a] = 0.0,
+                2 => (p[a], d[a]) = (p[a].round(), 0.01),
+                3 => d[a] = 1.0f64.copysign(d[a]),
+                _ => {}
+            }
+        }
+        let within = (0..3).all(|a| p[a] >= 0.0 && p[a] <= far[a]);
+        let on = within && rng.bits() % 2 == 0;
+        let c = if rng.bits() % 2 == 0 { (rng.unit() * levels).round() / levels } else { rng.unit() };
+        let mut ray = FlattenedRay::free(p.as_vec3(), d.as_vec3(), c as f32);
+        if on {
+            ray.departure = Departure::Surface(if rng.bits() % 2 == 0 { Side::Lower } else { Side::Higher });
+        }
+        if ray.direction == Vec3::ZERO {
+            ray.direction = Vec3::Z;
+        }
+        if rng.bits() % 4 == 0 {
+            ray.reach = (30.0 * rng.unit()) as f32 / ray.direction.length();
+        }
+        ray
+    }
+
+    #[test]
+    fn with_and_without_simd_hits_are_the_same_bits() {
+        // Below and above one node of the top level, thin, and off the grid of blocks.
+        for (dims, levels) in [([70, 66, 67], 1e4), ([5, 4, 9], 7.0), ([300, 30, 21], 40.0), ([2, 101, 33], 1e3)] {
+            let field = field(dims, levels);
+            let mut rng = Rng::stream(3, Stage::Test, dims[0] as u64);
+            for capped in [false, true] {
+                let wide = Pyramid::new(&field, capped);
+                let scalar = wide.clone().scalar();
+                let mut hits = 0;
+                for _ in 0..100_000 {
+                    let ray = ray(&field, &mut rng, levels);
+                    let hit = wide.intersect(&field, &ray, f64::from(ray.reach));
+                    assert_eq!(hit, scalar.intersect(&field, &ray, f64::from(ray.reach)), "{ray:?}");
+                    assert_eq!(hit.is_some(), wide.occluded(&field, &ray, f64::from(ray.reach)), "{ray:?}");
+                    hits += u32::from(hit.is_some());
+                }
+                assert!((5_000..95_000).contains(&hits), "{hits} hits of {dims:?} test nothing");
+            }
+        }
+    }
+
+    /// Crosses every plane, looks at every cell.
+    fn plain_walk(field: &Field, ray: &FlattenedRay) -> Option<f64> {
+        let (o, d) = (ray.origin.as_dvec3(), ray.direction.as_dvec3());
+        let far = field.lattice().far();
+        let mut times: Vec<f64> = (0..3)
+            .flat_map(|a| (0..=far[a] as usize).map(move |k| (k as f64 - o[a]) / d[a]))
+            .filter(|t| t.is_finite() && *t > 0.0)
+            .collect();
+        times.push(0.0);
+        times.sort_by(f64::total_cmp);
+        for pair in times.windows(2).filter(|pair| pair[1] > pair[0]) {
+            let middle = o + d * (0.5 * (pair[0] + pair[1]));
+            if !(middle.cmpge(DVec3::ZERO).all() && middle.cmple(far).all()) {
+                continue;
+            }
+            let (cell, _) = field.locate(middle);
+            let corners = crate::cell::Cell { s: field.corners(cell) };
+            if corners.s.iter().any(|s| s.is_nan()) {
+                continue;
+            }
+            let base = DVec3::from_array(cell.map(|i| i as f64));
+            let cubic = corners.cubic(f64::from(ray.isovalue), o + d * pair[0] - base, d);
+            let span = pair[1] - pair[0];
+            if let Some(t) = cubic.first_crossing(span, cubic.value(0.0) >= 0.0, cubic.value(span) >= 0.0) {
+                return Some(pair[0] + t);
+            }
+        }
+        None
+    }
+
+    #[test]
+    fn first_hits_are_those_of_a_plain_walk_in_f64() {
+        let field = field([70, 66, 67], 1e4);
+        let pyramid = Pyramid::new(&field, false);
+        let mut rng = Rng::stream(4, Stage::Test, 0);
+        let (mut wrong, mut hits) = (0, 0);
+        for _ in 0..50_000 {
+            let mut ray = ray(&field, &mut rng, 1e4);
+            (ray.departure, ray.reach) = (Departure::Free, f32::INFINITY);
+            ray.isovalue = rng.unit() as f32;
+            let expected = plain_walk(&field, &ray);
+            let hit = pyramid.intersect(&field, &ray, f64::INFINITY).map(|h| f64::from(h.t));
+            hits += u32::from(hit.is_some());
+            wrong += u32::from(match (hit, expected) {
+                (Some(t), Some(expected)) => (t - expected).abs() > 1e-6 * expected.max(1.0),
+                (hit, expected) => hit.is_some() != expected.is_some(),
+            });
+        }
+        assert_eq!(wrong, 0, "of {hits}");
+        assert!(hits > 10_000);
+    }
 }
