@@ -280,7 +280,7 @@ fn run(case: &Case, device: &Device, count: usize, repetitions: usize, summary: 
         let mut hits = vec![0; runs.len()];
         for repetition in 0..=repetitions {
             for (r, (kernel, rays)) in runs.iter().enumerate() {
-                let (time, n) = seconds(|| rays.par_chunks(TASK).map(|task| kernel(task)).sum());
+                let (time, n) = seconds(|| rays.par_chunks(TASK).map(kernel).sum());
                 hits[r] = n;
                 // The first round warms up.
                 if repetition > 0 {

@@ -20,7 +20,7 @@ impl Cell {
     }
 
     /// h at cell-local `p` in [0, 1]³.
-    #[inline]
+    #[inline(always)]
     pub fn value(&self, p: DVec3) -> f64 {
         let s = self.s.map(f64::from);
         let x = |a: usize| s[a] + p.x * (s[a + 1] - s[a]);
@@ -30,7 +30,7 @@ impl Cell {
 
     /// h − c along p + t d as a cubic in t, by 37-operation coefficients: h = P(x,y) + z Q(x,y), each restricted to the
     /// ray. [HSEAM22, after Parker99]
-    #[inline]
+    #[inline(always)]
     pub fn cubic(&self, c: f64, p: DVec3, d: DVec3) -> Cubic {
         let s = self.s.map(f64::from);
         // P = k0 + k1 x + k2 y + k3 xy on the face z = 0, Q likewise is the rise to z = 1.
@@ -49,7 +49,7 @@ impl Cell {
     /// Whether h ≥ c at (u, v) on the face across `axis` at its near (`far` = false) or far end; u and v run along the
     /// next two axes in cyclic order. Bit for bit the same from both cells that share the face: it uses the face's own
     /// corners only, and equal signs of all four decide without arithmetic.
-    #[inline]
+    #[inline(always)]
     pub fn face_inside(&self, axis: usize, far: bool, c: f64, u: f64, v: f64) -> bool {
         let (b, d) = (1 << ((axis + 1) % 3), 1 << ((axis + 2) % 3));
         let base = usize::from(far) << axis;

@@ -132,7 +132,7 @@ impl Field {
     }
 
     /// The 8 samples of a cell; bit a of the position says which end along axis a.
-    #[inline]
+    #[inline(always)]
     pub fn corners(&self, [i, j, k]: [usize; 3]) -> [f32; 8] {
         let [nx, ny, _] = self.lattice.dims();
         let at = (k * ny + j) * nx + i;

@@ -82,6 +82,33 @@ mod x86 {
         }
     }
 
+    impl Avx512 {
+        /// [`Pyramid::walk16`] with this kernel, compiled for this processor.
+        #[inline]
+        pub(in crate::pyramid) fn walk16<const ANY: bool>(
+            self,
+            pyramid: &Pyramid,
+            field: &Field,
+            active: u16,
+            ray: impl Fn(usize) -> FlattenedRay,
+            hits: &mut [Option<FlattenedHit>; 16],
+        ) {
+            #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,bmi1,bmi2")]
+            fn inner<const ANY: bool>(
+                kernel: Avx512,
+                pyramid: &Pyramid,
+                field: &Field,
+                active: u16,
+                ray: impl Fn(usize) -> FlattenedRay,
+                hits: &mut [Option<FlattenedHit>; 16],
+            ) {
+                pyramid.walk16::<ANY, _>(kernel, field, active, ray, hits);
+            }
+            // SAFETY: `self` exists, so `detect` found the features.
+            unsafe { inner::<ANY>(self, pyramid, field, active, ray, hits) }
+        }
+    }
+
     impl Children for Avx512 {
         type Ray = Ray;
 
@@ -95,6 +122,14 @@ mod x86 {
         fn children(self, line: &Line, ray: &Ray, tile: &Tile, base: [i32; 4], size: f32) -> u64 {
             // SAFETY: `self` exists, so `detect` found the features.
             unsafe { children(line.flip, ray, tile, base, size) }
+        }
+
+        #[inline(always)]
+        fn prefetch<T>(self, x: &T) {
+            for line in 0..size_of::<T>().div_ceil(64) {
+                // SAFETY: a hint, which reads nothing, for an address within `x`.
+                unsafe { _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(x).cast::<i8>().add(64 * line)) }
+            }
         }
     }
 
@@ -182,6 +217,17 @@ mod other {
             _: &FlattenedRay,
             _: f64,
         ) -> Option<FlattenedHit> {
+            match self {}
+        }
+
+        pub(in crate::pyramid) fn walk16<const ANY: bool>(
+            self,
+            _: &Pyramid,
+            _: &Field,
+            _: u16,
+            _: impl Fn(usize) -> FlattenedRay,
+            _: &mut [Option<FlattenedHit>; 16],
+        ) {
             match self {}
         }
     }

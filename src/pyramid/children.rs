@@ -45,6 +45,10 @@ pub(super) trait Children: Copy {
     /// may hold the isovalue and whose closed box the ray meets at a time above 0, up to its end. Bit n stands for
     /// child n ^ flip, so that they are in the ray's order.
     fn children(self, line: &Line, ray: &Self::Ray, tile: &Tile, base: [i32; 4], size: f32) -> u64;
+
+    /// Asks memory for what is read soon.
+    #[inline(always)]
+    fn prefetch<T>(self, _: &T) {}
 }
 
 /// Plain Rust, for every machine.

@@ -25,7 +25,7 @@ const FACES: [[u8; 2]; 3] = [[0x55, 0xaa], [0x33, 0xcc], [0x0f, 0xf0]];
 const PARALLEL: f64 = 1e-30;
 
 /// A ray within Ω.
-struct Ray<'a> {
+pub(super) struct Ray<'a> {
     field: &'a Field,
     o: [f64; 3],
     d: [f64; 3],
@@ -41,8 +41,43 @@ struct Ray<'a> {
     within: bool,
 }
 
+/// A ray that is ready for the hierarchy.
+pub(super) struct Start<'a> {
+    pub(super) ray: Ray<'a>,
+    pub(super) line: Line,
+    /// The cell of the start is done.
+    pub(super) departing: bool,
+}
+
+/// Children still to be visited.
+#[derive(Default)]
+pub(super) struct Stack {
+    /// Levels that have some, bit by bit.
+    pub(super) live: u32,
+    /// The children, bit by bit, in the ray's order.
+    pending: [u64; LEVELS],
+    /// The number of each level's first child, in units of children.
+    first: [[i32; 3]; LEVELS],
+}
+
+impl Stack {
+    /// The level and number of the next child. Something must be live.
+    #[inline(always)]
+    #[allow(clippy::cast_possible_wrap, reason = "below 64")]
+    pub(super) fn pop(&mut self, line: &Line) -> (usize, [i32; 3]) {
+        let level = (self.live.trailing_zeros() as usize) % LEVELS;
+        let these = self.pending[level];
+        let rest = these & these.wrapping_sub(1);
+        self.pending[level] = rest;
+        self.live ^= u32::from(rest == 0) << level;
+        let n = (these.trailing_zeros() ^ line.flip) as i32;
+        let [x, y, z] = self.first[level];
+        (level, [x + (n & 3), y + (n >> 2 & 3), z + (n >> 4)])
+    }
+}
+
 /// What a cell says.
-enum Step {
+pub(super) enum Step {
     On,
     Hit(FlattenedHit),
     /// Beyond the reach.
@@ -51,7 +86,6 @@ enum Step {
 
 impl Pyramid {
     /// The walk. With `ANY`, the t of the hit is only a bound.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped cell numbers; t leaves as f32")]
     #[inline(always)]
     pub(super) fn walk<const ANY: bool, K: Children>(
         &self,
@@ -60,30 +94,87 @@ impl Pyramid {
         ray: &FlattenedRay,
         reach: f64,
     ) -> Option<FlattenedHit> {
+        let start = match self.begin::<ANY>(field, ray, reach) {
+            Ok(start) => start,
+            Err(done) => return done,
+        };
+        let Start { ray, line, .. } = &start;
+        // Nodes larger than 256³ cells are taken in turn; mostly there is one.
+        let top = self.levels.len() - 1;
+        let constants = kernel.ray(line);
+        let roots = self.levels[top].dims;
+        let width = (4 << (2 * top)) as f32;
+        let turn = |a: usize, i: usize| if line.negative(a) { roots[a] - 1 - i } else { i };
+        let met = |a: usize, i: usize| {
+            let (b, e) = (i as f32 * width, (i + 1) as f32 * width);
+            let (b, e) = if line.negative(a) { (e, b) } else { (b, e) };
+            (line.time(a, b), line.time(a, e))
+        };
+        for k in 0..roots[2] {
+            for j in 0..roots[1] {
+                for i in 0..roots[0] {
+                    let root = [turn(0, i), turn(1, j), turn(2, k)];
+                    if roots != [1; 3] {
+                        let [x, y, z] = [0, 1, 2].map(|a| met(a, root[a]));
+                        if !(x.0.max(y.0).max(z.0) <= x.1.min(y.1).min(z.1)) {
+                            continue;
+                        }
+                    }
+                    let mut stack = self.stack(kernel, line, &constants, root);
+                    while stack.live != 0 {
+                        let (level, child) = stack.pop(line);
+                        if level > 0 {
+                            self.open(kernel, line, &constants, &mut stack, level, child);
+                            continue;
+                        }
+                        match ray.cell::<ANY>(line, child, start.departing) {
+                            Step::On => {}
+                            Step::Hit(hit) => return Some(hit),
+                            Step::End => return None,
+                        }
+                    }
+                }
+            }
+        }
+        self.leave(ray)
+    }
+
+    /// What comes before the hierarchy: the part of the ray in Ω, its isovalue, and the cell of its departure. `Err`
+    /// if that is all.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped cell numbers; t leaves as f32")]
+    #[inline(always)]
+    pub(super) fn begin<'a, const ANY: bool>(
+        &self,
+        field: &'a Field,
+        ray: &FlattenedRay,
+        reach: f64,
+    ) -> Result<Start<'a>, Option<FlattenedHit>> {
         let n = self.cells;
         let o = ray.origin.as_dvec3().to_array();
         let d = ray.direction.as_dvec3().to_array();
         let inv = d.map(|x| 1.0 / x);
         // Clip to Ω. A component 0 (or −0) never crosses a plane: its slab holds the whole line or nothing of it.
         let (mut t, mut t_out, mut entry) = (0f64, reach, None);
-        for a in 0..3 {
-            let far = n[a] as f64;
-            if d[a] == 0.0 {
-                if !(o[a] >= 0.0 && o[a] <= far) {
-                    return None;
+        if !(0..3).all(|a| o[a] >= 0.0 && o[a] <= n[a] as f64) {
+            for a in 0..3 {
+                let far = n[a] as f64;
+                if d[a] == 0.0 {
+                    if !(o[a] >= 0.0 && o[a] <= far) {
+                        return Err(None);
+                    }
+                    continue;
                 }
-                continue;
+                let (near_plane, far_plane) = if d[a] > 0.0 { (0.0, far) } else { (far, 0.0) };
+                let t0 = (near_plane - o[a]) * inv[a];
+                if t0 > t {
+                    (t, entry) = (t0, Some(a));
+                }
+                t_out = t_out.min((far_plane - o[a]) * inv[a]);
             }
-            let (near_plane, far_plane) = if d[a] > 0.0 { (0.0, far) } else { (far, 0.0) };
-            let t0 = (near_plane - o[a]) * inv[a];
-            if t0 > t {
-                (t, entry) = (t0, Some(a));
-            }
-            t_out = t_out.min((far_plane - o[a]) * inv[a]);
         }
         let scale = d[0].abs().max(d[1].abs()).max(d[2].abs());
         if !(t <= t_out) || scale == 0.0 {
-            return None;
+            return Err(None);
         }
         // The cell of the start, and the line from there.
         let mut cell = [0i32; 3];
@@ -95,7 +186,7 @@ impl Pyramid {
             cell[a] = (p.floor() as i32 - i32::from(below)).clamp(0, n[a] as i32 - 1);
             if d[a].abs() > PARALLEL * scale {
                 (line.o[a], line.inv[a]) = (p as f32, (scale * inv[a]) as f32);
-                line.flip |= u32::from(d[a] < 0.0) * 3 << (2 * a);
+                line.flip |= (u32::from(d[a] < 0.0) * 3) << (2 * a);
             } else {
                 line.o[a] = cell[a] as f32 + 0.5;
             }
@@ -122,102 +213,58 @@ impl Pyramid {
         if let Some(axis) = entry {
             let far = d[axis] < 0.0;
             if self.capped && ray.cell_at(cell).face_inside_ray(axis, far, &ray, cell, t) {
-                return Some(FlattenedHit { t: t as f32, target: cap(axis, far, Side::Lower) });
+                return Err(Some(FlattenedHit { t: t as f32, target: cap(axis, far, Side::Lower) }));
             }
         }
         if let Some(side) = departing {
             match ray.first_cell::<ANY>(&line, cell, side) {
                 Step::On => {}
-                Step::Hit(hit) => return Some(hit),
-                Step::End => return None,
+                Step::Hit(hit) => return Err(Some(hit)),
+                Step::End => return Err(None),
             }
         }
 
-        // Nodes larger than 256³ cells are taken in turn; mostly there is one.
-        let top = self.levels.len() - 1;
-        let constants = kernel.ray(&line);
-        let roots = self.levels[top].dims;
-        let width = (4 << (2 * top)) as f32;
-        let turn = |a: usize, i: usize| if line.negative(a) { roots[a] - 1 - i } else { i };
-        let met = |a: usize, i: usize| {
-            let (b, e) = (i as f32 * width, (i + 1) as f32 * width);
-            let (b, e) = if line.negative(a) { (e, b) } else { (b, e) };
-            (line.time(a, b), line.time(a, e))
-        };
-        for k in 0..roots[2] {
-            for j in 0..roots[1] {
-                for i in 0..roots[0] {
-                    let root = [turn(0, i), turn(1, j), turn(2, k)];
-                    if roots != [1; 3] {
-                        let [x, y, z] = [0, 1, 2].map(|a| met(a, root[a]));
-                        if !(x.0.max(y.0).max(z.0) <= x.1.min(y.1).min(z.1)) {
-                            continue;
-                        }
-                    }
-                    match self.descend::<ANY, K>(kernel, &constants, &ray, &line, departing.is_some(), root) {
-                        Step::On => {}
-                        Step::Hit(hit) => return Some(hit),
-                        Step::End => return None,
-                    }
-                }
-            }
-        }
-        if self.capped { self.leave(&ray) } else { None }
+        Ok(Start { ray, line, departing: departing.is_some() })
     }
 
-    /// Visits the active cells of the path within a node of the top level.
+    /// The root with its children.
     #[inline(always)]
-    #[allow(clippy::cast_sign_loss, clippy::cast_possible_wrap, reason = "node numbers are small and not negative")]
-    fn descend<const ANY: bool, K: Children>(
+    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, reason = "node numbers are small")]
+    pub(super) fn stack<K: Children>(&self, kernel: K, line: &Line, constants: &K::Ray, root: [usize; 3]) -> Stack {
+        let mut stack = Stack::default();
+        self.open(kernel, line, constants, &mut stack, self.levels.len(), root.map(|i| i as i32));
+        stack
+    }
+
+    /// Pushes the active children of node `node`, itself a child at `level`.
+    #[inline(always)]
+    #[allow(clippy::cast_sign_loss, reason = "node numbers are not negative")]
+    pub(super) fn open<K: Children>(
         &self,
         kernel: K,
-        constants: &K::Ray,
-        ray: &Ray,
         line: &Line,
-        departing: bool,
-        root: [usize; 3],
-    ) -> Step {
-        let top = self.levels.len() - 1;
-        let mut level = top;
-        let mut pending = [0u64; LEVELS];
-        // The number of each level's first child, in units of children.
-        let mut first = [[0i32; 3]; LEVELS];
-        let children = |level: usize, node: [usize; 3], first: [i32; 3]| {
-            let shift = 2 * level;
-            let base = [first[0] << shift, first[1] << shift, first[2] << shift, 0];
-            kernel.children(line, constants, self.levels[level].tile(node), base, (1 << shift) as f32)
-        };
-        first[top] = root.map(|i| 4 * i as i32);
-        pending[top] = children(top, root, first[top]);
-        loop {
-            let these = pending[level];
-            if these == 0 {
-                if level == top {
-                    return Step::On;
-                }
-                level += 1;
-                continue;
-            }
-            pending[level] = these & (these - 1);
-            let n = (these.trailing_zeros() ^ line.flip) as i32;
-            let child = [first[level][0] + (n & 3), first[level][1] + (n >> 2 & 3), first[level][2] + (n >> 4)];
-            if level > 0 {
-                level -= 1;
-                first[level] = child.map(|i| 4 * i);
-                pending[level] = children(level, child.map(|i| i as usize), first[level]);
-            } else {
-                match ray.cell::<ANY>(line, child, departing) {
-                    Step::On => {}
-                    done => return done,
-                }
-            }
-        }
+        constants: &K::Ray,
+        stack: &mut Stack,
+        level: usize,
+        node: [i32; 3],
+    ) {
+        let level = (level - 1) % LEVELS;
+        let first = node.map(|i| 4 * i);
+        let shift = 2 * level;
+        let base = [first[0] << shift, first[1] << shift, first[2] << shift, 0];
+        let tile = self.levels[level].tile(node.map(|i| i as usize));
+        let found = kernel.children(line, constants, tile, base, (1 << shift) as f32);
+        stack.first[level] = first;
+        stack.pending[level] = found;
+        stack.live |= u32::from(found != 0) << level;
     }
 
     /// What a ray finds that leaves Ω within its reach, if Ω is capped.
     #[allow(clippy::cast_possible_truncation, reason = "t leaves as f32")]
-    #[inline(never)]
-    fn leave(&self, ray: &Ray) -> Option<FlattenedHit> {
+    pub(super) fn leave(&self, ray: &Ray) -> Option<FlattenedHit> {
+        if !self.capped {
+            return None;
+        }
         let (mut axis, mut t) = (0, f64::INFINITY);
         for a in 0..3 {
             if ray.d[a] != 0.0 {
@@ -270,7 +317,7 @@ impl Ray<'_> {
 
     /// A cell of the path, or one that the path only touches.
     #[inline(always)]
-    fn cell<const ANY: bool>(&self, line: &Line, cell: [i32; 3], departing: bool) -> Step {
+    pub(super) fn cell<const ANY: bool>(&self, line: &Line, cell: [i32; 3], departing: bool) -> Step {
         let corners = self.cell_at(cell);
         let inside = corners.inside(self.c32);
         if inside == 0 || inside == u8::MAX {
@@ -367,7 +414,7 @@ impl Ray<'_> {
 
 impl Cell {
     /// [`Cell::face_inside`] where the ray meets the face at `t`.
-    #[inline]
+    #[inline(always)]
     fn face_inside_ray(&self, axis: usize, far: bool, ray: &Ray, cell: [i32; 3], t: f64) -> bool {
         let at = |a: usize| (ray.o[a] + t * ray.d[a] - f64::from(cell[a])).clamp(0.0, 1.0);
         self.face_inside(axis, far, ray.c, at((axis + 1) % 3), at((axis + 2) % 3))
