@@ -132,11 +132,13 @@ impl Field {
     }
 
     /// The 8 samples of a cell; bit a of the position says which end along axis a.
-    #[inline]
+    #[inline(always)]
     pub fn corners(&self, [i, j, k]: [usize; 3]) -> [f32; 8] {
         let [nx, ny, _] = self.lattice.dims();
-        let s = &self.samples[(k * ny + j) * nx + i..];
+        let at = (k * ny + j) * nx + i;
+        // One bound for all: the last corner's.
         let (y, z) = (nx, nx * ny);
+        let s = &self.samples[at..at + z + y + 2];
         [s[0], s[1], s[y], s[y + 1], s[z], s[z + 1], s[z + y], s[z + y + 1]]
     }
 
