@@ -33,5 +33,7 @@ pub mod tracer;
 pub mod embree;
 // Light transport, generic over the tracer.
 pub mod photon;
+// The second engine: every voxel and isovalue by lines.
+pub mod sweep;
 // Products.
 pub mod export;
