@@ -87,7 +87,7 @@ pub struct SweepResult {
     pub flats: Vec<Option<FlatTexture>>,
     /// Indirect bounces of the replicate that took the most.
     pub bounces: usize,
-    /// Predicted share of mean indirect light that was left out (0 where the tail was extrapolated).
+    /// Bound on the share of mean indirect light that later bounces would add; NaN where `max_bounces` came first.
     pub residual: f64,
     /// Whether `tick` stopped the work.
     pub stopped: bool,
@@ -229,15 +229,15 @@ impl Run<'_> {
         let pass = Pass { scene: self.scene, geometry: self.geometry, inside: self.inside, primary: self.sides[0] };
         let nothing = flats.open();
         flats.close(nothing);
-        flats.reflect(1.0, false);
-        let mut b: Vec<Planes> = direct.iter().map(|d| self.reflect(d, None, 1.0)).collect();
+        flats.reflect([1.0; 3], false);
+        let mut b: Vec<Planes> = direct.iter().map(|d| self.reflect(d, None, [1.0; 3])).collect();
         let fixed = s.max_bounces < 6;
         let mut monitor = Monitor::default();
         let mut averaged = 0;
         let mut bounce = 0;
         while bounce < s.max_bounces && !stopped {
             bounce += 1;
-            let settled = fixed || averaged > 0 || monitor.tail().is_some_and(|t| t.abs() < s.target.max(1e-4));
+            let settled = fixed || averaged > 0 || monitor.missing(FULL_PASSES as i32).is_some_and(|m| m < s.target);
             let last_coarse = settled || bounce + FULL_PASSES > s.max_bounces;
             let directions =
                 if last_coarse { s.directions } else { (s.directions / COARSE).max(LEAST).min(s.directions) };
@@ -262,23 +262,17 @@ impl Run<'_> {
             out.counts.families += (lines.len() * self.sides.len()) as u64;
             out.counts.gather_rays += out.counts.valid * (lines.len() * self.sides.len()) as u64;
             let mean = self.mean(&fresh);
-            // Full passes are averaged: each saw the light that the one before left.
-            let counts_from = if fixed { usize::MAX } else { averaged };
-            if last_coarse && !fixed {
-                if counts_from == 0 {
-                    indirect = fresh;
-                } else {
-                    let w = 1.0 / (averaged + 1) as f32;
-                    for (old, new) in indirect.iter_mut().flatten().zip(fresh.iter().flatten()) {
-                        old.par_iter_mut().zip(new).with_min_len(1 << 12).for_each(|(o, n)| *o += w * (n - *o));
-                    }
+            if averaged > 0 {
+                // Full passes are averaged: each saw the light that the one before left.
+                let w = 1.0 / (averaged + 1) as f32;
+                for (old, new) in indirect.iter_mut().flatten().zip(fresh.iter().flatten()) {
+                    old.par_iter_mut().zip(new).with_min_len(1 << 12).for_each(|(o, n)| *o += w * (n - *o));
                 }
-                averaged += 1;
             } else {
                 indirect = fresh;
             }
-            let scale = if last_coarse { 1.0 } else { monitor.push(mean) };
-            out.residual = out.residual.max(0.0);
+            averaged += usize::from(last_coarse && !fixed);
+            let scale = if fixed { [1.0; 3] } else { monitor.push(mean) };
             flats.reflect(scale, true);
             for ((b, d), e) in b.iter_mut().zip(&direct).zip(&indirect) {
                 *b = self.reflect(d, Some(e), scale);
@@ -288,24 +282,24 @@ impl Run<'_> {
             }
         }
         out.bounces = out.bounces.max(bounce);
-        out.residual = monitor.tail().unwrap_or(0.0).abs().max(out.residual);
+        out.residual = monitor.missing(0).unwrap_or(f64::NAN).max(out.residual);
         out.stopped |= stopped;
         Replicate { direct, indirect }
     }
 
     /// B = Le + ρ/π (direct + scale · indirect), filled where no surface is.
-    fn reflect(&self, direct: &Planes, indirect: Option<&Planes>, scale: f32) -> Planes {
+    fn reflect(&self, direct: &Planes, indirect: Option<&Planes>, scale: [f32; 3]) -> Planes {
         let surface = &self.scene.surface;
         let mut b: Planes = std::array::from_fn(|c| {
             #[allow(clippy::cast_possible_truncation, reason = "albedo and emission")]
             let (rho, emission) = ((surface.albedo[c] / std::f64::consts::PI) as f32, surface.emission[c] as f32);
-            let valid = &self.geometry.valid;
+            let lit = &self.geometry.lit;
             (0..direct[c].len())
                 .into_par_iter()
                 .with_min_len(1 << 12)
                 .map(|i| {
-                    let e = direct[c][i] + indirect.map_or(0.0, |e| scale * e[c][i]);
-                    if valid[i] { emission + rho * e } else { 0.0 }
+                    let e = direct[c][i] + indirect.map_or(0.0, |e| scale[c] * e[c][i]);
+                    if lit[i] { emission + rho * e } else { 0.0 }
                 })
                 .collect()
         });
@@ -313,65 +307,64 @@ impl Run<'_> {
         b
     }
 
-    /// Mean indirect irradiance over valid nodes, all sides and channels.
-    fn mean(&self, planes: &[Planes]) -> f64 {
+    /// Indirect irradiance summed over valid nodes and sides, per channel.
+    fn mean(&self, planes: &[Planes]) -> [f64; 3] {
         // Sums by fixed chunks: the same bits on any number of threads.
-        let sum: f64 = planes
-            .iter()
-            .flatten()
-            .map(|plane| {
-                let chunks: Vec<f64> = plane
-                    .par_chunks(1 << 14)
-                    .zip(self.geometry.valid.par_chunks(1 << 14))
-                    .map(|(x, v)| x.iter().zip(v).filter(|(_, v)| **v).map(|(x, _)| f64::from(*x)).sum())
-                    .collect();
-                chunks.iter().sum::<f64>()
-            })
-            .sum();
-        sum
+        let sum = |plane: &Vec<f32>| -> f64 {
+            let chunks: Vec<f64> = plane
+                .par_chunks(1 << 14)
+                .zip(self.geometry.valid.par_chunks(1 << 14))
+                .map(|(x, v)| x.iter().zip(v).filter(|(_, v)| **v).map(|(x, _)| f64::from(*x)).sum())
+                .collect();
+            chunks.iter().sum()
+        };
+        std::array::from_fn(|c| planes.iter().map(|p| sum(&p[c])).sum())
     }
 }
 
-/// Watches the mean of indirect light from pass to pass.
+/// Watches the mean of indirect light, per channel, from pass to pass.
 #[derive(Default)]
 struct Monitor {
-    means: Vec<f64>,
-    extrapolated: bool,
+    means: Vec<[f64; 3]>,
+    /// Ratio of successive changes, and the share of the mean that all later bounces would add, when last measured.
+    ratio: [f64; 3],
+    tail: [f64; 3],
+    /// Passes since then.
+    since: i32,
 }
 
+/// The pass whose change predicts the tail: by then light has left the neighbourhood of the luminaires.
+const PREDICTS: usize = 4;
+
 impl Monitor {
-    /// Takes the mean of a pass; returns the factor that adds the predicted tail of all bounces that are left. Applied
-    /// once, when three passes show a ratio: passes after it start from light that is complete in the mean.
-    fn push(&mut self, mean: f64) -> f32 {
+    /// Takes the means of a pass; returns per channel the factor that adds the predicted tail of all bounces that are
+    /// left. It is applied once: passes after it start from light that is complete in the mean.
+    #[allow(clippy::cast_possible_truncation, reason = "a factor near 1")]
+    fn push(&mut self, mean: [f64; 3]) -> [f32; 3] {
         self.means.push(mean);
-        if self.extrapolated || self.means.len() < 3 {
-            return 1.0;
+        self.since += 1;
+        if self.means.len() != PREDICTS {
+            return [1.0; 3];
         }
-        let [a, b, c]: [f64; 3] = self.means[self.means.len() - 3..].try_into().expect("three");
-        let ratio = (c - b) / (b - a);
-        if c > 0.0 && ratio > 0.0 && ratio < 0.95 {
-            self.extrapolated = true;
-            let whole = c + (c - b) * ratio / (1.0 - ratio);
-            // From here on changes are measured against the completed mean.
-            self.means.push(whole);
-            #[allow(clippy::cast_possible_truncation, reason = "a factor near 1")]
-            return (whole / c) as f32;
-        }
-        1.0
+        self.since = 0;
+        let [a, b, c] = [1, 2, 3].map(|i| self.means[i]);
+        std::array::from_fn(|i| {
+            let (old, new) = (b[i] - a[i], c[i] - b[i]);
+            if !(old > 0.0 && new > 0.0) {
+                return 1.0;
+            }
+            self.ratio[i] = (new / old).min(0.98);
+            let rest = new * self.ratio[i] / (1.0 - self.ratio[i]);
+            self.tail[i] = rest / c[i];
+            1.0 + (rest / c[i]) as f32
+        })
     }
 
-    /// Predicted share of the mean that is still missing; `None` while unknown.
-    fn tail(&self) -> Option<f64> {
-        let n = self.means.len();
-        if n < 2 || !self.extrapolated && n < 4 {
-            return None;
-        }
-        let (b, c) = (self.means[n - 2], self.means[n - 1]);
-        if c == 0.0 {
-            return Some(0.0);
-        }
-        // A surface reflects at most what it gets: half is a cautious ratio for the tail of a corrected series.
-        Some((c - b) / c)
+    /// Bound on the share of the mean that is still missing, `more` passes from now; `None` before the prediction. The
+    /// change of a pass itself stalls at the directions' noise.
+    fn missing(&self, more: i32) -> Option<f64> {
+        (self.means.len() >= PREDICTS)
+            .then(|| (0..3).map(|i| self.tail[i] * self.ratio[i].powi(self.since + more)).fold(0.0, f64::max))
     }
 }
 

@@ -178,14 +178,14 @@ impl Flats {
     }
 
     /// B = ρ/π (direct + scale · indirect); texels that lie inside the solid take the mean of neighbours that do not.
-    pub(super) fn reflect(&mut self, scale: f32, seen: bool) {
+    pub(super) fn reflect(&mut self, scale: [f32; 3], seen: bool) {
         for t in self.textures.iter_mut().flatten() {
             let nc = t.isovalues();
             for texel in 0..t.dims[0] * t.dims[1] {
                 for c in 0..3 {
                     let row = (3 * texel + c) * nc..(3 * texel + c + 1) * nc;
                     for i in row {
-                        t.radiance[i] = t.albedo[c] / PI * (t.direct[i] + scale * t.indirect[i]);
+                        t.radiance[i] = t.albedo[c] / PI * (t.direct[i] + scale[c] * t.indirect[i]);
                     }
                 }
             }

@@ -1,7 +1,7 @@
 //! One pass of gather sweeps: a bounce for every node and every isovalue at once, walls included.
 
 use super::arrive;
-use super::directions::Shear;
+use super::directions::{Layout, Shear};
 use super::flats::{Arrivals, Ends, Flats, Incoming};
 use super::grid::{Geometry, NORMAL_SCALE, Planes, transposed, untransposed};
 use super::pack::{LANES, Lanes, Pack, Plan};
@@ -64,7 +64,38 @@ impl Pass<'_> {
             drop(b);
             e = std::array::from_fn(|c| untransposed(&e[c], dims));
         }
+        self.normalise(lines, &mut e);
         (e, true)
+    }
+
+    /// Divides by the sum of cosines that the directions gave each node's normal, which is π only in the mean: equal
+    /// radiance from everywhere gives its irradiance exactly.
+    fn normalise(&self, lines: &[Shear], e: &mut Planes) {
+        const ROW: usize = 256;
+        let n = self.geometry.normals(&Layout::new(self.geometry.dims, 2));
+        let omega: Vec<[f32; 3]> = lines.iter().map(|s| s.omega.as_vec3().to_array()).collect();
+        // Σ|ω·N| · 4π/(2·lines) over N's units, against π.
+        let half = 0.5 * lines.len() as f32 * NORMAL_SCALE;
+        let [e0, e1, e2] = e;
+        (e0.par_chunks_mut(ROW), e1.par_chunks_mut(ROW), e2.par_chunks_mut(ROW)).into_par_iter().enumerate().for_each(
+            |(row, (e0, e1, e2))| {
+                let width = e0.len();
+                let n = [0, 1, 2].map(|a| {
+                    let mut out = [0f32; ROW];
+                    out.iter_mut().zip(&n[a][row * ROW..][..width]).for_each(|(o, &x)| *o = f32::from(x));
+                    out
+                });
+                let mut sum = [0f32; ROW];
+                for w in &omega {
+                    for i in 0..ROW {
+                        sum[i] += (w[0] * n[0][i] + w[1] * n[1][i] + w[2] * n[2][i]).abs();
+                    }
+                }
+                for e in [e0, e1, e2] {
+                    e.iter_mut().zip(&sum).for_each(|(e, s)| *e *= if *s > 0.0 { half / s } else { 0.0 });
+                }
+            },
+        );
     }
 
     /// All lines of one family, both ways.

@@ -9,6 +9,9 @@ use rayon::prelude::*;
 /// Normals are stored in units of 1/32767.
 pub(super) const NORMAL_SCALE: f32 = 32767.0;
 
+/// Nodes this far outside the sweep, in its units, are still lit.
+const OVERSHOOT: f32 = 0.1;
+
 /// Red, green and blue, a plane each, so that neighbouring lines load neighbouring numbers.
 pub(super) type Planes = [Vec<f32>; 3];
 
@@ -26,6 +29,9 @@ pub(super) struct Geometry<'a> {
     normals_transposed: [Vec<i16>; 3],
     /// Nodes that hold a surface of the sweep.
     pub valid: Vec<bool>,
+    /// Nodes that are lit: the valid ones, and those just outside the sweep, whose own light is a better neighbour to
+    /// interpolate with than a copy.
+    pub lit: Vec<bool>,
     rings: Vec<Vec<u32>>,
 }
 
@@ -48,8 +54,10 @@ impl<'a> Geometry<'a> {
         let valid: Vec<bool> = h.iter().zip(&encoded).map(|(h, n)| (0.0..=1.0).contains(h) && *n != [0; 3]).collect();
         let normals: [Vec<i16>; 3] = std::array::from_fn(|a| encoded.iter().map(|n| n[a]).collect());
         let normals_transposed = std::array::from_fn(|a| transposed(&normals[a], dims));
-        let rings = rings(dims, &valid);
-        Self { dims, h, h_transposed: transposed(h, dims), normals, normals_transposed, valid, rings }
+        let lit: Vec<bool> =
+            h.iter().zip(&encoded).map(|(h, n)| (-OVERSHOOT..=1.0 + OVERSHOOT).contains(h) && *n != [0; 3]).collect();
+        let rings = rings(dims, &lit);
+        Self { dims, h, h_transposed: transposed(h, dims), normals, normals_transposed, valid, lit, rings }
     }
 
     /// h in the memory order of `layout`.
@@ -62,9 +70,9 @@ impl<'a> Geometry<'a> {
         if layout.transposed { &self.normals_transposed } else { &self.normals }
     }
 
-    /// The unit normal of a node towards the lower side; `None` where it holds no surface.
+    /// The unit normal of a node towards the lower side; `None` where none is lit.
     pub(super) fn normal(&self, at: usize) -> Option<DVec3> {
-        if !self.valid[at] {
+        if !self.lit[at] {
             return None;
         }
         DVec3::from_array(std::array::from_fn(|a| f64::from(self.normals[a][at]))).try_normalize()
@@ -73,7 +81,7 @@ impl<'a> Geometry<'a> {
     /// Gives nodes without a surface the mean of their neighbours that have one (or were filled before), so that
     /// interpolation near the sweep's ends meets no black.
     pub(super) fn fill(&self, planes: &mut Planes) {
-        let mut known = self.valid.clone();
+        let mut known = self.lit.clone();
         let [nx, ny, nz] = self.dims;
         for ring in &self.rings {
             let known_before = &known;
