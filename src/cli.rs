@@ -1,11 +1,15 @@
 //! The command line: verbs, flags, and what they print. No physics here.
 
+mod compare;
+mod extract;
+mod reference;
+
 use crate::bake::{BakeOptions, BakeSettings, bake};
 use crate::embree::Device;
 use crate::error::{Error, Result};
 use crate::export::bake_file::{self, BakedVolume};
 use crate::progress::{self, Progress};
-use crate::render::{Camera, Shading, render};
+use crate::render::{Camera, Rendered, Shading, render};
 use crate::scene_file::{RawOptions, SceneOptions, load};
 use crate::volume::Volume;
 use crate::volume::generate::Generator;
@@ -26,6 +30,7 @@ Examples:
   isolume info head.nii.gz                               what a volume holds, and a suggested sweep
   isolume bake head.nii.gz --isovalues 15 200 -o head.vti   illuminate every isosurface from 15 to 200
   isolume render head.vti --isovalue 80 -o head.png      a picture of one of them
+  isolume extract head.vti --isovalue 80 -o head.ply     the same as a mesh with its light
   isolume generate bumps -o bumps.vti                    a volume to play with
 
 Exit codes: 0 done, 1 failed, 2 wrong usage or input, 130 interrupted."
@@ -51,6 +56,12 @@ enum Verb {
     Bake(Bake),
     /// Draw an isosurface of a bake inside its box
     Render(Render),
+    /// Take one isosurface away as a mesh, with a bake's light on its vertices
+    Extract(extract::Extract),
+    /// Illuminate one isosurface in ordinary 3D, per vertex with variance: what bakes are measured against
+    Reference(reference::ReferenceArgs),
+    /// Measure a bake against references
+    Compare(compare::Compare),
 }
 
 #[derive(clap::Args, Debug)]
@@ -113,6 +124,9 @@ struct Render {
     /// Plain local shading of the same view, for comparison
     #[arg(long)]
     local: bool,
+    /// Path-trace the isosurface's triangles instead of using the bake's light
+    #[arg(long, conflicts_with = "local")]
+    reference: bool,
     /// Pixels from top to bottom
     #[arg(long, default_value_t = 600, value_name = "PIXELS")]
     height: usize,
@@ -167,6 +181,9 @@ impl Cli {
             Verb::Generate(v) => v.run(progress),
             Verb::Bake(v) => v.run(progress),
             Verb::Render(v) => v.run(progress),
+            Verb::Extract(v) => v.run(progress),
+            Verb::Reference(v) => v.run(progress),
+            Verb::Compare(v) => v.run(progress),
         }
     }
 }
@@ -321,7 +338,12 @@ impl Render {
             camera.target = target;
         }
         let shading = if self.local { Shading::Local } else { Shading::Baked };
-        let rendered = render(&baked, self.isovalue, &camera, shading, self.samples, &device()?)?;
+        let rendered = if self.reference {
+            let picture = reference::picture(&baked.scene, self.isovalue, &camera, self.samples, &device()?)?;
+            Rendered { picture, unbaked: 0.0 }
+        } else {
+            render(&baked, self.isovalue, &camera, shading, self.samples, &device()?)?
+        };
         let exposure = baked.exposure * self.exposure;
         if self.output.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr")) {
             let attributes = [

@@ -51,6 +51,10 @@ pub mod bake;
 pub mod scene_file;
 // Products.
 pub mod export;
+pub mod surface_mesh;
 pub mod render;
+// One isosurface at a time in 3D, and how far a bake is from it.
+pub mod reference;
+pub mod accuracy;
 // Verbs.
 pub mod cli;

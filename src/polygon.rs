@@ -132,6 +132,12 @@ impl Polygon {
         unreachable!("the last triangle takes the rest")
     }
 
+    /// Whether a point of the plane lies inside.
+    pub fn contains(&self, x: DVec3) -> bool {
+        let (v, n) = (&self.vertices, self.vertices.len());
+        (0..n).all(|i| (v[(i + 1) % n] - v[i]).cross(x - v[i]).dot(self.normal) >= 0.0)
+    }
+
     /// Whether texture coordinates cover the polygon exactly.
     pub fn is_parallelogram(&self) -> bool {
         let v = &self.vertices;

@@ -1,25 +1,22 @@
-//! The graph of h and the extruded polygons as Embree user geometry: [`GraphTracer`].
+//! The graph of h as Embree user geometry, with the extruded polygons: [`GraphTracer`].
 //!
 //! The whole volume is **one** primitive whose callback walks the min/max pyramid: Embree's hierarchy is blind to the
 //! isovalue, and a callback costs as much as several cells (design: speed). The isovalue rides in `ray.id`, what the
 //! ray starts and ends on in `ray.time`.
 
+use super::extrusions::{Extrusions, embree_ray, flattened_ray, padded};
 use super::{
-    Device, INVALID_ID, Ray, Ray16, RayHit, RayHit16, RayView, Scene as Bvh, SceneBuilder, UserGeometry, UserHit,
+    Device, INVALID_ID, Ray16, RayHit, RayHit16, RayView, Scene as Bvh, SceneBuilder, UserGeometry, UserHit,
     UserHits16, Valid16,
 };
 use crate::error::Result;
 use crate::field::Field;
 use crate::flattened::{FlattenedHit, FlattenedRay, Side, Target};
-use crate::polygon::LocalPolygon;
 use crate::pyramid::Pyramid;
 use crate::scene::{Boundary, Scene};
 use crate::tracer::Tracer;
-use glam::{DVec3, Vec3};
+use glam::DVec3;
 use std::sync::Arc;
-
-/// Boxes grow by this many cells, since Embree tests user geometry without its ROBUST care. 1e-3 lost no ray.
-const PADDING: f64 = 1e-3;
 
 /// The 4D scene in Embree: nearest flattened hits of the graph, walls and luminaires.
 pub struct GraphTracer<'a> {
@@ -31,11 +28,6 @@ pub struct GraphTracer<'a> {
 struct Graph<'a> {
     field: &'a Field,
     pyramid: Arc<Pyramid>,
-}
-
-/// Walls and luminaires, a primitive each.
-struct Extrusions {
-    polygons: Vec<LocalPolygon>,
 }
 
 impl<'a> GraphTracer<'a> {
@@ -55,34 +47,8 @@ impl<'a> GraphTracer<'a> {
     pub fn with_pyramid(device: &Device, scene: &'a Scene, pyramid: Arc<Pyramid>) -> Result<Self> {
         let mut builder = SceneBuilder::new(device)?;
         let volume = builder.user_shared(Arc::new(Graph { field: &scene.field, pyramid }), u32::MAX)?;
-        if !scene.polygons().is_empty() {
-            let polygons = scene.polygons().iter().map(|p| LocalPolygon::new(p, scene.lattice())).collect();
-            builder.user_shared(Arc::new(Extrusions { polygons }), u32::MAX)?;
-        }
+        Extrusions::attach(&mut builder, scene, u32::MAX)?;
         Ok(Self { bvh: builder.commit()?, volume })
-    }
-}
-
-/// The ray as Embree carries it.
-#[inline]
-fn embree_ray(ray: &FlattenedRay) -> Ray {
-    let mut r = Ray::new(ray.origin.to_array(), ray.direction.to_array(), 0.0, ray.reach);
-    r.id = ray.isovalue.to_bits();
-    r.time = ray.pack_ends();
-    r
-}
-
-/// The inverse of [`embree_ray`].
-#[inline]
-fn flattened_ray(r: &RayView) -> FlattenedRay {
-    let (departure, target) = FlattenedRay::unpack_ends(r.time);
-    FlattenedRay {
-        origin: Vec3::from_array(r.org),
-        direction: Vec3::from_array(r.dir),
-        isovalue: f32::from_bits(r.id),
-        reach: r.tfar,
-        departure,
-        target,
     }
 }
 
@@ -165,14 +131,6 @@ fn decode_target(bits: u32) -> Target {
     }
 }
 
-/// Box corners for Embree, grown by [`PADDING`].
-#[allow(clippy::cast_possible_truncation, reason = "the padding covers f32 rounding")]
-fn padded(lo: DVec3, hi: DVec3) -> ([f32; 3], [f32; 3]) {
-    // Far from the origin an f32 step outgrows the padding in cells.
-    let pad = PADDING.max(4.0 * f64::from(f32::EPSILON) * lo.abs().max(hi.abs()).max_element());
-    ((lo - pad).as_vec3().to_array(), (hi + pad).as_vec3().to_array())
-}
-
 impl UserGeometry for Graph<'_> {
     fn len(&self) -> u32 {
         1
@@ -211,38 +169,5 @@ impl UserGeometry for Graph<'_> {
     #[inline]
     fn occluded16(&self, _: u32, active: u16, rays: &Ray16) -> u16 {
         self.pyramid.occluded16(self.field, active, |lane| flattened_ray(&rays.lane(lane)))
-    }
-}
-
-impl Extrusions {
-    #[inline]
-    fn meet(&self, prim: u32, ray: &RayView) -> Option<f64> {
-        let o = DVec3::from_array(ray.org.map(f64::from));
-        let d = DVec3::from_array(ray.dir.map(f64::from));
-        let ends = FlattenedRay::unpack_ends(ray.time);
-        self.polygons[prim as usize].intersect(prim, ends, o, d, f64::from(ray.tfar))
-    }
-}
-
-impl UserGeometry for Extrusions {
-    fn len(&self) -> u32 {
-        u32::try_from(self.polygons.len()).expect("scenes hold fewer than 2¹⁶ polygons")
-    }
-
-    fn bounds(&self, prim: u32) -> ([f32; 3], [f32; 3]) {
-        let (lo, hi) = self.polygons[prim as usize].bounds();
-        padded(lo, hi)
-    }
-
-    #[inline]
-    #[allow(clippy::cast_possible_truncation, reason = "t leaves as f32, clamped to the reach")]
-    fn intersect(&self, prim: u32, ray: &RayView) -> Option<UserHit> {
-        let t = (self.meet(prim, ray)? as f32).min(ray.tfar);
-        Some(UserHit { t, u: 0.0, v: 0.0, normal: [0.0; 3] })
-    }
-
-    #[inline]
-    fn occluded(&self, prim: u32, ray: &RayView) -> bool {
-        self.meet(prim, ray).is_some()
     }
 }

@@ -184,12 +184,19 @@ impl BakedVolume {
     /// # Errors
     /// `Io`; `Invalid` if the file is no bake or is damaged.
     pub fn read(path: &Path) -> Result<Self> {
+        Self::try_read(path)?
+            .ok_or_else(|| Error::invalid(path, "is no bake: it holds no illumination; make one with `isolume bake`"))
+    }
+
+    /// As [`BakedVolume::read`], but `None` if the file is a `.vti` without illumination.
+    ///
+    /// # Errors
+    /// `Io`; `Invalid` if the file is damaged.
+    pub fn try_read(path: &Path) -> Result<Option<Self>> {
         let file = VtiFile::read(path)?;
         let text = file.field_strings.iter().find(|(name, _)| name == DESCRIPTION).map(|(_, text)| text.clone());
-        let Some(text) = text else {
-            return Err(Error::invalid(path, "is no bake: it holds no illumination; make one with `isolume bake`"));
-        };
-        Self::from_parts(path, file, &text).map_err(|e| e.in_file(path))
+        let Some(text) = text else { return Ok(None) };
+        Self::from_parts(path, file, &text).map(Some).map_err(|e| e.in_file(path))
     }
 
     fn from_parts(path: &Path, file: VtiFile, text: &str) -> Result<Self> {

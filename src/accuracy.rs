@@ -1,0 +1,164 @@
+//! How far a bake is from references: percent RMS as BB09 measured it. [BB09 §3]
+//!
+//! Colours are linear, rgb = L π / (ρ_max E₀) clamped to [0, 1]. BB09 print the squared vertex error as |Δ|, without the
+//! square; read as a squared Euclidean norm, `percent_rms = 100 √⟨|rgb_tex − rgb_ref|²⟩` is what this crate reports, and
+//! that / √3, the RMS per channel, beside it.
+
+use crate::error::{Error, Result};
+use crate::export::ply::PlyMesh;
+use crate::surface_mesh::vertex_areas;
+use glam::DVec3;
+use serde::Serialize;
+
+/// A reference as compared: one isosurface, radiance and its variance at the sampled vertices.
+#[derive(Clone, Debug, Default)]
+pub struct ReferenceMesh {
+    /// Vertices, world.
+    pub positions: Vec<DVec3>,
+    /// Triangles.
+    pub triangles: Vec<[u32; 3]>,
+    /// Linear outgoing radiance.
+    pub radiance: Vec<DVec3>,
+    /// Variance of the radiance as a mean; 0 where unknown.
+    pub variance: Vec<DVec3>,
+    /// Whether a vertex takes part.
+    pub sampled: Vec<bool>,
+}
+
+impl ReferenceMesh {
+    /// From the properties that `isolume reference` writes; variance 0 and all vertices sampled where those are missing.
+    ///
+    /// # Errors
+    /// `Invalid` if positions or radiance are missing.
+    pub fn from_ply(mesh: &PlyMesh) -> Result<Self> {
+        let triple = |names: [&str; 3]| -> Option<Vec<DVec3>> {
+            let values = mesh.triple(names)?;
+            Some(values.into_iter().map(|v| DVec3::from_array(v.map(f64::from))).collect())
+        };
+        let missing = |what: &str| Error::Invalid(format!("has no {what}; make it with `isolume reference`"));
+        let radiance = triple(["radiance_r", "radiance_g", "radiance_b"])
+            .ok_or_else(|| missing("vertex properties radiance_r, radiance_g, radiance_b"))?;
+        Ok(Self {
+            positions: triple(["x", "y", "z"]).ok_or_else(|| missing("positions"))?,
+            triangles: mesh.triangles.clone(),
+            variance: triple(["variance_r", "variance_g", "variance_b"])
+                .unwrap_or_else(|| vec![DVec3::ZERO; radiance.len()]),
+            sampled: match mesh.property("sampled") {
+                Some(flags) => flags.iter().map(|&f| f > 0.0).collect(),
+                None => vec![true; radiance.len()],
+            },
+            radiance,
+        })
+    }
+}
+
+/// A bake's distance from its reference. Percentages are of the display range [0, 1].
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Accuracy {
+    /// Vertices that took part.
+    pub vertices: usize,
+    /// References: 1, or 2 whose noise cancels.
+    pub references: usize,
+    /// 100 √⟨|Δ|²⟩. With two references ⟨(t − r₁)·(t − r₂)⟩ stands for ⟨|Δ|²⟩, 0 where that is negative.
+    pub percent_rms: f64,
+    /// The same per channel: / √3.
+    pub percent_rms_sqrt3: f64,
+    /// The same, vertices weighted by their area.
+    pub percent_rms_area: f64,
+    /// The same over vertices whose reference exceeds 0.02 in some channel; 0 without any.
+    pub percent_rms_lit: f64,
+    /// Share of such vertices.
+    pub lit: f64,
+    /// 95 % confidence interval of `percent_rms`, from the scatter over vertices (as if they were independent).
+    pub confidence: [f64; 2],
+    /// What a perfect bake would show against one reference: 100 √⟨Σ variance⟩.
+    pub noise_floor: f64,
+    /// One reference: √(percent_rms² − noise_floor²), 0 where that is negative. Two: `percent_rms`.
+    pub percent_rms_without_noise: f64,
+    /// 100 ⟨|Δ|⟩, against the mean of the references.
+    pub mean: f64,
+    /// 100 max |Δ|, against the mean of the references.
+    pub max: f64,
+    /// 100 ⟨t − r⟩ over channels: the sign of the error.
+    pub bias: f64,
+    /// rgb = radiance × this.
+    pub exposure: f64,
+}
+
+/// Rgb above which a vertex counts as lit.
+pub const LIT: f64 = 0.02;
+
+/// Linear radiance to clamped display rgb.
+#[inline]
+pub fn display(radiance: DVec3, exposure: f64) -> DVec3 {
+    (radiance * exposure).clamp(DVec3::ZERO, DVec3::ONE)
+}
+
+/// Compares `texture` (linear radiance at the vertices) with one or two references on the same mesh. Returns the
+/// numbers and |Δ| per vertex against the references' mean (0 where not sampled).
+///
+/// # Errors
+/// `Invalid` without references or common vertices, or if meshes differ.
+pub fn compare(texture: &[DVec3], references: &[ReferenceMesh], exposure: f64) -> Result<(Accuracy, Vec<f64>)> {
+    let Some(first) = references.first() else {
+        return Err(Error::Invalid("no reference given".into()));
+    };
+    let n = first.positions.len();
+    for other in &references[1..] {
+        let same = other.positions.len() == n
+            && other.triangles == first.triangles
+            && other.positions.iter().zip(&first.positions).all(|(a, b)| a == b);
+        if !same {
+            return Err(Error::Invalid(
+                "the references are of different meshes; make both of the same scene, isovalue and --refine".into(),
+            ));
+        }
+    }
+    if references.len() == 2 && first.radiance == references[1].radiance {
+        return Err(Error::Invalid("the two references are the same; give the second another --seed".into()));
+    }
+    let areas = vertex_areas(&first.positions, &first.triangles);
+    let chosen: Vec<usize> = (0..n).filter(|&v| references.iter().all(|r| r.sampled[v])).collect();
+    if chosen.is_empty() {
+        return Err(Error::Invalid("no vertex is sampled in all references".into()));
+    }
+    let count = references.len() as f64;
+    let mut per_vertex = vec![0.0; n];
+    let (mut sum, mut squares, mut area_sum, mut area, mut lit_sum, mut lit) = (0.0, 0.0, 0.0, 0.0, 0.0, 0usize);
+    let mut out = Accuracy { vertices: chosen.len(), references: references.len(), exposure, ..Accuracy::default() };
+    for &v in &chosen {
+        let t = display(texture[v], exposure);
+        let r: Vec<DVec3> = references.iter().map(|r| display(r.radiance[v], exposure)).collect();
+        let mean = r.iter().sum::<DVec3>() / count;
+        let square = if let [a, b] = r[..] { (t - a).dot(t - b) } else { (t - mean).length_squared() };
+        sum += square;
+        squares += square * square;
+        area_sum += square * areas[v];
+        area += areas[v];
+        if mean.max_element() > LIT {
+            (lit_sum, lit) = (lit_sum + square, lit + 1);
+        }
+        let distance = (t - mean).length();
+        per_vertex[v] = distance;
+        out.mean += distance;
+        out.max = out.max.max(100.0 * distance);
+        out.bias += (t - mean).element_sum() / 3.0;
+        out.noise_floor += references.iter().map(|r| r.variance[v].element_sum()).sum::<f64>() / count;
+    }
+    let vertices = chosen.len() as f64;
+    let percent = |square: f64| 100.0 * square.max(0.0).sqrt();
+    let square = sum / vertices;
+    let deviation = ((squares / vertices - square * square).max(0.0) / vertices).sqrt();
+    out.percent_rms = percent(square);
+    out.percent_rms_sqrt3 = out.percent_rms / 3f64.sqrt();
+    out.percent_rms_area = if area > 0.0 { percent(area_sum / area) } else { 0.0 };
+    out.percent_rms_lit = if lit > 0 { percent(lit_sum / lit as f64) } else { 0.0 };
+    out.lit = lit as f64 / vertices;
+    out.confidence = [percent(square - 1.96 * deviation), percent(square + 1.96 * deviation)];
+    let floor = out.noise_floor / vertices * exposure * exposure;
+    out.noise_floor = percent(floor);
+    out.percent_rms_without_noise = if references.len() == 1 { percent(square - floor) } else { out.percent_rms };
+    out.mean *= 100.0 / vertices;
+    out.bias *= 100.0 / vertices;
+    Ok((out, per_vertex))
+}

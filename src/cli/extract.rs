@@ -1,0 +1,85 @@
+//! `isolume extract`: one isosurface as a mesh, with a bake's light on its vertices.
+
+use super::{expect_extension, writable};
+use crate::error::Result;
+use crate::export::bake_file::BakedVolume;
+use crate::export::{Mesh, obj, ply};
+use crate::progress::Progress;
+use crate::scene_file::{SceneOptions, load};
+use crate::surface_mesh::{SurfaceMesh, channel, display_colours, texture};
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+#[derive(clap::Args, Debug)]
+#[command(after_help = "\
+From a bake, the PLY also holds its light: linear `radiance_r`, `radiance_g`, `radiance_b`, and exposed, sRGB-encoded
+`red green blue` for the eye.
+
+Examples:
+  isolume extract head.nii.gz --isovalue 80 -o head.ply
+  isolume extract baked.vti --isovalue 80 -o textured.ply --refine 2")]
+pub(super) struct Extract {
+    /// Volume, scene file (.toml), or bake (.vti)
+    input: PathBuf,
+    /// The isosurface, in the volume's units
+    #[arg(long, value_name = "C", allow_negative_numbers = true)]
+    isovalue: f64,
+    /// Output: .ply or .obj
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// Cut every cell into R³ by trilinear interpolation first, so that the triangles follow the surface more closely
+    #[arg(long, default_value_t = 1, value_name = "R")]
+    refine: usize,
+    #[command(flatten)]
+    scene: SceneOptions,
+}
+
+impl Extract {
+    pub(super) fn run(self, progress: Progress) -> Result<()> {
+        expect_extension(&self.output, &["ply", "obj"])?;
+        writable(&self.output)?;
+        let begun = Instant::now();
+        let baked = open_bake(&self.input)?;
+        let loaded;
+        let scene = match &baked {
+            Some(baked) => &baked.scene,
+            None => {
+                loaded = load(&self.input, &self.scene)?;
+                &loaded.scene
+            }
+        };
+        let mesh = SurfaceMesh::extract(scene, scene.field.sweep().isovalue(self.isovalue), self.refine)?;
+        let radiance = baked.as_ref().map(|b| texture(b, &mesh.positions)).transpose()?;
+        let channels: Option<[Vec<f32>; 3]> = radiance.as_ref().map(|r| [0, 1, 2].map(|c| channel(r, c)));
+        let colours = radiance.as_ref().zip(baked.as_ref()).map(|(r, b)| display_colours(r, b.exposure));
+        let properties: Vec<(&str, &[f32])> = match &channels {
+            Some([r, g, b]) => vec![("radiance_r", r), ("radiance_g", g), ("radiance_b", b)],
+            None => Vec::new(),
+        };
+        write_mesh(&self.output, &Mesh { colours: colours.as_deref(), ..mesh.export(&properties) })?;
+        if progress == Progress::Shown {
+            eprintln!(
+                "{}: {} vertices, {} triangles in {:.2} s",
+                self.output.display(),
+                mesh.positions.len(),
+                mesh.triangles.len(),
+                begun.elapsed().as_secs_f64()
+            );
+        }
+        Ok(())
+    }
+}
+
+/// The bake in a `.vti`, if it is one.
+pub(super) fn open_bake(path: &Path) -> Result<Option<BakedVolume>> {
+    if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("vti")) { BakedVolume::try_read(path) } else { Ok(None) }
+}
+
+/// Writes a mesh as its extension says.
+pub(super) fn write_mesh(path: &Path, mesh: &Mesh<'_>) -> Result<()> {
+    if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("obj")) {
+        obj::write(path, mesh)
+    } else {
+        ply::write(path, mesh)
+    }
+}

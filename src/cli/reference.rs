@@ -1,0 +1,168 @@
+//! `isolume reference`: one isosurface illuminated in ordinary 3D, per vertex with variance, or as a picture.
+
+use super::extract::open_bake;
+use super::{device, expect_extension, writable};
+use crate::embree::{Device, GraphTracer, SurfaceTracer};
+use crate::error::{Error, Result};
+use crate::export::picture::Picture;
+use crate::export::ply;
+use crate::flattened::FlattenedRay;
+use crate::progress::Progress;
+use crate::reference::{Integrator, Reference, ReferenceSettings, SurfaceMapSettings, path_radiance, reference};
+use crate::render::{Camera, trace_picture};
+use crate::rng::{Rng, Stage};
+use crate::scene::Scene;
+use crate::scene_file::{SceneOptions, load};
+use crate::surface_mesh::{SurfaceMesh, channel, unit_isovalue};
+use glam::DVec3;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+#[derive(clap::Args, Debug)]
+#[command(after_help = "\
+The PLY holds, per vertex, the outside's outgoing radiance `radiance_r/g/b`, the variance of that mean
+`variance_r/g/b`, and `sampled`: 1 where it was computed, 0 elsewhere (--vertices). The subset is the same for every
+seed, so that two references of different seeds can be compared with a bake without their own noise.
+
+Examples:
+  isolume reference scene.toml --isovalue 47 -o ref.ply --vertices 4000
+  isolume compare out.vti ref.ply")]
+pub(super) struct ReferenceArgs {
+    /// Volume, scene file (.toml), or bake (.vti: its scene)
+    input: PathBuf,
+    /// The isosurface, in the volume's units
+    #[arg(long, value_name = "C", allow_negative_numbers = true)]
+    isovalue: f64,
+    /// Output: .ply
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// path: unbiased path tracing; photon: a photon map on the mesh and final gather
+    #[arg(long, default_value = "path")]
+    integrator: Integrator,
+    /// Only a fixed random subset of N vertices
+    #[arg(long, value_name = "N")]
+    vertices: Option<usize>,
+    /// Paths or gather rays per vertex
+    #[arg(long, default_value_t = 1024, value_name = "N")]
+    samples: u32,
+    /// Independent batches that tell the variance
+    #[arg(long, default_value_t = 16, value_name = "N")]
+    batches: u32,
+    /// Photons over all batches (--integrator photon)
+    #[arg(long, default_value_t = 1 << 24, value_name = "N")]
+    photons: u64,
+    /// Photons per irradiance estimate (--integrator photon)
+    #[arg(long, default_value_t = 64, value_name = "K")]
+    photons_per_estimate: usize,
+    /// Seed of all random numbers
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Cut every cell into R³ before extracting triangles
+    #[arg(long, default_value_t = 1, value_name = "R")]
+    refine: usize,
+    /// Trace the trilinear surface itself instead of triangles
+    #[arg(long)]
+    trilinear: bool,
+    #[command(flatten)]
+    scene: SceneOptions,
+}
+
+impl ReferenceArgs {
+    pub(super) fn run(self, progress: Progress) -> Result<()> {
+        expect_extension(&self.output, &["ply"])?;
+        writable(&self.output)?;
+        if !(1..=1 << 20).contains(&self.samples) || !(2..=1024).contains(&self.batches) {
+            return Err(Error::Invalid("--samples: 1 to 1048576; --batches: 2 to 1024".into()));
+        }
+        if self.photons == 0 || !(2..=4096).contains(&self.photons_per_estimate) || self.vertices == Some(0) {
+            return Err(Error::Invalid("--photons, --vertices: at least 1; --photons-per-estimate: 2 to 4096".into()));
+        }
+        let baked = open_bake(&self.input)?;
+        let scene = match baked {
+            Some(baked) => baked.scene,
+            None => load(&self.input, &self.scene)?.scene,
+        };
+        let isovalue = unit_isovalue(&scene.field, self.isovalue)?;
+        let settings = ReferenceSettings {
+            integrator: self.integrator,
+            samples: self.samples,
+            batches: self.batches,
+            photons: self.photons,
+            map: SurfaceMapSettings { photons: self.photons_per_estimate, ..SurfaceMapSettings::default() },
+            vertices: self.vertices,
+            seed: self.seed,
+        };
+        let begun = Instant::now();
+        let (mesh, result, inside) =
+            compute(&scene, isovalue, self.refine, self.trilinear, &settings, &device()?, progress)?;
+        let seconds = begun.elapsed().as_secs_f64();
+        write(&self.output, &mesh, &result)?;
+        if progress == Progress::Shown {
+            let count = result.sampled.iter().filter(|s| **s).count();
+            eprintln!(
+                "{}: {count} of {} vertices in {seconds:.2} s ({:.0} vertices/s, {:.2} M rays/s), {inside} rays began inside",
+                self.output.display(),
+                mesh.local.len(),
+                count as f64 / seconds,
+                result.rays as f64 / seconds / 1e6
+            );
+        }
+        Ok(())
+    }
+}
+
+/// Mesh and reference of one isosurface, and the rays that departed below its triangles.
+pub(super) fn compute(
+    scene: &Scene,
+    isovalue: f32,
+    refine: usize,
+    trilinear: bool,
+    settings: &ReferenceSettings,
+    device: &Device,
+    progress: Progress,
+) -> Result<(SurfaceMesh, Reference, u64)> {
+    let mesh = SurfaceMesh::extract(scene, isovalue, refine)?;
+    let vertices = settings.vertices.unwrap_or(usize::MAX).min(mesh.local.len());
+    let stage = progress.stage("reference", vertices as u64 * u64::from(settings.batches.max(2)));
+    let tick = |n| stage.tick(n);
+    let (result, inside) = if trilinear {
+        let tracer = GraphTracer::new(device, scene)?;
+        (reference(scene, &tracer, &mesh, isovalue, settings, &tick), 0)
+    } else {
+        let tracer = SurfaceTracer::new(device, scene, isovalue, refine)?;
+        let result = reference(scene, &tracer, &mesh, isovalue, settings, &tick);
+        let inside = tracer.inside_starts();
+        (result, inside)
+    };
+    stage.end()?;
+    Ok((mesh, result, inside))
+}
+
+/// Writes a reference as PLY.
+pub(super) fn write(path: &Path, mesh: &SurfaceMesh, result: &Reference) -> Result<()> {
+    let radiance = [0, 1, 2].map(|c| channel(&result.radiance, c));
+    let variance = [0, 1, 2].map(|c| channel(&result.variance, c));
+    let sampled: Vec<f32> = result.sampled.iter().map(|&s| if s { 1.0 } else { 0.0 }).collect();
+    let properties: Vec<(&str, &[f32])> = vec![
+        ("radiance_r", &radiance[0]),
+        ("radiance_g", &radiance[1]),
+        ("radiance_b", &radiance[2]),
+        ("variance_r", &variance[0]),
+        ("variance_g", &variance[1]),
+        ("variance_b", &variance[2]),
+        ("sampled", &sampled),
+    ];
+    ply::write(path, &mesh.export(&properties))
+}
+
+/// A path-traced picture of the triangles at `isovalue` (source units).
+pub(super) fn picture(scene: &Scene, isovalue: f64, camera: &Camera, samples: u32, device: &Device) -> Result<Picture> {
+    let isovalue = unit_isovalue(&scene.field, isovalue)?;
+    let tracer = SurfaceTracer::new(device, scene, isovalue, 1)?;
+    // Paths are told apart by their ray: the same picture on any number of threads.
+    let shade = |ray: &FlattenedRay, hit, direction: DVec3| {
+        let key = direction.to_array().iter().fold(0u64, |k, x| (k ^ x.to_bits()).wrapping_mul(0x9e37_79b9_7f4a_7c15));
+        path_radiance(scene, &tracer, ray, hit, &mut Rng::stream(1, Stage::Path, key))
+    };
+    trace_picture(scene, &tracer, isovalue, camera, samples, &shade)
+}

@@ -1,0 +1,181 @@
+//! The reference: one isosurface at a time, illuminated in ordinary 3D, with the variance of every number.
+//!
+//! Two integrators share the receivers (the vertices of the mesh, which lie on the trilinear level set, with the shared
+//! normal) and nothing of the bake's estimators: an unbiased path tracer, and a photon map on the mesh with final gather.
+//! Both run in independent batches; what is reported is the batches' mean and the variance of that mean.
+
+mod path;
+mod surface_map;
+
+pub use path::{PathTracer, path_radiance};
+pub use surface_map::{SurfaceMap, SurfaceMapSettings};
+
+use crate::direct::Receiver;
+use crate::flattened::{Departure, Side};
+use crate::photon::{PhotonSettings, trace_photons};
+use crate::rng::{Rng, Stage};
+use crate::scene::Scene;
+use crate::surface_mesh::SurfaceMesh;
+use crate::tracer::Tracer;
+use glam::DVec3;
+use rayon::prelude::*;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// How outgoing radiance is found.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum Integrator {
+    /// Path tracing with next-event estimation: unbiased.
+    #[default]
+    Path,
+    /// A photon map on the mesh and final gather, as BB09's reference.
+    Photon,
+}
+
+/// How much work a reference is worth.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ReferenceSettings {
+    /// How.
+    pub integrator: Integrator,
+    /// Paths, or gather rays, per vertex; rounded up to a multiple of `batches`.
+    pub samples: u32,
+    /// Independent batches that tell the variance, at least 2.
+    pub batches: u32,
+    /// Photons over all batches ([`Integrator::Photon`]).
+    pub photons: u64,
+    /// How irradiance is estimated from photons.
+    pub map: SurfaceMapSettings,
+    /// A fixed random subset of this many vertices instead of all.
+    pub vertices: Option<usize>,
+    /// Seed of the estimates. The subset does not depend on it: references of different seeds share their vertices.
+    pub seed: u64,
+}
+
+impl Default for ReferenceSettings {
+    fn default() -> Self {
+        Self {
+            integrator: Integrator::Path,
+            samples: 1024,
+            batches: 16,
+            photons: 1 << 24,
+            map: SurfaceMapSettings::default(),
+            vertices: None,
+            seed: 1,
+        }
+    }
+}
+
+/// Outgoing radiance at vertices.
+#[derive(Clone, Debug, Default)]
+pub struct Reference {
+    /// Mean per vertex and channel; 0 where not sampled.
+    pub radiance: Vec<DVec3>,
+    /// Variance of that mean.
+    pub variance: Vec<DVec3>,
+    /// Whether the vertex was sampled: it is in the subset and has a normal.
+    pub sampled: Vec<bool>,
+    /// Rays traced.
+    pub rays: u64,
+}
+
+/// A fixed random subset of `count` of `total` vertices (Fisher–Yates), in increasing order; all if `None`.
+pub fn subset(total: usize, count: Option<usize>) -> Vec<usize> {
+    let count = count.unwrap_or(total).min(total);
+    let mut all: Vec<usize> = (0..total).collect();
+    if count < total {
+        let mut rng = Rng::stream(0, Stage::Path, u64::MAX);
+        for i in 0..count {
+            #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "below total")]
+            let j = i + (rng.unit() * (total - i) as f64) as usize;
+            all.swap(i, j.min(total - 1));
+        }
+        all.truncate(count);
+        all.sort_unstable();
+    }
+    all
+}
+
+/// The receiver at local `p` of hyperplane `isovalue`; `None` where ∇h vanishes.
+pub fn receiver(scene: &Scene, p: DVec3, isovalue: f32, side: Side) -> Option<Receiver> {
+    let position = p.as_vec3();
+    let normal = scene.normal(position.as_dvec3(), side)?;
+    Some(Receiver { position, normal, isovalue, departure: Departure::Surface(side) })
+}
+
+/// Outgoing radiance of the outside at the vertices of `mesh`, the isosurface at `isovalue` (units of the sweep).
+/// `tick(n)` reports n of batches × vertices done; returning false stops early.
+#[allow(clippy::cast_possible_truncation, reason = "batches are few")]
+pub fn reference<T: Tracer>(
+    scene: &Scene,
+    tracer: &T,
+    mesh: &SurfaceMesh,
+    isovalue: f32,
+    settings: &ReferenceSettings,
+    tick: &(dyn Fn(u64) -> bool + Sync),
+) -> Reference {
+    let side = scene.surface.outside;
+    let chosen = subset(mesh.local.len(), settings.vertices);
+    let receivers: Vec<Option<Receiver>> =
+        chosen.iter().map(|&v| receiver(scene, mesh.local[v], isovalue, side)).collect();
+    let batches = settings.batches.max(2);
+    let samples = settings.samples.div_ceil(batches);
+    let rays = AtomicU64::new(0);
+    let (mut sums, mut squares) = (vec![DVec3::ZERO; chosen.len()], vec![DVec3::ZERO; chosen.len()]);
+    for batch in 0..u64::from(batches) {
+        let map = (settings.integrator == Integrator::Photon).then(|| {
+            let photons = trace_photons(
+                scene,
+                tracer,
+                &PhotonSettings {
+                    count: (settings.photons / u64::from(batches)).max(1),
+                    max_bounces: u16::MAX,
+                    // Streams of batches must differ in the seed: photons are keyed by nothing else.
+                    seed: settings.seed.wrapping_mul(0x1_0000_0001).wrapping_add(batch << 32),
+                    fixed_isovalue: Some(isovalue),
+                },
+                &|_| tick(0),
+            );
+            rays.fetch_add(photons.rays, Ordering::Relaxed);
+            SurfaceMap::new(scene, mesh, isovalue, &photons, settings.map)
+        });
+        let estimates: Vec<DVec3> = chosen
+            .par_iter()
+            .zip(&receivers)
+            .with_min_len(16)
+            .map(|(&vertex, receiver)| {
+                let Some(receiver) = receiver else { return DVec3::ZERO };
+                if !tick(0) {
+                    return DVec3::ZERO;
+                }
+                let key = (settings.seed, vertex as u64 * u64::from(batches) + batch);
+                let mut paths = PathTracer::new(scene, tracer);
+                let radiance = match &map {
+                    None => paths.outgoing(receiver, samples, key),
+                    Some(map) => map.outgoing(scene, tracer, receiver, samples, key, &mut paths.rays),
+                };
+                rays.fetch_add(paths.rays, Ordering::Relaxed);
+                tick(1);
+                radiance
+            })
+            .collect();
+        // Welford's update, all vertices side by side.
+        for ((mean, square), x) in sums.iter_mut().zip(&mut squares).zip(estimates) {
+            let d = x - *mean;
+            *mean += d / (batch + 1) as f64;
+            *square += d * (x - *mean);
+        }
+    }
+    let total = mesh.local.len();
+    let mut out = Reference {
+        radiance: vec![DVec3::ZERO; total],
+        variance: vec![DVec3::ZERO; total],
+        sampled: vec![false; total],
+        rays: rays.into_inner(),
+    };
+    let n = f64::from(batches);
+    for (i, &v) in chosen.iter().enumerate().filter(|(i, _)| receivers[*i].is_some()) {
+        out.radiance[v] = sums[i];
+        out.variance[v] = squares[i] / (n * (n - 1.0));
+        out.sampled[v] = true;
+    }
+    out
+}

@@ -1,0 +1,189 @@
+//! Unbiased path tracing with next-event estimation. [Kajiya86]
+
+use crate::brdf::reflected;
+use crate::direct::Receiver;
+use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target};
+use crate::luminaire::{point_term, unoccluded};
+use crate::rng::{Rng, Sobol, Stage};
+use crate::scene::Scene;
+use crate::tracer::Tracer;
+use crate::warp::{Frame, cosine_hemisphere};
+use glam::DVec3;
+
+/// A path tracer that counts its rays.
+pub struct PathTracer<'a, T> {
+    scene: &'a Scene,
+    tracer: &'a T,
+    /// Rays traced.
+    pub rays: u64,
+}
+
+/// Shadow rays that choose the control variate of a receiver's direct light.
+const PILOT: u32 = 16;
+
+impl<'a, T: Tracer> PathTracer<'a, T> {
+    /// A path tracer through `tracer`.
+    pub fn new(scene: &'a Scene, tracer: &'a T) -> Self {
+        Self { scene, tracer, rays: 0 }
+    }
+
+    /// Radiance that leaves the surface at `receiver`, from `samples` paths. `key` is (seed, index).
+    pub fn outgoing(&mut self, receiver: &Receiver, samples: u32, key: (u64, u64)) -> DVec3 {
+        let scene = self.scene;
+        let direct = self.direct(receiver, samples, key);
+        let frame = Frame::new(receiver.normal);
+        let set = Sobol::set(key.0, Stage::Path, key.1);
+        let mut sum = DVec3::ZERO;
+        for i in 0..samples {
+            let mut rng = Rng::stream(key.0, Stage::Path, key.1 << 20 ^ u64::from(i));
+            let direction = frame.to_world(cosine_hemisphere(set.point2(i, 2)));
+            sum +=
+                self.incoming(scene.ray(receiver.position, direction, receiver.isovalue, receiver.departure), &mut rng);
+        }
+        let indirect = sum * (std::f64::consts::PI / f64::from(samples.max(1)));
+        reflected(scene.surface.albedo, direct + indirect) + scene.surface.emission
+    }
+
+    /// Direct irradiance by `samples` points uniform over each luminaire:
+    /// β E₀ + A/n Σ g (V − β) with E₀ the closed form without blockers. Unbiased for every β; β is the visible share
+    /// seen by a pilot of its own, so that what is fully lit or fully dark has no variance.
+    pub fn direct(&mut self, receiver: &Receiver, samples: u32, (seed, index): (u64, u64)) -> DVec3 {
+        let scene = self.scene;
+        let x = scene.lattice().to_world(receiver.position.as_dvec3());
+        let mut total = DVec3::ZERO;
+        for (n, &l) in scene.luminaires().iter().enumerate() {
+            let light = &scene.polygons()[l as usize];
+            if receiver.departure == Departure::Polygon(l) {
+                continue;
+            }
+            let open = unoccluded(light, x, receiver.normal);
+            if open == 0.0 {
+                continue;
+            }
+            let index = index * scene.luminaires().len() as u64 + n as u64;
+            let mut shares = |set: Sobol, count: u32| -> (f64, f64) {
+                let (mut all, mut seen) = (0.0, 0.0);
+                for i in 0..count {
+                    let y = light.sample(set.point2(i, 0));
+                    let g = point_term(x, receiver.normal, y, light.normal());
+                    all += g;
+                    if g > 0.0 && self.visible(receiver, y, l) {
+                        seen += g;
+                    }
+                }
+                (all, seen)
+            };
+            // The pilot's stream: another index of the same stage, far from all others.
+            let (all, seen) = shares(Sobol::set(seed, Stage::Direct, !index), PILOT);
+            let beta = if all > 0.0 { seen / all } else { 0.0 };
+            let (all, seen) = shares(Sobol::set(seed, Stage::Direct, index), samples);
+            let mean = light.area() * (seen - beta * all) / f64::from(samples.max(1));
+            total += light.emission * (beta * open + mean);
+        }
+        total
+    }
+
+    /// Whether `y` on luminaire `l` is seen from `receiver`.
+    #[inline]
+    fn visible(&mut self, receiver: &Receiver, y: DVec3, l: u32) -> bool {
+        self.rays += 1;
+        let direction = self.scene.lattice().to_index(y).as_vec3() - receiver.position;
+        let ray = FlattenedRay {
+            reach: 1.0,
+            departure: receiver.departure,
+            target: Some(l),
+            ..FlattenedRay::free(receiver.position, direction, receiver.isovalue)
+        };
+        !self.tracer.occluded(&ray)
+    }
+
+    /// Direct irradiance from one random point per luminaire: noisy and unbiased.
+    pub(super) fn direct_once(&mut self, receiver: &Receiver, rng: &mut Rng) -> DVec3 {
+        let scene = self.scene;
+        let x = scene.lattice().to_world(receiver.position.as_dvec3());
+        let mut total = DVec3::ZERO;
+        for &l in scene.luminaires() {
+            let light = &scene.polygons()[l as usize];
+            let y = light.sample(rng.unit2());
+            let g = point_term(x, receiver.normal, y, light.normal());
+            if g > 0.0 && receiver.departure != Departure::Polygon(l) && self.visible(receiver, y, l) {
+                total += light.emission * (light.area() * g);
+            }
+        }
+        total
+    }
+
+    /// Radiance that arrives along `ray`, without what its first hit emits as a luminaire. Russian roulette keeps the
+    /// largest channel.
+    fn incoming(&mut self, mut ray: FlattenedRay, rng: &mut Rng) -> DVec3 {
+        let (mut total, mut weight) = (DVec3::ZERO, DVec3::ONE);
+        loop {
+            self.rays += 1;
+            let Some(hit) = self.tracer.intersect(&ray) else { return total };
+            let Some((receiver, albedo, emission)) = landing(self.scene, &ray, hit) else { return total };
+            total += weight * emission;
+            let survival = (weight * albedo).max_element() / weight.max_element();
+            if !(survival > 0.0) {
+                return total;
+            }
+            total += weight * reflected(albedo, self.direct_once(&receiver, rng));
+            if rng.unit() >= survival {
+                return total;
+            }
+            weight *= albedo / survival;
+            let direction = Frame::new(receiver.normal).to_world(cosine_hemisphere(rng.unit2()));
+            ray = self.scene.ray(receiver.position, direction, ray.isovalue, receiver.departure);
+        }
+    }
+}
+
+/// What stands at a hit: a receiver, its albedo, and its emission unless it is a luminaire, whose light counts as direct.
+/// `None` where ∇h vanishes or nothing reflects.
+#[inline]
+pub(super) fn landing(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> Option<(Receiver, DVec3, DVec3)> {
+    let position = ray.at(hit.t).as_vec3();
+    let isovalue = ray.isovalue;
+    let none = DVec3::ZERO;
+    let (normal, departure, albedo, emission) = match hit.target {
+        Target::Surface(side) => {
+            let normal = scene.normal(position.as_dvec3(), side)?;
+            (normal, Departure::Surface(side), scene.surface.albedo, scene.surface.emission)
+        }
+        Target::Cap(face, side) => {
+            let n = scene.face_normal(face);
+            (if side == Side::Lower { n } else { -n }, Departure::Free, scene.surface.albedo, none)
+        }
+        Target::Polygon(id) => {
+            let p = &scene.polygons()[id as usize];
+            // The back of a luminaire is black.
+            let seen = (scene.lattice().axes() * ray.direction.as_dvec3()).dot(p.normal()) < 0.0;
+            (p.normal(), Departure::Polygon(id), if seen { p.albedo } else { none }, none)
+        }
+    };
+    Some((Receiver { position, normal, isovalue, departure }, albedo, emission))
+}
+
+/// Radiance seen along `ray` of a picture, from one path; what a luminaire emits is seen.
+pub fn path_radiance<T: Tracer>(
+    scene: &Scene,
+    tracer: &T,
+    ray: &FlattenedRay,
+    hit: FlattenedHit,
+    rng: &mut Rng,
+) -> DVec3 {
+    let Some((receiver, albedo, mut emission)) = landing(scene, ray, hit) else { return DVec3::ZERO };
+    if let Target::Polygon(id) = hit.target {
+        let p = &scene.polygons()[id as usize];
+        let seen = (scene.lattice().axes() * ray.direction.as_dvec3()).dot(p.normal()) < 0.0;
+        emission = if seen { p.emission } else { DVec3::ZERO };
+    }
+    if albedo == DVec3::ZERO {
+        return emission;
+    }
+    let mut paths = PathTracer::new(scene, tracer);
+    let direct = paths.direct_once(&receiver, rng);
+    let direction = Frame::new(receiver.normal).to_world(cosine_hemisphere(rng.unit2()));
+    let next = scene.ray(receiver.position, direction, ray.isovalue, receiver.departure);
+    let indirect = paths.incoming(next, rng) * std::f64::consts::PI;
+    emission + reflected(albedo, direct + indirect)
+}

@@ -1,0 +1,238 @@
+//! A photon map of one isosurface in 3D: irradiance per area of mesh and walls, and final gather from it. [Jensen01]
+
+use super::path::{PathTracer, landing};
+use crate::brdf::reflected;
+use crate::direct::Receiver;
+use crate::flattened::{Departure, Side};
+use crate::nearest::{Neighbours, PointGrid};
+use crate::photon::Photons;
+use crate::rng::{Rng, Sobol, Stage};
+use crate::scene::Scene;
+use crate::surface_mesh::SurfaceMesh;
+use crate::tracer::Tracer;
+use crate::warp::{self, Frame, cosine_hemisphere};
+use glam::{DVec3, Vec3};
+use rayon::prelude::*;
+
+/// How irradiance is estimated from photons on a surface.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SurfaceMapSettings {
+    /// Nearest photons per estimate.
+    pub photons: usize,
+    /// Largest radius, as a fraction of Ω's diagonal.
+    pub max_radius: f64,
+    /// Least cosine between normals.
+    pub cone: f64,
+}
+
+impl Default for SurfaceMapSettings {
+    fn default() -> Self {
+        Self { photons: 64, max_radius: 0.05, cone: 0.7 }
+    }
+}
+
+/// Points per triangle of the quadrature of ∫_A K dA: the centroids of a 4×4 subdivision.
+const CUTS: usize = 4;
+/// Points of the unit disk for walls.
+const DISK: usize = 64;
+
+/// Photons that were reflected before, on the mesh and on polygons.
+pub struct SurfaceMap {
+    settings: SurfaceMapSettings,
+    isovalue: f32,
+    origin: DVec3,
+    radius: f32,
+    /// One per side (lower, higher) of the surface.
+    sides: [Share; 2],
+    /// One per polygon.
+    walls: Vec<Share>,
+    area_grid: PointGrid,
+    /// Slot order of `area_grid`: area and lower normal.
+    areas: Vec<(f32, Vec3)>,
+    disk: Vec<[f64; 2]>,
+}
+
+/// Photons of one side or polygon.
+struct Share {
+    grid: PointGrid,
+    /// Slot order: power and the surface's lower normal (unused on walls).
+    photons: Vec<(Vec3, Vec3)>,
+}
+
+impl Share {
+    fn new(items: &[(Vec3, Vec3, Vec3)]) -> Self {
+        let grid = PointGrid::new(&items.iter().map(|i| i.0).collect::<Vec<_>>(), 3.0);
+        let photons = grid.numbers().iter().map(|&n| (items[n as usize].1, items[n as usize].2)).collect();
+        Self { grid, photons }
+    }
+}
+
+impl SurfaceMap {
+    /// Maps the photons of one isovalue that were reflected at least once; `mesh` is its isosurface.
+    pub fn new(
+        scene: &Scene,
+        mesh: &SurfaceMesh,
+        isovalue: f32,
+        photons: &Photons,
+        settings: SurfaceMapSettings,
+    ) -> Self {
+        let lattice = scene.lattice();
+        let origin = scene.bounds()[0];
+        let lower = |p: DVec3| scene.normal(p, Side::Lower).unwrap_or_default().as_vec3();
+        let sides = [Side::Lower, Side::Higher].map(|side| {
+            let items: Vec<_> = photons
+                .surface
+                .par_iter()
+                .filter(|p| p.bounces > 0 && p.side == side)
+                .map(|p| {
+                    let at = p.position.as_dvec3();
+                    ((lattice.to_world(at) - origin).as_vec3(), p.power, lower(at))
+                })
+                .collect();
+            Share::new(&items)
+        });
+        let walls = (0..scene.polygons().len())
+            .map(|n| {
+                let polygon = &scene.polygons()[n];
+                let items: Vec<_> = photons
+                    .flat
+                    .par_iter()
+                    .filter(|p| p.bounces > 0 && p.flat as usize == n)
+                    .map(|p| {
+                        let x = polygon.at([f64::from(p.uvc[0]), f64::from(p.uvc[1])]);
+                        ((x - origin).as_vec3(), p.power, Vec3::ZERO)
+                    })
+                    .collect();
+                Share::new(&items)
+            })
+            .collect();
+        let mut points = Vec::with_capacity(mesh.triangles.len() * CUTS * CUTS);
+        for t in &mesh.triangles {
+            let [a, b, c] = t.map(|v| mesh.positions[v as usize] - origin);
+            let [na, nb, nc] = t.map(|v| mesh.normals[v as usize]);
+            #[allow(clippy::cast_possible_truncation, reason = "areas are f32")]
+            let area = ((b - a).cross(c - a).length() / (2 * CUTS * CUTS) as f64) as f32;
+            let outside = if scene.surface.outside == Side::Lower { 1.0 } else { -1.0 };
+            for i in 0..CUTS {
+                for j in 0..CUTS - i {
+                    let mut push = |u: f64, v: f64| {
+                        let (u, v) = (u / CUTS as f64, v / CUTS as f64);
+                        let n = na.as_dvec3() * (1.0 - u - v) + nb.as_dvec3() * u + nc.as_dvec3() * v;
+                        let normal = (outside * n.normalize_or_zero()).as_vec3();
+                        points.push(((a + u * (b - a) + v * (c - a)).as_vec3(), area, normal));
+                    };
+                    let (u, v) = (i as f64, j as f64);
+                    push(u + 1.0 / 3.0, v + 1.0 / 3.0);
+                    if i + j + 1 < CUTS {
+                        push(u + 2.0 / 3.0, v + 2.0 / 3.0);
+                    }
+                }
+            }
+        }
+        let area_grid = PointGrid::new(&points.iter().map(|p| p.0).collect::<Vec<_>>(), 3.0);
+        let areas = area_grid.numbers().iter().map(|&n| (points[n as usize].1, points[n as usize].2)).collect();
+        let set = Sobol::set(0, Stage::Footprint, 1 << 20);
+        #[allow(clippy::cast_possible_truncation, reason = "64 points")]
+        let disk = (0..DISK as u32).map(|i| warp::disk(set.point2(i, 0))).collect();
+        let diagonal = (lattice.axes() * lattice.far()).length();
+        #[allow(clippy::cast_possible_truncation, reason = "distances are f32")]
+        let radius = (settings.max_radius * diagonal) as f32;
+        Self { settings, isovalue, origin, radius, sides, walls, area_grid, areas, disk }
+    }
+
+    /// Radiance that leaves the surface at `receiver`: direct light, and a final gather of `samples` rays that find
+    /// direct light by a shadow ray and the rest in the map.
+    pub fn outgoing<T: Tracer>(
+        &self,
+        scene: &Scene,
+        tracer: &T,
+        receiver: &Receiver,
+        samples: u32,
+        key: (u64, u64),
+        rays: &mut u64,
+    ) -> DVec3 {
+        let mut paths = PathTracer::new(scene, tracer);
+        let direct = paths.direct(receiver, samples, key);
+        let frame = Frame::new(receiver.normal);
+        let set = Sobol::set(key.0, Stage::Path, key.1);
+        let (mut scratch, mut sum) = (Neighbours::default(), DVec3::ZERO);
+        for i in 0..samples {
+            let mut rng = Rng::stream(key.0, Stage::Path, key.1 << 20 ^ u64::from(i));
+            let direction = frame.to_world(cosine_hemisphere(set.point2(i, 2)));
+            let ray = scene.ray(receiver.position, direction, receiver.isovalue, receiver.departure);
+            paths.rays += 1;
+            let Some(hit) = tracer.intersect(&ray) else { continue };
+            let Some((landed, albedo, emission)) = landing(scene, &ray, hit) else { continue };
+            sum += emission;
+            if albedo != DVec3::ZERO {
+                let irradiance = paths.direct_once(&landed, &mut rng) + self.irradiance(scene, &landed, &mut scratch);
+                sum += reflected(albedo, irradiance);
+            }
+        }
+        *rays += paths.rays;
+        let indirect = sum * (std::f64::consts::PI / f64::from(samples.max(1)));
+        reflected(scene.surface.albedo, direct + indirect) + scene.surface.emission
+    }
+
+    /// Irradiance of reflected photons: Σ w K / ∫_A K dA with K = 1 − (d/r)², r the distance of the k-th photon and A
+    /// what lies within r, on the same side, with a similar normal, on mesh or polygon. 0 on caps.
+    #[allow(clippy::cast_possible_truncation, reason = "distances are f32")]
+    pub fn irradiance(&self, scene: &Scene, at: &Receiver, scratch: &mut Neighbours) -> DVec3 {
+        let world = scene.lattice().to_world(at.position.as_dvec3());
+        let q = (world - self.origin).as_vec3();
+        let cone = self.settings.cone as f32;
+        let (share, normal) = match at.departure {
+            Departure::Surface(Side::Lower) => (&self.sides[0], at.normal.as_vec3()),
+            Departure::Surface(Side::Higher) => (&self.sides[1], -at.normal.as_vec3()),
+            Departure::Polygon(id) => (&self.walls[id as usize], Vec3::ZERO),
+            Departure::Free => return DVec3::ZERO,
+        };
+        let wall = normal == Vec3::ZERO;
+        let k = self.settings.photons;
+        let accept = |slot: u32| wall || share.photons[slot as usize].1.dot(normal) >= cone;
+        share.grid.nearest(q, k, self.radius, accept, scratch);
+        let found = scratch.found();
+        if found.is_empty() {
+            return DVec3::ZERO;
+        }
+        let farthest = found.iter().map(|e| e.0).fold(0.0, f32::max);
+        let radius = if found.len() < k { self.radius } else { farthest.sqrt() };
+        if radius == 0.0 {
+            return DVec3::ZERO;
+        }
+        let weight = |d2: f32| f64::from((1.0 - d2 / (radius * radius)).max(0.0));
+        let power: DVec3 = found.iter().map(|&(d2, slot)| share.photons[slot as usize].0.as_dvec3() * weight(d2)).sum();
+        let area = match at.departure {
+            Departure::Polygon(id) => self.wall_area(scene, id, world, at, f64::from(radius)),
+            _ => {
+                let accept = |slot: u32| self.areas[slot as usize].1.dot(normal) >= cone;
+                self.area_grid.nearest(q, usize::MAX, radius, accept, scratch);
+                let found = scratch.found();
+                found.iter().map(|&(d2, slot)| f64::from(self.areas[slot as usize].0) * weight(d2)).sum()
+            }
+        };
+        if area > 0.0 { power / area } else { DVec3::ZERO }
+    }
+
+    /// ∫ K dA over the part of the disk on polygon `id` that lies on the receiver's side of the level set.
+    fn wall_area(&self, scene: &Scene, id: u32, world: DVec3, at: &Receiver, radius: f64) -> f64 {
+        let (polygon, lattice) = (&scene.polygons()[id as usize], scene.lattice());
+        let frame = Frame::new(polygon.normal());
+        let far = lattice.far();
+        let higher = |p: DVec3| {
+            let inside = p.cmpge(DVec3::splat(-1e-6)).all() && p.cmple(far + 1e-6).all();
+            inside && scene.field.value(p) >= f64::from(self.isovalue)
+        };
+        let side = higher(at.position.as_dvec3());
+        let sum: f64 = self
+            .disk
+            .iter()
+            .filter(|[u, v]| {
+                let x = world + frame.to_world(DVec3::new(*u, *v, 0.0)) * radius;
+                polygon.contains(x) && higher(lattice.to_index(x)) == side
+            })
+            .map(|[u, v]| 1.0 - u * u - v * v)
+            .sum();
+        sum * std::f64::consts::PI * radius * radius / DISK as f64
+    }
+}
