@@ -19,6 +19,8 @@ mod flats;
 mod gather;
 mod grid;
 mod pack;
+#[allow(unsafe_code, reason = "vector instructions: measured to pay, chosen at run time")]
+mod simd;
 
 use crate::error::{Error, Result};
 use crate::flat::FlatTexture;
@@ -28,6 +30,7 @@ use flats::Flats;
 use gather::Pass;
 use grid::{Geometry, Planes};
 use rayon::prelude::*;
+use simd::Isa;
 use std::f32::consts::PI;
 
 /// How to sweep.
@@ -158,7 +161,7 @@ pub fn sweep(scene: &Scene, settings: &SweepSettings, tick: &(dyn Fn(f64) -> boo
     out.counts.masked = geometry.valid.len() as u64 - out.counts.valid;
     let mut done = 0;
     for r in 0..replicates {
-        let run = Run { scene, settings, geometry: &geometry, inside: &inside, sides: &sides };
+        let run = Run { scene, settings, geometry: &geometry, inside: &inside, sides: &sides, isa: Isa::detect() };
         let progress = |x: f64| tick((r as f64 + x) / replicates as f64);
         let replicate = run.replicate(r as u64, &mut flats, &mut out, &progress);
         if out.stopped && done > 0 {
@@ -194,6 +197,7 @@ struct Run<'a> {
     geometry: &'a Geometry<'a>,
     inside: &'a [bool],
     sides: &'a [Side],
+    isa: Isa,
 }
 
 /// Direct and indirect irradiance of one replicate, per side.
@@ -226,7 +230,7 @@ impl Run<'_> {
         stopped |= !complete;
         out.counts.shadow_rays += out.counts.valid * lights as u64;
         let mut indirect: Vec<Planes> = self.sides.iter().map(|_| grid::black(n)).collect();
-        let pass = Pass { scene: self.scene, geometry: self.geometry, inside: self.inside, primary: self.sides[0] };
+        let pass = Pass { scene: self.scene, geometry: self.geometry, inside: self.inside, primary: self.sides[0], isa: self.isa };
         let nothing = flats.open();
         flats.close(nothing);
         flats.reflect([1.0; 3], false);

@@ -37,7 +37,7 @@ impl Texture {
     }
 
     /// Writes B at (u, v) for every isovalue to `out`: three channels of `isovalues()` numbers.
-    #[inline]
+    #[inline(always)]
     pub(super) fn column(&self, uv: [f32; 2], out: &mut [f32]) {
         let n = 3 * self.dims[2];
         let [a, b, c, d] = around(self.dims, uv).map(|(t, w)| (&self.radiance[t * n..][..n], w));
@@ -289,7 +289,7 @@ pub(super) struct Stop {
 }
 
 /// The radiance of a stop over isovalues; black where it shows none.
-#[inline]
+#[inline(always)]
 pub(super) fn fill_column(flats: &Flats, stop: Option<Stop>, out: &mut [f32]) {
     let texture = stop.and_then(|s| Some((flats.textures[s.flat? as usize].as_ref()?, s.uv)));
     match texture {
@@ -381,7 +381,7 @@ impl Ends {
     }
 
     /// What line (p, q) meets first beyond `from`, towards +τ (`forward`) or −τ; polygon `except` does not count.
-    #[inline]
+    #[inline(always)]
     #[allow(clippy::cast_possible_truncation, reason = "texture coordinates")]
     pub(super) fn stop(&self, p: f64, q: f64, from: f64, forward: bool, except: Option<u32>) -> Option<Stop> {
         let mut best: Option<(f64, &Met)> = None;

@@ -4,7 +4,8 @@ use super::arrive;
 use super::directions::{Layout, Shear};
 use super::flats::{Arrivals, Ends, Flats, Incoming};
 use super::grid::{Geometry, NORMAL_SCALE, Planes, transposed, untransposed};
-use super::pack::{LANES, Lanes, Pack, Plan};
+use super::pack::{LANES, Pack, Plan, Way};
+use super::simd::Isa;
 use crate::flattened::Side;
 use crate::scene::Scene;
 use glam::DVec3;
@@ -18,6 +19,8 @@ pub(super) struct Pass<'a> {
     pub inside: &'a [bool],
     /// The side that owns lines without samples.
     pub primary: Side,
+    /// The instruction set of the hot loops.
+    pub isa: Isa,
 }
 
 /// Rows of lines that are in memory at a time. Every node is written once per direction whatever this is.
@@ -71,26 +74,15 @@ impl Pass<'_> {
     /// Divides by the sum of cosines that the directions gave each node's normal, which is π only in the mean: equal
     /// radiance from everywhere gives its irradiance exactly.
     fn normalise(&self, lines: &[Shear], e: &mut Planes) {
-        const ROW: usize = 256;
         let n = self.geometry.normals(&Layout::new(self.geometry.dims, 2));
         let omega: Vec<[f32; 3]> = lines.iter().map(|s| s.omega.as_vec3().to_array()).collect();
         // Σ|ω·N| · 4π/(2·lines) over N's units, against π.
         let half = 0.5 * lines.len() as f32 * NORMAL_SCALE;
         let [e0, e1, e2] = e;
-        (e0.par_chunks_mut(ROW), e1.par_chunks_mut(ROW), e2.par_chunks_mut(ROW)).into_par_iter().enumerate().for_each(
+        (e0.par_chunks_mut(COSINES), e1.par_chunks_mut(COSINES), e2.par_chunks_mut(COSINES)).into_par_iter().enumerate().for_each(
             |(row, (e0, e1, e2))| {
-                let width = e0.len();
-                let n = [0, 1, 2].map(|a| {
-                    let mut out = [0f32; ROW];
-                    out.iter_mut().zip(&n[a][row * ROW..][..width]).for_each(|(o, &x)| *o = f32::from(x));
-                    out
-                });
-                let mut sum = [0f32; ROW];
-                for w in &omega {
-                    for i in 0..ROW {
-                        sum[i] += (w[0] * n[0][i] + w[1] * n[1][i] + w[2] * n[2][i]).abs();
-                    }
-                }
+                let mut sum = [0f32; COSINES];
+                self.isa.cosines(&omega, n.each_ref().map(|n| &n[row * COSINES..][..e0.len()]), &mut sum);
                 for e in [e0, e1, e2] {
                     e.iter_mut().zip(&sum).for_each(|(e, s)| *e *= if *s > 0.0 { half / s } else { 0.0 });
                 }
@@ -124,6 +116,7 @@ impl Pass<'_> {
         let first = plan.first[1].min(walls.rows.0);
         let last = (plan.first[1] + plan.count[1] as isize).max(walls.rows.1);
         let strict = side == Side::Higher;
+        let isa = self.isa;
         let scale = 4.0 * std::f64::consts::PI / (2 * lines) as f64;
         let omega = (shear.omega * (f64::from(sign) * scale / f64::from(NORMAL_SCALE))).as_vec3().to_array();
         let mut q0 = first;
@@ -138,17 +131,13 @@ impl Pass<'_> {
                     let within = row.q >= plan.first[1] && row.q < plan.first[1] + plan.count[1] as isize;
                     for start in (0..plan.width).step_by(LANES).filter(|_| within) {
                         let p = plan.first[0] + start as isize;
-                        if !pack.read(&plan, h, b, p, row.q) {
+                        if !isa.read(pack, &plan, h, b, p, row.q) {
                             continue;
                         }
-                        pack.end(&plan, &ends, flats, p, row.q);
-                        for forward in [true, false] {
-                            let planes = &mut row.planes[if forward { 0..3 } else { 3..6 }];
-                            pack.scan(forward, strict, sign, |k, light: &[Lanes; 3]| {
-                                for c in 0..3 {
-                                    planes[c][k * plan.width + start..][..LANES].copy_from_slice(&light[c]);
-                                }
-                            });
+                        isa.end(pack, &plan, &ends, flats, p, row.q);
+                        let (plus, minus) = row.planes.split_at_mut(3);
+                        for (forward, out) in [(true, plus), (false, minus)] {
+                            isa.scan(pack, Way { forward, strict, sign }, out, (plan.width, start));
                         }
                         walls.through(pack, p, row.q, &mut row.arrivals);
                     }
@@ -198,15 +187,15 @@ impl Pass<'_> {
                     let at = m * nu..(m + 1) * nu;
                     let n = [0, 1, 2].map(|a| &normals[a][outer * chunk..][at.clone()]);
                     let e = [&mut e0[at.clone()], &mut e1[at.clone()], &mut e2[at.clone()]];
-                    accumulate_row(e, n, omega, light, line0, fu, fv);
+                    self.isa.accumulate(e, n, omega, light, line0, fu, fv);
                 }
             });
     }
 }
 
 /// One row of nodes. `line0` is the line (in `light`) just beyond node 0, −1 of which is missing.
-#[inline]
-fn accumulate_row(
+#[inline(always)]
+pub(super) fn accumulate_row(
     e: [&mut [f32]; 3],
     n: [&[i16]; 3],
     omega: [f32; 3],
@@ -243,6 +232,23 @@ fn accumulate_row(
             let a = (w[0] * plus[0][i] + w[1] * plus[1][i]) + (w[2] * plus[2][i] + w[3] * plus[3][i]);
             let b = (w[0] * minus[0][i] + w[1] * minus[1][i]) + (w[2] * minus[2][i] + w[3] * minus[3][i]);
             e[i] += cos.max(0.0) * a + (-cos).max(0.0) * b;
+        }
+    }
+}
+
+/// Nodes whose cosines are summed at a time.
+pub(super) const COSINES: usize = 256;
+
+/// Σ|ω·N| over directions, of up to [`COSINES`] nodes with normals `n`.
+#[inline(always)]
+pub(super) fn sum_cosines(omega: &[[f32; 3]], n: [&[i16]; 3], sum: &mut [f32; COSINES]) {
+    let mut normal = [[0f32; COSINES]; 3];
+    for (to, from) in normal.iter_mut().zip(n) {
+        to.iter_mut().zip(from).for_each(|(o, &x)| *o = f32::from(x));
+    }
+    for w in omega {
+        for i in 0..COSINES {
+            sum[i] += (w[0] * normal[0][i] + w[1] * normal[1][i] + w[2] * normal[2][i]).abs();
         }
     }
 }

@@ -74,14 +74,14 @@ struct Taps {
 }
 
 impl Taps {
-    #[inline]
+    #[inline(always)]
     fn one(&self, plane: &[f32], lane: isize) -> f32 {
         let s = |t: usize| self.weight[t] * plane[(self.at[t] + lane).unsigned_abs()];
         (s(0) + s(1)) + (s(2) + s(3))
     }
 
     /// Lanes `lo..hi` of a pack that starts at memory position `at + 0`.
-    #[inline]
+    #[inline(always)]
     fn many(&self, plane: &[f32], lo: usize, hi: usize, out: &mut Lanes) {
         if lo == 0 && hi == LANES {
             let [a, b, c, d] = self
@@ -101,10 +101,21 @@ impl Taps {
 
 /// A cut of one lane by a luminaire inside Ω: after which row, and what it shows to lines from before and behind.
 #[derive(Clone, Copy)]
-struct Cut {
-    row: usize,
-    lane: usize,
-    slots: [u32; 2],
+pub(super) struct Cut {
+    pub row: usize,
+    pub lane: usize,
+    pub slots: [u32; 2],
+}
+
+/// How to scan.
+#[derive(Clone, Copy)]
+pub(super) struct Way {
+    /// Rays run towards +τ.
+    pub forward: bool,
+    /// The next value must be greater, not only as great: the higher side.
+    pub strict: bool,
+    /// The sign h was read with.
+    pub sign: f32,
 }
 
 /// The samples of sixteen lines. Row 0 and the last hold nothing but entry and exit points; row k + 1 is slice k. A
@@ -112,15 +123,15 @@ struct Cut {
 pub(super) struct Pack {
     pub h: Vec<Lanes>,
     pub b: [Vec<Lanes>; 3],
-    next: Vec<[u32; LANES]>,
-    h_next: Vec<Lanes>,
+    pub next: Vec<[u32; LANES]>,
+    pub h_next: Vec<Lanes>,
     /// Rows that hold samples.
     pub rows: (usize, usize),
-    cuts: Vec<Cut>,
+    pub cuts: Vec<Cut>,
     /// Radiance of ends over isovalues: slot = lane for + ends, 16 + lane for − ends, then cuts.
-    columns: Vec<f32>,
-    isovalues: usize,
-    dark: bool,
+    pub columns: Vec<f32>,
+    pub isovalues: usize,
+    pub dark: bool,
     scratch: Vec<[Stop; 2]>,
 }
 
@@ -143,6 +154,7 @@ impl Pack {
     }
 
     /// Reads h and B along lines (first + lane, q). Returns whether any of them meets Ω.
+    #[inline(always)]
     pub(super) fn read(&mut self, plan: &Plan, h: &[f32], b: &Planes, first: isize, q: isize) -> bool {
         let [nu, nv, na] = plan.shear.layout.dims;
         let [sv, sa] = plan.shear.layout.stride;
@@ -228,6 +240,7 @@ impl Pack {
     }
 
     /// Finds what the lines end on and reads the radiance there. `first` and `q` as in [`Pack::read`].
+    #[inline(always)]
     pub(super) fn end(&mut self, plan: &Plan, ends: &Ends, flats: &Flats, first: isize, q: isize) {
         self.cuts.clear();
         let n = 3 * self.isovalues;
@@ -265,9 +278,10 @@ impl Pack {
     /// For every sample, the radiance its ray towards +τ (`forward`) or −τ meets: B where h is first back at the sample's
     /// value, or what stands at the end. [BSV93: all nearest greater values, one line per lane]
     ///
-    /// `emit(k, L)` receives the three channels of slice k. With `strict` the next value must be greater.
+    /// Writes slice k to `out` at k · width + start. With `strict` the next value must be greater.
     #[allow(clippy::cast_possible_truncation, reason = "rows of a pack")]
-    pub(super) fn scan(&mut self, forward: bool, strict: bool, sign: f32, mut emit: impl FnMut(usize, &[Lanes; 3])) {
+    pub(super) fn scan(&mut self, way: Way, out: &mut [Vec<f32>], (width, start): (usize, usize)) {
+        let Way { forward, strict, sign } = way;
         let rows = self.h.len();
         let end = rows as u32;
         let default = |lane: usize| end + (lane + if forward { 0 } else { LANES }) as u32;
@@ -328,7 +342,9 @@ impl Pack {
                 }
             }
             if row > 0 && row < rows - 1 {
-                emit(row - 1, &light);
+                for c in 0..3 {
+                    out[c][(row - 1) * width + start..][..LANES].copy_from_slice(&light[c]);
+                }
             }
         }
     }
