@@ -106,8 +106,20 @@ impl Pyramid {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped cell numbers; t leaves as f32")]
     fn walk<const ANY: bool>(&self, field: &Field, ray: &FlattenedRay, reach: f64) -> Option<FlattenedHit> {
         let n = self.levels[0].dims;
-        let o = ray.origin.as_dvec3().to_array();
+        let mut o = ray.origin.as_dvec3().to_array();
         let d = ray.direction.as_dvec3().to_array();
+        if let Departure::Cap(face, side) = ray.departure {
+            let (axis, far) = (usize::from(face % 3), face >= 3);
+            let inward = if far { d[axis] < 0.0 } else { d[axis] > 0.0 };
+            if inward != (side == Side::Higher) && d[axis] != 0.0 {
+                return Some(FlattenedHit { t: 0.0, target: cap(axis, far, side) });
+            }
+            if side == Side::Lower {
+                // Ω is convex: what leaves it never comes back.
+                return None;
+            }
+            o[axis] = if far { n[axis] as f64 } else { 0.0 };
+        }
         let inv = d.map(|x| 1.0 / x);
         // Clip to Ω. A component 0 (or −0) never crosses a plane: its slab holds the whole line or nothing of it.
         let (mut t, mut t_out, mut entry) = (0f64, reach, None);
