@@ -122,7 +122,7 @@ impl Pyramid {
         }
         let inv = d.map(|x| 1.0 / x);
         // Clip to Ω. A component 0 (or −0) never crosses a plane: its slab holds the whole line or nothing of it.
-        let (mut t, mut t_out, mut entry) = (0f64, reach, None);
+        let (mut t, mut t_out, mut entry, mut exit) = (0f64, reach, None, 0);
         for a in 0..3 {
             let far = n[a] as f64;
             if d[a] == 0.0 {
@@ -136,10 +136,18 @@ impl Pyramid {
             if t0 > t {
                 (t, entry) = (t0, Some(a));
             }
-            t_out = t_out.min((far_plane - o[a]) * inv[a]);
+            let t1 = (far_plane - o[a]) * inv[a];
+            if t1 < t_out {
+                (t_out, exit) = (t1, a);
+            }
         }
         if !(t <= t_out) || d == [0.0; 3] {
             return None;
+        }
+        if let (Departure::Surface(side), true) = (ray.departure, t_out == 0.0 && reach > 0.0) {
+            // It leaves Ω where it starts. There h = c counts as inside, which must not end a ray from the lower side.
+            let closed = self.capped && side == Side::Higher;
+            return closed.then(|| FlattenedHit { t: 0.0, target: cap(exit, d[exit] > 0.0, side) });
         }
         let mut cell = [0i64; 3];
         for a in 0..3 {
