@@ -150,8 +150,29 @@ impl Pyramid {
         reach: f64,
     ) -> Result<Start<'a>, Option<FlattenedHit>> {
         let n = self.cells;
-        let o = ray.origin.as_dvec3().to_array();
+        let mut o = ray.origin.as_dvec3().to_array();
         let d = ray.direction.as_dvec3().to_array();
+        if let Departure::Cap(face, side) = ray.departure {
+            let (axis, far) = (usize::from(face % 3), face >= 3);
+            let inward = if far { d[axis] < 0.0 } else { d[axis] > 0.0 };
+            if inward != (side == Side::Higher) && d[axis] != 0.0 {
+                return Err(Some(FlattenedHit { t: 0.0, target: cap(axis, far, side) }));
+            }
+            if side == Side::Lower {
+                // Ω is convex: what leaves it never comes back.
+                return Err(None);
+            }
+            o[axis] = if far { n[axis] as f64 } else { 0.0 };
+        }
+        if let Departure::Surface(side) = ray.departure {
+            let outwards = |a: usize| (o[a] == 0.0 && d[a] < 0.0) || (o[a] == n[a] as f64 && d[a] > 0.0);
+            if let Some(axis) = (0..3).find(|&a| outwards(a)) {
+                // It leaves Ω where it starts. There h = c counts as inside, which must not end a ray from the lower side.
+                let closed = self.capped && side == Side::Higher;
+                let target = cap(axis, d[axis] > 0.0, side);
+                return Err(closed.then_some(FlattenedHit { t: 0.0, target }));
+            }
+        }
         let inv = d.map(|x| 1.0 / x);
         // Clip to Ω. A component 0 (or −0) never crosses a plane: its slab holds the whole line or nothing of it.
         let (mut t, mut t_out, mut entry) = (0f64, reach, None);
