@@ -1,5 +1,8 @@
 //! The command line: verbs, flags, and what they print. No physics here.
 
+mod flatland;
+mod study;
+
 use crate::bake::{BakeOptions, BakeSettings, bake};
 use crate::embree::Device;
 use crate::error::{Error, Result};
@@ -51,6 +54,10 @@ enum Verb {
     Bake(Bake),
     /// Draw an isosurface of a bake inside its box
     Render(Render),
+    /// n = 2: pictures of light on a height field, in horizontal planes and as an ordinary surface
+    Flatland(flatland::Flatland),
+    /// Measure: tables and plots
+    Study(study::Study),
 }
 
 #[derive(clap::Args, Debug)]
@@ -167,6 +174,8 @@ impl Cli {
             Verb::Generate(v) => v.run(progress),
             Verb::Bake(v) => v.run(progress),
             Verb::Render(v) => v.run(progress),
+            Verb::Flatland(v) => v.run(progress),
+            Verb::Study(v) => v.run(progress),
         }
     }
 }
@@ -174,6 +183,12 @@ impl Cli {
 /// Fails now if `path` could not be written later.
 fn writable(path: &Path) -> Result<()> {
     crate::atomic::AtomicFile::create(path).map(drop)
+}
+
+/// Makes an output folder, and fails now if nothing could be written there.
+fn folder(path: &Path) -> Result<()> {
+    std::fs::create_dir_all(path).map_err(|e| Error::io(path, e))?;
+    writable(&path.join("probe"))
 }
 
 fn expect_extension(path: &Path, known: &[&str]) -> Result<()> {

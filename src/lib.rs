@@ -50,5 +50,7 @@ pub mod scene_file;
 // Products.
 pub mod export;
 pub mod render;
+// n = 2.
+pub mod flatland;
 // Verbs.
 pub mod cli;
