@@ -3,6 +3,8 @@
 mod compare;
 mod extract;
 mod reference;
+mod flatland;
+mod study;
 
 use crate::bake::{BakeOptions, BakeSettings, bake};
 use crate::embree::Device;
@@ -62,6 +64,10 @@ enum Verb {
     Reference(reference::ReferenceArgs),
     /// Measure a bake against references
     Compare(compare::Compare),
+    /// n = 2: pictures of light on a height field, in horizontal planes and as an ordinary surface
+    Flatland(flatland::Flatland),
+    /// Measure: tables and plots
+    Study(study::Study),
 }
 
 #[derive(clap::Args, Debug)]
@@ -184,6 +190,8 @@ impl Cli {
             Verb::Extract(v) => v.run(progress),
             Verb::Reference(v) => v.run(progress),
             Verb::Compare(v) => v.run(progress),
+            Verb::Flatland(v) => v.run(progress),
+            Verb::Study(v) => v.run(progress),
         }
     }
 }
@@ -191,6 +199,12 @@ impl Cli {
 /// Fails now if `path` could not be written later.
 fn writable(path: &Path) -> Result<()> {
     crate::atomic::AtomicFile::create(path).map(drop)
+}
+
+/// Makes an output folder, and fails now if nothing could be written there.
+fn folder(path: &Path) -> Result<()> {
+    std::fs::create_dir_all(path).map_err(|e| Error::io(path, e))?;
+    writable(&path.join("probe"))
 }
 
 fn expect_extension(path: &Path, known: &[&str]) -> Result<()> {

@@ -56,5 +56,6 @@ pub mod render;
 // One isosurface at a time in 3D, and how far a bake is from it.
 pub mod reference;
 pub mod accuracy;
+pub mod flatland;
 // Verbs.
 pub mod cli;

@@ -216,8 +216,7 @@ mod avx512 {
                     unsafe {
                         let a = gather(&pack.columns, index, ended, zero);
                         let b = gather(&pack.columns, _mm512_add_epi32(index, _mm512_set1_epi32(1)), ended, zero);
-                        light[c] =
-                            _mm512_mask_add_ps(light[c], ended, _mm512_mul_ps(g, a), _mm512_mul_ps(f, b));
+                        light[c] = _mm512_mask_add_ps(light[c], ended, _mm512_mul_ps(g, a), _mm512_mul_ps(f, b));
                     }
                 }
             }
