@@ -68,7 +68,7 @@ fn misses(scene: &Scene, levels: u8, rays: u64, seed: u64) -> (u64, u64, u64) {
             let mut rng = Rng::stream(seed, Stage::Test, i);
             let origin = start(&mut rng, dims);
             // Half of the isovalues are integers, which the samples are too.
-            let c = if i % 2 == 0 {
+            let c = if i.is_multiple_of(2) {
                 scene.field.sweep().isovalue((1 + rng.bits() % u64::from(levels - 1)) as f64)
             } else {
                 rng.unit() as f32
@@ -177,7 +177,7 @@ fn batches_find_what_single_rays_find() {
             .map(|_| {
                 let origin = start(&mut rng, scene.lattice().dims());
                 let mut ray = FlattenedRay::free(origin, direction(&mut rng), 0.9 * rng.unit() as f32);
-                if rng.bits() % 4 == 0 {
+                if rng.bits().is_multiple_of(4) {
                     ray.reach = (10.0 * rng.unit()) as f32;
                 }
                 ray

@@ -103,7 +103,7 @@ impl Pyramid {
         let mut nodes = Queue::default();
         for n in (0..WIDTH as u8).filter(|n| active >> n & 1 == 1) {
             let ray = ray(usize::from(n));
-            match self.begin::<ANY>(field, &ray, f64::from(ray.reach)) {
+            match self.begin::<ANY, K>(kernel, field, &ray, f64::from(ray.reach)) {
                 Err(done) => hits[usize::from(n)] = done,
                 Ok(start) => {
                     let constants = kernel.ray(&start.line);

@@ -12,11 +12,11 @@
 //! monotone, so that the times of the block are in order too.
 
 use super::children::{Children, Line};
-use super::{LEVELS, Pyramid, quantise};
+use super::{LEVELS, Pyramid, quantise4};
 use crate::cell::Cell;
 use crate::field::Field;
 use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target};
-use glam::DVec3;
+use glam::{DVec3, Vec4};
 
 /// Corners on the face across an axis, near and far.
 const FACES: [[u8; 2]; 3] = [[0x55, 0xaa], [0x33, 0xcc], [0x0f, 0xf0]];
@@ -94,7 +94,7 @@ impl Pyramid {
         ray: &FlattenedRay,
         reach: f64,
     ) -> Option<FlattenedHit> {
-        let start = match self.begin::<ANY>(field, ray, reach) {
+        let start = match self.begin::<ANY, K>(kernel, field, ray, reach) {
             Ok(start) => start,
             Err(done) => return done,
         };
@@ -143,8 +143,9 @@ impl Pyramid {
     /// if that is all.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped cell numbers; t leaves as f32")]
     #[inline(always)]
-    pub(super) fn begin<'a, const ANY: bool>(
+    pub(super) fn begin<'a, const ANY: bool, K: Children>(
         &self,
+        kernel: K,
         field: &'a Field,
         ray: &FlattenedRay,
         reach: f64,
@@ -212,6 +213,12 @@ impl Pyramid {
                 line.o[a] = cell[a] as f32 + 0.5;
             }
         }
+        // What is cold most often, on the way while the first cell is computed.
+        for (level, shift) in [(0, 2), (1, 4)] {
+            if let Some(level) = self.levels.get(level) {
+                kernel.prefetch(level.tile(cell.map(|i| i as usize >> shift)));
+            }
+        }
         // Roughly: the cells decide.
         line.end = ((reach - t) * scale * (1.0 + 1e-5) + 1e-3) as f32;
 
@@ -228,7 +235,7 @@ impl Pyramid {
         }
         let nearest = c as f32;
         let c32 = if f64::from(nearest) < c { nearest.next_up() } else { nearest };
-        (line.most_lo, line.least_hi) = (quantise(c32.next_down()), quantise(c32));
+        [line.most_lo, line.least_hi, ..] = quantise4(Vec4::new(c32.next_down(), c32, 0.0, 0.0));
 
         let ray = Ray { field, o, d, inv, c, c32, t, reach, within: entry.is_none() };
         if let Some(axis) = entry {
