@@ -106,8 +106,12 @@ fn main() {
             direct / exact
         );
         let start = Instant::now();
-        let out = sweep(&scene, &SweepSettings { directions: 128, light_points: 64, replicates: 1, ..settings(64, 64) }, &|_| true)
-            .expect("a sweep");
+        let out = sweep(
+            &scene,
+            &SweepSettings { directions: 128, light_points: 64, replicates: 1, ..settings(64, 64) },
+            &|_| true,
+        )
+        .expect("a sweep");
         println!("      converged: {:.2} s, {} bounces", start.elapsed().as_secs_f64(), out.bounces);
     }
 }

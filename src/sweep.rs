@@ -230,7 +230,13 @@ impl Run<'_> {
         stopped |= !complete;
         out.counts.shadow_rays += out.counts.valid * lights as u64;
         let mut indirect: Vec<Planes> = self.sides.iter().map(|_| grid::black(n)).collect();
-        let pass = Pass { scene: self.scene, geometry: self.geometry, inside: self.inside, primary: self.sides[0], isa: self.isa };
+        let pass = Pass {
+            scene: self.scene,
+            geometry: self.geometry,
+            inside: self.inside,
+            primary: self.sides[0],
+            isa: self.isa,
+        };
         let nothing = flats.open();
         flats.close(nothing);
         flats.reflect([1.0; 3], false);

@@ -79,15 +79,16 @@ impl Pass<'_> {
         // Σ|ω·N| · 4π/(2·lines) over N's units, against π.
         let half = 0.5 * lines.len() as f32 * NORMAL_SCALE;
         let [e0, e1, e2] = e;
-        (e0.par_chunks_mut(COSINES), e1.par_chunks_mut(COSINES), e2.par_chunks_mut(COSINES)).into_par_iter().enumerate().for_each(
-            |(row, (e0, e1, e2))| {
+        (e0.par_chunks_mut(COSINES), e1.par_chunks_mut(COSINES), e2.par_chunks_mut(COSINES))
+            .into_par_iter()
+            .enumerate()
+            .for_each(|(row, (e0, e1, e2))| {
                 let mut sum = [0f32; COSINES];
                 self.isa.cosines(&omega, n.each_ref().map(|n| &n[row * COSINES..][..e0.len()]), &mut sum);
                 for e in [e0, e1, e2] {
                     e.iter_mut().zip(&sum).for_each(|(e, s)| *e *= if *s > 0.0 { half / s } else { 0.0 });
                 }
-            },
-        );
+            });
     }
 
     /// All lines of one family, both ways.
