@@ -55,10 +55,9 @@ impl Fan {
         let mut fan = Self { layout, source, depth, slices, first, count, seen };
         let mut seen = std::mem::take(&mut fan.seen);
         let h = geometry.h(&layout);
-        seen.par_chunks_mut(count[0] * slices.1).enumerate().for_each_init(
-            || (Vec::new(), Vec::new()),
-            |(most, least), (row, out)| fan.march(h, start, row, most, least, out),
-        );
+        seen.par_chunks_mut(count[0] * slices.1)
+            .enumerate()
+            .for_each_init(|| [const { Vec::new() }; 3], |scratch, (row, out)| fan.march(h, start, row, scratch, out));
         fan.seen = seen;
         Some(fan)
     }
@@ -70,7 +69,7 @@ impl Fan {
 
     /// One row of lines, all slices.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
-    fn march(&self, h: &[f32], start: f32, row: usize, most: &mut Vec<f32>, least: &mut Vec<f32>, out: &mut [u8]) {
+    fn march(&self, h: &[f32], start: f32, row: usize, [most, least, mixed]: &mut [Vec<f32>; 3], out: &mut [u8]) {
         let [nu, nv, _] = self.layout.dims;
         let [sv, sa] = self.layout.stride;
         let np = self.count[0];
@@ -92,21 +91,29 @@ impl Fan {
             let p = |u: f64| self.source[0] + (u - self.source[0]) / ratio - self.first[0] as f64;
             let lo = p(0.0).ceil().max(0.0) as usize;
             let hi = (p((nu - 1) as f64).floor().min(np as f64 - 1.0) + 1.0).max(0.0) as usize;
-            let (near, far) = (&h[k * sa + j * sv..][..nu], &h[k * sa + (j + 1) * sv..][..nu]);
             let u0 = (self.source[0] + (self.first[0] as f64 - self.source[0]) * ratio) as f32;
             let du = ratio as f32;
-            for p in lo..hi {
-                let u = (u0 + p as f32 * du).max(0.0);
-                let i = (u as usize).min(nu - 2);
+            if lo >= hi {
+                continue;
+            }
+            // The row of lines lies between two rows of samples: mixed once, for near slices hold many lines per sample.
+            let (i0, i1) =
+                (((u0 + lo as f32 * du).max(0.0) as usize).min(nu - 2), ((u0 + hi as f32 * du) as usize + 2).min(nu));
+            let (near, far) = (&h[k * sa + j * sv..][i0..i1], &h[k * sa + (j + 1) * sv..][i0..i1]);
+            mixed.clear();
+            mixed.extend(near.iter().zip(far).map(|(a, b)| a + fv * (b - a)));
+            let lines = most[lo..hi].iter_mut().zip(&mut least[lo..hi]).zip(&mut out[lo..hi]);
+            for (p, ((most, least), out)) in lines.enumerate() {
+                let u = (u0 + (lo + p) as f32 * du).max(0.0);
+                let i = (u as usize).clamp(i0, i1 - 2);
                 let fu = u - i as f32;
-                let a = near[i] + fu * (near[i + 1] - near[i]);
-                let b = far[i] + fu * (far[i + 1] - far[i]);
-                let x = a + fv * (b - a);
-                let lit = u8::from(x > most[p]) * LOWER + u8::from(x <= least[p]) * HIGHER + SAMPLED;
-                out[p] = if x.is_nan() { 0 } else { lit };
+                let (a, b) = (mixed[i - i0], mixed[i - i0 + 1]);
+                let x = a + fu * (b - a);
+                let lit = u8::from(x > *most) * LOWER + u8::from(x <= *least) * HIGHER + SAMPLED;
+                *out = if x.is_nan() { 0 } else { lit };
                 // f32::max and min pass over NaN.
-                most[p] = most[p].max(x);
-                least[p] = least[p].min(x);
+                *most = most.max(x);
+                *least = least.min(x);
             }
         }
     }
@@ -230,6 +237,12 @@ pub(super) fn direct(
     let corners: Vec<DVec3> = (0..8)
         .map(|c| lattice.to_world(lattice.far() * DVec3::from_array([c & 1, c >> 1 & 1, c >> 2].map(f64::from))))
         .collect();
+    // The sign of each side's normal; 0 gives no light to a side that nobody asks for.
+    let wanted = [Side::Lower, Side::Higher].map(|s| match s {
+        s if !sides.contains(&s) => 0.0,
+        Side::Lower => 1.0,
+        Side::Higher => -1.0,
+    });
     for &number in scene.luminaires() {
         let light = &scene.polygons()[number as usize];
         let points = points(light, seed, index, number, count);
@@ -254,7 +267,7 @@ pub(super) fn direct(
                     let size = d.map(f64::abs);
                     let axis =
                         if size[2] >= size[0] && size[2] >= size[1] { 2 } else { usize::from(size[1] >= size[0]) };
-                    let g = [normal, -normal].map(|n| point_term(place, n, world, light.normal()) as f32);
+                    let g = wanted.map(|s| point_term(place, s * normal, world, light.normal()) as f32);
                     if g == [0.0; 2] {
                         continue;
                     }
@@ -359,7 +372,3 @@ fn walls(scene: &Scene, flats: &mut Flats, sides: &[Side], number: u32, points: 
         });
     }
 }
-
-#[cfg(test)]
-#[path = "direct_tests.rs"]
-mod tests;

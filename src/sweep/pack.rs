@@ -108,7 +108,7 @@ pub(super) struct Cut {
 }
 
 /// How to scan.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Debug)]
 pub(super) struct Way {
     /// Rays run towards +τ.
     pub forward: bool,
@@ -137,7 +137,11 @@ pub(super) struct Pack {
 
 impl Pack {
     pub(super) fn new(slices: usize, flats: &Flats) -> Self {
-        let rows = slices + 2;
+        Self { dark: flats.none(), ..Self::with_rows(slices + 2, flats.isovalues) }
+    }
+
+    /// Nothing, in so many rows, with ends that shine over `isovalues`.
+    pub(super) fn with_rows(rows: usize, isovalues: usize) -> Self {
         let zero = || vec![[0.0; LANES]; rows];
         Self {
             h: vec![[OUTSIDE; LANES]; rows],
@@ -146,9 +150,9 @@ impl Pack {
             h_next: zero(),
             rows: (0, 0),
             cuts: Vec::new(),
-            columns: vec![0.0; 2 * LANES * 3 * flats.isovalues],
-            isovalues: flats.isovalues,
-            dark: flats.none(),
+            columns: vec![0.0; 2 * LANES * 3 * isovalues],
+            isovalues,
+            dark: false,
             scratch: Vec::new(),
         }
     }

@@ -228,3 +228,82 @@ mod avx512 {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rng::{Rng, Stage};
+    use crate::sweep::pack::{LANES, OUTSIDE};
+
+    /// A pack of noise with plateaus, gaps, ends outside and cuts.
+    fn noise(seed: u64) -> Pack {
+        let mut rng = Rng::stream(seed, Stage::Test, 0);
+        let (rows, n) = (50, 4);
+        let mut pack = Pack::with_rows(rows, n);
+        for row in 0..rows {
+            for lane in 0..LANES {
+                let x = (rng.unit() * 12.0).floor() as f32 / 12.0;
+                let out = row < lane % 5 || row + lane % 3 >= rows;
+                let kind = rng.unit();
+                pack.h[row][lane] = if out {
+                    OUTSIDE
+                } else if kind < 0.03 {
+                    f32::NAN
+                } else {
+                    x
+                };
+                (0..3).for_each(|c| pack.b[c][row][lane] = rng.unit() as f32);
+            }
+        }
+        pack.columns = (0..(2 * LANES + 4) * 3 * n).map(|_| rng.unit() as f32).collect();
+        pack.rows = (0, rows);
+        pack.cuts = (0..2)
+            .map(|i| super::super::pack::Cut { row: 20 + i, lane: 3, slots: [32 + 2 * i as u32, 33 + 2 * i as u32] })
+            .collect();
+        pack
+    }
+
+    #[test]
+    fn every_instruction_set_scans_to_the_same_bits() {
+        for seed in 0..20 {
+            for way in 0..8 {
+                let way =
+                    Way { forward: way & 1 == 1, strict: way & 2 == 2, sign: if way & 4 == 4 { 1.0 } else { -1.0 } };
+                let scan = |isa: Isa| {
+                    let mut out = vec![vec![0f32; 48 * LANES]; 3];
+                    isa.scan(&mut noise(seed), way, &mut out, (LANES, 0));
+                    out.iter().flatten().map(|x| x.to_bits()).collect::<Vec<_>>()
+                };
+                assert_eq!(scan(Isa::PLAIN), scan(Isa::detect()), "{way:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn scans_find_the_next_greater_value() {
+        // Against looking at every later sample: [BSV93] is only a faster way to do that.
+        let mut pack = noise(7);
+        pack.cuts.clear();
+        let reference = noise(7);
+        let mut out = vec![vec![0f32; 48 * LANES]; 3];
+        Isa::detect().scan(&mut pack, Way { forward: true, strict: false, sign: 1.0 }, &mut out, (LANES, 0));
+        let mut found = 0;
+        for lane in 0..LANES {
+            for row in 1..49 {
+                let h = reference.h[row][lane];
+                let next = (row + 1..50).find(|&r| reference.h[r][lane] >= h);
+                if let (true, Some(r)) = (h.is_finite(), next) {
+                    let before = reference.h[r - 1][lane];
+                    let f =
+                        if before.is_nan() { 1.0 } else { ((h - before) / (reference.h[r][lane] - before)).min(1.0) };
+                    let f = if f.is_nan() { 1.0 } else { f.max(0.0) };
+                    let (b0, b1) = (reference.b[1][r - 1][lane], reference.b[1][r][lane]);
+                    let expected = (1.0 - f) * b0 + f * b1;
+                    assert!((out[1][(row - 1) * LANES + lane] - expected).abs() < 1e-6, "lane {lane} row {row}");
+                    found += 1;
+                }
+            }
+        }
+        assert!(found > 400, "{found}");
+    }
+}
