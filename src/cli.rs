@@ -3,6 +3,7 @@
 mod compare;
 mod extract;
 mod reference;
+mod study;
 
 use crate::bake::{BakeOptions, BakeSettings, bake};
 use crate::embree::Device;
@@ -62,6 +63,8 @@ enum Verb {
     Reference(reference::ReferenceArgs),
     /// Measure a bake against references
     Compare(compare::Compare),
+    /// Make tables and plots of error and speed
+    Study(study::StudyArgs),
 }
 
 #[derive(clap::Args, Debug)]
@@ -184,6 +187,7 @@ impl Cli {
             Verb::Extract(v) => v.run(progress),
             Verb::Reference(v) => v.run(progress),
             Verb::Compare(v) => v.run(progress),
+            Verb::Study(v) => v.run(progress),
         }
     }
 }

@@ -54,5 +54,7 @@ pub mod render;
 // One isosurface at a time in 3D, and how far a bake is from it.
 pub mod reference;
 pub mod accuracy;
+pub mod plot;
+pub mod study;
 // Verbs.
 pub mod cli;
