@@ -4,6 +4,10 @@
 //! square; read as a squared Euclidean norm, `percent_rms = 100 √⟨|rgb_tex − rgb_ref|²⟩` is what this crate reports, and
 //! that / √3, the RMS per channel, beside it.
 
+mod floor;
+
+pub use floor::interpolation_floor;
+
 use crate::error::{Error, Result};
 use crate::export::ply::PlyMesh;
 use crate::surface_mesh::vertex_areas;

@@ -66,8 +66,8 @@ enum Verb {
     Compare(compare::Compare),
     /// n = 2: pictures of light on a height field, in horizontal planes and as an ordinary surface
     Flatland(flatland::Flatland),
-    /// Measure: tables and plots
-    Study(study::Study),
+    /// Make tables and plots of error and speed
+    Study(study::StudyArgs),
 }
 
 #[derive(clap::Args, Debug)]

@@ -56,6 +56,8 @@ pub mod render;
 // One isosurface at a time in 3D, and how far a bake is from it.
 pub mod reference;
 pub mod accuracy;
+pub mod plot;
+pub mod study;
 pub mod flatland;
 // Verbs.
 pub mod cli;

@@ -11,14 +11,17 @@ pub use path::{PathTracer, path_radiance};
 pub use surface_map::{SurfaceMap, SurfaceMapSettings};
 
 use crate::direct::Receiver;
+use crate::error::Result;
+use crate::export::ply;
 use crate::flattened::{Departure, Side};
 use crate::photon::{PhotonSettings, trace_photons};
 use crate::rng::{Rng, Stage};
 use crate::scene::Scene;
-use crate::surface_mesh::SurfaceMesh;
+use crate::surface_mesh::{SurfaceMesh, channel};
 use crate::tracer::Tracer;
 use glam::DVec3;
 use rayon::prelude::*;
+use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// How outgoing radiance is found.
@@ -75,6 +78,28 @@ pub struct Reference {
     pub sampled: Vec<bool>,
     /// Rays traced.
     pub rays: u64,
+}
+
+impl Reference {
+    /// Writes the reference of `mesh` as PLY: `radiance_r/g/b`, `variance_r/g/b` and `sampled` per vertex.
+    ///
+    /// # Errors
+    /// As [`ply::write`].
+    pub fn write(&self, path: &Path, mesh: &SurfaceMesh) -> Result<()> {
+        let radiance = [0, 1, 2].map(|c| channel(&self.radiance, c));
+        let variance = [0, 1, 2].map(|c| channel(&self.variance, c));
+        let sampled: Vec<f32> = self.sampled.iter().map(|&s| if s { 1.0 } else { 0.0 }).collect();
+        let properties: Vec<(&str, &[f32])> = vec![
+            ("radiance_r", &radiance[0]),
+            ("radiance_g", &radiance[1]),
+            ("radiance_b", &radiance[2]),
+            ("variance_r", &variance[0]),
+            ("variance_g", &variance[1]),
+            ("variance_b", &variance[2]),
+            ("sampled", &sampled),
+        ];
+        ply::write(path, &mesh.export(&properties))
+    }
 }
 
 /// A fixed random subset of `count` of `total` vertices (Fisher–Yates), in increasing order; all if `None`.

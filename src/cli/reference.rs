@@ -5,7 +5,6 @@ use super::{device, expect_extension, writable};
 use crate::embree::{Device, GraphTracer, SurfaceTracer};
 use crate::error::{Error, Result};
 use crate::export::picture::Picture;
-use crate::export::ply;
 use crate::flattened::FlattenedRay;
 use crate::progress::Progress;
 use crate::reference::{Integrator, Reference, ReferenceSettings, SurfaceMapSettings, path_radiance, reference};
@@ -13,9 +12,9 @@ use crate::render::{Camera, trace_picture};
 use crate::rng::{Rng, Stage};
 use crate::scene::Scene;
 use crate::scene_file::{SceneOptions, load};
-use crate::surface_mesh::{SurfaceMesh, channel, unit_isovalue};
+use crate::surface_mesh::{SurfaceMesh, unit_isovalue};
 use glam::DVec3;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Instant;
 
 #[derive(clap::Args, Debug)]
@@ -96,7 +95,7 @@ impl ReferenceArgs {
         let (mesh, result, inside) =
             compute(&scene, isovalue, self.refine, self.trilinear, &settings, &device()?, progress)?;
         let seconds = begun.elapsed().as_secs_f64();
-        write(&self.output, &mesh, &result)?;
+        result.write(&self.output, &mesh)?;
         if progress == Progress::Shown {
             let count = result.sampled.iter().filter(|s| **s).count();
             eprintln!(
@@ -136,23 +135,6 @@ pub(super) fn compute(
     };
     stage.end()?;
     Ok((mesh, result, inside))
-}
-
-/// Writes a reference as PLY.
-pub(super) fn write(path: &Path, mesh: &SurfaceMesh, result: &Reference) -> Result<()> {
-    let radiance = [0, 1, 2].map(|c| channel(&result.radiance, c));
-    let variance = [0, 1, 2].map(|c| channel(&result.variance, c));
-    let sampled: Vec<f32> = result.sampled.iter().map(|&s| if s { 1.0 } else { 0.0 }).collect();
-    let properties: Vec<(&str, &[f32])> = vec![
-        ("radiance_r", &radiance[0]),
-        ("radiance_g", &radiance[1]),
-        ("radiance_b", &radiance[2]),
-        ("variance_r", &variance[0]),
-        ("variance_g", &variance[1]),
-        ("variance_b", &variance[2]),
-        ("sampled", &sampled),
-    ];
-    ply::write(path, &mesh.export(&properties))
 }
 
 /// A path-traced picture of the triangles at `isovalue` (source units).

@@ -1,18 +1,28 @@
-//! `isolume study`: measurements that fill tables, one subcommand each.
+//! `isolume study`: the tables and plots of the documentation.
 
-use crate::error::Result;
+use super::device;
+use crate::bake::BakeOptions;
+use crate::error::{Error, Result};
 use crate::flatland::study::{StudySettings, flatland};
 use crate::progress::Progress;
-use std::path::PathBuf;
+use crate::scene_file::{SceneOptions, load};
+use crate::study::{Study, Subject, curve, datasets, strategies};
+use std::path::{Path, PathBuf};
 
 #[derive(clap::Args, Debug)]
-pub(super) struct Study {
+pub(super) struct StudyArgs {
     #[command(subcommand)]
-    what: What,
+    kind: Kind,
 }
 
 #[derive(clap::Subcommand, Debug)]
-enum What {
+enum Kind {
+    /// BB09's table: sampling strategies over the sweep
+    Strategies(Tables),
+    /// Error, floor and seconds of each data set
+    Datasets(Tables),
+    /// Error against wall seconds over photons, samples and gather rays
+    Curve(Tables),
     /// n = 2: samples on level sets against uniform ones, from 10³ to 10⁶ (BB09's 7.4 % and 2.2 %)
     Flatland(Flatland),
 }
@@ -30,14 +40,74 @@ struct Flatland {
     seed: u64,
 }
 
-impl Study {
+#[derive(clap::Args, Debug)]
+#[command(after_help = "\
+Writes CSV, Markdown and SVG into DIR; rows that are there are kept, so that an interrupted study goes on where it
+stopped. References are cached in DIR/references.
+
+Examples:
+  isolume study strategies scenes/cornell-bumps.toml -o results
+  isolume study datasets scenes/cornell-bumps.toml --data data -o results")]
+struct Tables {
+    /// Scene files or volumes
+    #[arg(required_unless_present = "data", value_name = "SCENE")]
+    scenes: Vec<PathBuf>,
+    /// Folder for tables, plots and references
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+    /// Folder with ch2.nii.gz and neuron.mha: adds those that are there
+    #[arg(long, value_name = "DIR")]
+    data: Option<PathBuf>,
+    /// Small counts and few isovalues, to see that everything works
+    #[arg(long)]
+    quick: bool,
+    #[command(flatten)]
+    bake: BakeOptions,
+}
+
+/// Data sets of BB09's kinds by file name, with sweep and main isovalue.
+const DATA: [(&str, &str, [f64; 2], f64); 2] =
+    [("brain", "ch2.nii.gz", [15.0, 200.0], 80.0), ("neuron", "neuron.mha", [20.0, 200.0], 60.0)];
+
+impl StudyArgs {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
-        match self.what {
-            What::Flatland(v) => {
+        match self.kind {
+            Kind::Strategies(tables) => tables.run(progress, strategies),
+            Kind::Datasets(tables) => tables.run(progress, datasets),
+            Kind::Curve(tables) => tables.run(progress, curve),
+            Kind::Flatland(v) => {
                 super::folder(&v.output)?;
                 let settings = StudySettings { most: v.most, seed: v.seed, ..StudySettings::default() };
-                flatland(&v.output, &super::device()?, &settings, progress)
+                flatland(&v.output, &device()?, &settings, progress)
             }
         }
     }
+}
+
+impl Tables {
+    fn run(self, progress: Progress, study: fn(&Study, &[Subject], &BakeOptions) -> Result<()>) -> Result<()> {
+        let mut subjects = Vec::new();
+        for path in &self.scenes {
+            let loaded = load(path, &SceneOptions::default())?;
+            subjects.push(Subject { name: stem(path), scene: loaded.scene, isovalue: None });
+        }
+        if let Some(folder) = &self.data {
+            for (name, file, isovalues, main) in DATA {
+                let path = folder.join(file);
+                if path.exists() {
+                    let options = SceneOptions { isovalues: Some(isovalues.to_vec()), ..SceneOptions::default() };
+                    let scene = load(&path, &options)?.scene;
+                    subjects.push(Subject { name: name.into(), scene, isovalue: Some(main) });
+                }
+            }
+        }
+        if subjects.is_empty() {
+            return Err(Error::Invalid("--data: the folder holds neither ch2.nii.gz nor neuron.mha".into()));
+        }
+        study(&Study::new(self.output, device()?, progress, self.quick)?, &subjects, &self.bake)
+    }
+}
+
+fn stem(path: &Path) -> String {
+    path.file_stem().map_or_else(|| "scene".into(), |s| s.to_string_lossy().into_owned())
 }

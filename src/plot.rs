@@ -1,0 +1,242 @@
+//! Line and scatter plots as SVG: what the tables of a study look like.
+
+use crate::atomic::AtomicFile;
+use crate::error::Result;
+use std::fmt::Write as _;
+use std::io::Write as _;
+use std::path::Path;
+
+/// Points of one colour, joined or not.
+#[derive(Clone, Debug, Default)]
+pub struct Series {
+    /// Name in the legend.
+    pub name: String,
+    /// (x, y); points that are not finite, or not positive on a logarithmic axis, are left out.
+    pub points: Vec<(f64, f64)>,
+    /// Whether a line joins them in their order.
+    pub line: bool,
+    /// Whether each has a mark.
+    pub marks: bool,
+}
+
+/// One pair of axes.
+#[derive(Clone, Debug, Default)]
+pub struct Plot {
+    /// Above the axes.
+    pub title: String,
+    /// Below them.
+    pub x_label: String,
+    /// Left of them.
+    pub y_label: String,
+    /// Whether x is logarithmic.
+    pub log_x: bool,
+    /// Whether y is logarithmic; a linear y axis begins at 0.
+    pub log_y: bool,
+    /// What is drawn.
+    pub series: Vec<Series>,
+    /// Vertical lines to compare with.
+    pub guides: Vec<f64>,
+}
+
+const WIDTH: f64 = 760.0;
+const HEIGHT: f64 = 460.0;
+/// Left, top, right, bottom.
+const MARGINS: [f64; 4] = [70.0, 40.0, 190.0, 55.0];
+/// Okabe and Ito's colours, told apart by all.
+const COLOURS: [&str; 7] = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000"];
+
+/// One axis: its range, in logarithms if `log`, and where it lies on the page.
+struct Axis {
+    range: [f64; 2],
+    log: bool,
+    page: [f64; 2],
+}
+
+impl Axis {
+    fn new(values: impl Iterator<Item = f64>, log: bool, from_zero: bool, page: [f64; 2]) -> Self {
+        let (mut lo, mut hi) = (f64::INFINITY, f64::NEG_INFINITY);
+        for v in values {
+            let v = if log { v.log10() } else { v };
+            (lo, hi) = (lo.min(v), hi.max(v));
+        }
+        if !(lo <= hi) {
+            (lo, hi) = (0.0, 1.0);
+        }
+        if from_zero && !log {
+            lo = lo.min(0.0);
+        }
+        let pad = if hi > lo { 0.04 * (hi - lo) } else { 0.5 };
+        Self { range: [if from_zero && lo == 0.0 { 0.0 } else { lo - pad }, hi + pad], log, page }
+    }
+
+    fn at(&self, v: f64) -> f64 {
+        let v = if self.log { v.log10() } else { v };
+        let [lo, hi] = self.range;
+        self.page[0] + (v - lo) / (hi - lo) * (self.page[1] - self.page[0])
+    }
+
+    /// Tick values: 1, 2, 5 × powers of ten.
+    fn ticks(&self) -> Vec<f64> {
+        let [lo, hi] = self.range;
+        if self.log {
+            #[allow(clippy::cast_possible_truncation, reason = "exponents of what is plotted")]
+            let (first, last) = (lo.floor() as i32, hi.ceil() as i32);
+            let steps: &[f64] = if hi - lo < 2.5 { &[1.0, 2.0, 5.0] } else { &[1.0] };
+            let all = (first..=last).flat_map(|e| steps.iter().map(move |s| s * 10f64.powi(e)));
+            return all.filter(|v| (lo..=hi).contains(&v.log10())).collect();
+        }
+        let raw = (hi - lo) / 6.0;
+        let power = 10f64.powf(raw.log10().floor());
+        let step = [1.0, 2.0, 5.0, 10.0].map(|s| s * power).into_iter().find(|s| *s >= raw).unwrap_or(raw);
+        let first = (lo / step).ceil();
+        (0..12).map(|i| (first + f64::from(i)) * step).take_while(|v| *v <= hi + 1e-9 * step).collect()
+    }
+}
+
+fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
+}
+
+/// A number as an axis shows it.
+fn tick_label(v: f64) -> String {
+    if v != 0.0 && !(1e-3..1e5).contains(&v.abs()) {
+        format!("{v:.0e}")
+    } else {
+        format!("{}", (v * 1e6).round() / 1e6)
+    }
+}
+
+impl Plot {
+    /// The plot as an SVG document.
+    pub fn to_svg(&self) -> String {
+        let [left, top, right, bottom] = MARGINS;
+        let usable = |&(x, y): &(f64, f64)| {
+            x.is_finite() && y.is_finite() && (!self.log_x || x > 0.0) && (!self.log_y || y > 0.0)
+        };
+        let points = || self.series.iter().flat_map(|s| s.points.iter().copied()).filter(|p| usable(p));
+        let x_axis = Axis::new(points().map(|p| p.0), self.log_x, false, [left, WIDTH - right]);
+        let y_axis = Axis::new(points().map(|p| p.1), self.log_y, true, [HEIGHT - bottom, top]);
+        let mut s = format!(
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" font-family=\"sans-serif\" \
+             font-size=\"12\">\n<rect width=\"100%\" height=\"100%\" fill=\"white\"/>\n"
+        );
+        let mut put = |text: std::fmt::Arguments<'_>| s.write_fmt(text).expect("strings take all that is written");
+        let middle = 0.5 * (left + WIDTH - right);
+        put(format_args!(
+            "<text x=\"{middle}\" y=\"22\" text-anchor=\"middle\" font-size=\"15\">{}</text>\n",
+            escaped(&self.title)
+        ));
+        for v in x_axis.ticks() {
+            let x = x_axis.at(v);
+            put(format_args!("<path d=\"M{x:.1} {top}V{:.1}\" stroke=\"#ddd\"/>", HEIGHT - bottom));
+            put(format_args!(
+                "<text x=\"{x:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{}</text>\n",
+                HEIGHT - bottom + 17.0,
+                tick_label(v)
+            ));
+        }
+        for v in y_axis.ticks() {
+            let y = y_axis.at(v);
+            put(format_args!("<path d=\"M{left} {y:.1}H{:.1}\" stroke=\"#ddd\"/>", WIDTH - right));
+            put(format_args!(
+                "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">{}</text>\n",
+                left - 6.0,
+                y + 4.0,
+                tick_label(v)
+            ));
+        }
+        for &v in self.guides.iter().filter(|v| (x_axis.page[0]..=x_axis.page[1]).contains(&x_axis.at(**v))) {
+            let x = x_axis.at(v);
+            put(format_args!(
+                "<path d=\"M{x:.1} {top}V{:.1}\" stroke=\"#999\" stroke-dasharray=\"3 3\"/>\n",
+                HEIGHT - bottom
+            ));
+        }
+        put(format_args!(
+            "<path d=\"M{left} {top}V{y}H{x}\" fill=\"none\" stroke=\"black\"/>\n",
+            y = HEIGHT - bottom,
+            x = WIDTH - right
+        ));
+        put(format_args!(
+            "<text x=\"{middle}\" y=\"{}\" text-anchor=\"middle\">{}</text>\n",
+            HEIGHT - 14.0,
+            escaped(&self.x_label)
+        ));
+        let y_middle = 0.5 * (top + HEIGHT - bottom);
+        put(format_args!(
+            "<text transform=\"translate(18 {y_middle}) rotate(-90)\" text-anchor=\"middle\">{}</text>\n",
+            escaped(&self.y_label)
+        ));
+        for (n, series) in self.series.iter().enumerate() {
+            let colour = COLOURS[n % COLOURS.len()];
+            let at: Vec<(f64, f64)> =
+                series.points.iter().filter(|p| usable(p)).map(|p| (x_axis.at(p.0), y_axis.at(p.1))).collect();
+            if series.line && at.len() > 1 {
+                let path: Vec<String> = at.iter().map(|(x, y)| format!("{x:.1} {y:.1}")).collect();
+                put(format_args!(
+                    "<path d=\"M{}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"1.6\"/>\n",
+                    path.join("L")
+                ));
+            }
+            if series.marks {
+                for (x, y) in &at {
+                    put(format_args!("<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"2.8\" fill=\"{colour}\"/>"));
+                }
+                put(format_args!("\n"));
+            }
+            let (x, y) = (WIDTH - right + 14.0, top + 14.0 + 19.0 * n as f64);
+            put(format_args!(
+                "<circle cx=\"{x}\" cy=\"{:.1}\" r=\"4\" fill=\"{colour}\"/><text x=\"{}\" y=\"{y}\">{}</text>\n",
+                y - 4.0,
+                x + 10.0,
+                escaped(&series.name)
+            ));
+        }
+        s.push_str("</svg>\n");
+        s
+    }
+
+    /// Writes the plot.
+    ///
+    /// # Errors
+    /// `Io`.
+    pub fn write(&self, path: &Path) -> Result<()> {
+        let mut file = AtomicFile::create(path)?;
+        let written = file.write_all(self.to_svg().as_bytes());
+        file.finish(written)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_cannot_be_drawn_is_left_out() {
+        let series = Series {
+            name: "a<b".into(),
+            points: vec![(1.0, 1.0), (10.0, f64::NAN), (100.0, 0.0), (100.0, 2.0)],
+            line: true,
+            marks: true,
+        };
+        let plot = Plot {
+            log_x: true,
+            log_y: true,
+            series: vec![series, Series::default()],
+            guides: vec![1e9],
+            ..Plot::default()
+        };
+        let svg = plot.to_svg();
+        assert_eq!(svg.matches("r=\"2.8\"").count(), 2);
+        assert!(!svg.contains("NaN") && !svg.contains("inf") && svg.contains("a&lt;b"), "{svg}");
+        assert!(!Plot::default().to_svg().contains("NaN"), "an empty plot");
+    }
+
+    #[test]
+    fn ticks_are_round_and_inside() {
+        let axis = Axis { range: [3.6, 95.0], log: false, page: [0.0, 1.0] };
+        assert_eq!(axis.ticks(), [20.0, 40.0, 60.0, 80.0]);
+        let axis = Axis { range: [-0.1, 1.1], log: true, page: [0.0, 1.0] };
+        assert_eq!(axis.ticks(), [1.0, 2.0, 5.0, 10.0]);
+    }
+}

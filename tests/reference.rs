@@ -1,0 +1,383 @@
+//! The reference against answers known without it: hits of two tracers, closed forms, two integrators; and the numbers
+//! that `compare` makes of it.
+
+use glam::DVec3;
+use isolume::accuracy::{ReferenceMesh, compare, interpolation_floor};
+use isolume::brdf::reflected;
+use isolume::direct::{Receiver, luminance};
+use isolume::embree::{Device, GraphTracer, SurfaceTracer};
+use isolume::field::{Field, Sweep};
+use isolume::flattened::{Departure, FlattenedRay, Side, Target};
+use isolume::polygon::Polygon;
+use isolume::reference::{Integrator, PathTracer, ReferenceSettings, receiver, reference, subset};
+use isolume::rng::{Rng, Stage};
+use isolume::scene::{Boundary, Scene, Surface, cornell_box};
+use isolume::stats::{normal_quantile, sidak};
+use isolume::surface_mesh::SurfaceMesh;
+use isolume::tracer::Tracer;
+use isolume::volume::generate::Generator;
+use isolume::volume::{Lattice, Samples, Volume};
+use isolume::warp;
+
+fn device() -> Device {
+    Device::new(1).unwrap()
+}
+
+/// h = |x|² on [−1, 1]³, n³ samples, in the sweep [0, 1]: balls of radius √c, inside where h < c.
+fn balls(n: usize, surface: Surface, polygons: Vec<Polygon>) -> Scene {
+    let lattice = Lattice::aligned([n; 3], DVec3::splat(-1.0), DVec3::splat(2.0 / (n - 1) as f64)).unwrap();
+    let samples = (0..lattice.len())
+        .map(|o| lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64))).length_squared() as f32)
+        .collect();
+    let volume = Volume::new("balls", lattice, Samples::F32(samples)).unwrap();
+    let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+    Scene::new(field, surface, Boundary::Open, polygons).unwrap()
+}
+
+fn bumps(n: usize) -> Scene {
+    let volume = Generator::from_name("bumps").unwrap().sample([n; 3]).unwrap();
+    let field = Field::new(&volume, Sweep::new(3.6, 95.0).unwrap()).unwrap();
+    let polygons = cornell_box(field.lattice(), 0.0).unwrap();
+    Scene::new(field, Surface::default(), Boundary::Open, polygons).unwrap()
+}
+
+/// Rays from random points in random directions: (share with the same target, mean and worst distance between the hits of
+/// those that meet the surface at more than 20°, measured along the normal, in cells).
+fn agreement(scene: &Scene, c: f32, refine: usize, rays: u64) -> (f64, f64, f64) {
+    let device = device();
+    let (triangles, graph) =
+        (SurfaceTracer::new(&device, scene, c, refine).unwrap(), GraphTracer::new(&device, scene).unwrap());
+    let far = scene.lattice().far();
+    let (mut same, mut sum, mut worst, mut count) = (0u64, 0.0, 0f64, 0u64);
+    for i in 0..rays {
+        let mut rng = Rng::stream(1, Stage::Test, i);
+        let origin = (far * DVec3::new(rng.unit(), rng.unit(), rng.unit())).as_vec3();
+        let ray = FlattenedRay::free(origin, warp::sphere(rng.unit2()).as_vec3(), c);
+        let (a, b) = (triangles.intersect(&ray), graph.intersect(&ray));
+        assert_eq!(triangles.occluded(&ray), a.is_some(), "{ray:?}");
+        let (Some(a), Some(b)) = (a, b) else {
+            same += u64::from(a.is_none() && b.is_none());
+            continue;
+        };
+        same += u64::from(a.target == b.target);
+        if a.target != b.target || !matches!(a.target, Target::Surface(_)) {
+            continue;
+        }
+        let cosine = scene.normal(ray.at(b.t), Side::Lower).unwrap().dot(ray.direction.as_dvec3()).abs();
+        if cosine > 0.35 {
+            let distance = f64::from((a.t - b.t).abs()) * cosine;
+            (sum, worst, count) = (sum + distance, worst.max(distance), count + 1);
+        }
+    }
+    (same as f64 / rays as f64, sum / count as f64, worst)
+}
+
+#[test]
+fn triangles_and_the_trilinear_surface_are_hit_at_the_same_places() {
+    // A chord of a sphere of R cells leaves it by at most (√3)²/8R within a cell; a factor 4 for the ray's own slope and
+    // for saddles. Four times less with cells cut in two.
+    let scene = balls(33, Surface::default(), Vec::new());
+    let bound = |refine: f64| 4.0 * 3.0 / (8.0 * 0.8 * 16.0) / (refine * refine);
+    for (refine, factor) in [(1, 1.0), (2, 2.0)] {
+        let (same, mean, worst) = agreement(&scene, 0.64, refine, 50_000);
+        assert!(same > 0.998 && worst < bound(factor), "ball, refine {refine}: {same} {mean} {worst}");
+    }
+    let scene = bumps(41);
+    let c = scene.field.sweep().isovalue(47.0);
+    let (coarse, fine) = (agreement(&scene, c, 1, 50_000), agreement(&scene, c, 3, 50_000));
+    assert!(coarse.0 > 0.995 && fine.0 > 0.999, "targets: {coarse:?} {fine:?}");
+    assert!(fine.1 < 0.3 * coarse.1 && coarse.1 < 0.03, "distances fall with refinement: {coarse:?} {fine:?}");
+}
+
+#[test]
+fn starts_on_the_surface_meet_neither_it_nor_a_hole() {
+    let scene = balls(25, Surface::default(), Vec::new());
+    let device = device();
+    let tracer = SurfaceTracer::new(&device, &scene, 0.64, 1).unwrap();
+    let mesh = tracer.mesh().clone();
+    let (mut rays, mut at_start, mut missed, mut hit_outside) = (0u64, 0u64, 0u64, 0u64);
+    let mut cast = |p: DVec3, i: u64| {
+        let mut rng = Rng::stream(2, Stage::Test, i);
+        for (side, n) in [(Side::Lower, -1.0), (Side::Higher, 1.0)] {
+            let normal = n * scene.lattice().to_world(p).normalize();
+            let direction = warp::Frame::new(normal).to_world(warp::cosine_hemisphere(rng.unit2()));
+            let ray = scene.ray(p.as_vec3(), direction, 0.64, Departure::Surface(side));
+            let hit = tracer.intersect(&ray);
+            assert_eq!(tracer.occluded(&ray), hit.is_some(), "{ray:?}");
+            rays += 1;
+            match (hit, side) {
+                (Some(h), _) if h.t == 0.0 => at_start += 1,
+                // Inside the ball every ray ends on it, where the chord says.
+                (Some(h), Side::Lower) => {
+                    let chord = 2.0 * 0.8 * direction.dot(normal);
+                    assert!((f64::from(h.t) - chord).abs() < 0.05 + 0.02 / direction.dot(normal), "{h:?} {chord}");
+                    assert_eq!(h.target, Target::Surface(Side::Lower));
+                }
+                (None, Side::Lower) => missed += 1,
+                (Some(_), Side::Higher) => hit_outside += 1,
+                (None, Side::Higher) => {}
+            }
+        }
+    };
+    for (i, &v) in mesh.vertices.iter().enumerate() {
+        (0..10).for_each(|k| cast(v, (i * 10 + k) as u64));
+    }
+    for (i, t) in mesh.triangles.iter().enumerate() {
+        let [a, b, c] = t.map(|v| mesh.vertices[v as usize]);
+        let mut rng = Rng::stream(3, Stage::Test, i as u64);
+        let [u, v] = warp::triangle(rng.unit2());
+        // Middles of edges, too.
+        (0..5).for_each(|k| cast(a + u * (b - a) + v * (c - a), (1 << 32) + (i * 5 + k) as u64));
+        (0..5).for_each(|k| cast(0.5 * (a + b), (2 << 32) + (i * 5 + k) as u64));
+    }
+    // 0.1 %: marching cubes' triangles of a ball are not quite convex.
+    assert_eq!(missed, 0, "of {rays} rays");
+    assert!((hit_outside as f64) < 1e-3 * rays as f64, "{hit_outside} of {rays}");
+    assert!((at_start as f64) < 0.03 * rays as f64, "{at_start} of {rays}");
+}
+
+#[test]
+fn integrating_sphere() {
+    // A small square light in the middle of a ball of radius R: the indirect part of E is ρΦ/(4πR²(1−ρ)) everywhere.
+    let (rho, radius, half) = (0.5, 0.8, 0.01);
+    let corner = |x: f64, y: f64| DVec3::new(x * half, y * half, 0.0);
+    let square = vec![corner(-1., -1.), corner(-1., 1.), corner(1., 1.), corner(1., -1.)];
+    let light = Polygon::new("light", square, DVec3::ZERO, DVec3::ONE).unwrap();
+    let flux = std::f64::consts::PI * light.area();
+    let scene = balls(49, Surface { albedo: DVec3::splat(rho), ..Surface::default() }, vec![light]);
+    let device = device();
+    let c = (radius * radius) as f32;
+    let tracer = SurfaceTracer::new(&device, &scene, c, 1).unwrap();
+    let mesh = SurfaceMesh::extract(&scene, c, 1).unwrap();
+    let expected = rho * flux / (4.0 * std::f64::consts::PI * radius * radius * (1.0 - rho));
+    let mut moments = isolume::stats::Moments::default();
+    for v in subset(mesh.local.len(), Some(300)) {
+        let at = receiver(&scene, mesh.local[v], c, Side::Lower).unwrap();
+        let mut paths = PathTracer::new(&scene, &tracer);
+        let total = paths.outgoing(&at, 256, (5, v as u64));
+        let direct = paths.direct(&at, 256, (5, v as u64));
+        moments.push((total - reflected(DVec3::splat(rho), direct)).x * std::f64::consts::PI / rho);
+    }
+    // 0.5 %: triangles cut corners (0.1 % of the area), the light blocks A/πR² = 0.02 %.
+    let tolerance = 0.005 * expected + 4.0 * moments.std_error();
+    assert!(
+        (moments.mean() - expected).abs() < tolerance,
+        "{} ± {}, expected {expected}",
+        moments.mean(),
+        moments.std_error()
+    );
+}
+
+#[test]
+fn furnaces() {
+    // Inside a closed level set of emission 1 − ρ and albedo ρ the radiance is 1.
+    let (device, c) = (device(), 0.5);
+    let rho = DVec3::new(0.7, 0.3, 0.5);
+    let scene = balls(25, Surface { albedo: rho, emission: DVec3::ONE - rho, ..Surface::default() }, Vec::new());
+    let tracer = SurfaceTracer::new(&device, &scene, c, 1).unwrap();
+    let mesh = SurfaceMesh::extract(&scene, c, 1).unwrap();
+    let settings = ReferenceSettings { samples: 512, batches: 16, vertices: Some(200), ..ReferenceSettings::default() };
+    let result = reference(&scene, &tracer, &mesh, c, &settings, &|_| true);
+    let level = normal_quantile(sidak(0.01, 600));
+    for v in (0..mesh.local.len()).filter(|&v| result.sampled[v]) {
+        for k in 0..3 {
+            let z = (result.radiance[v][k] - 1.0) / result.variance[v][k].sqrt().max(1e-6);
+            assert!(z.abs() < 1.6 * level, "vertex {v}: {} ± {}", result.radiance[v], result.variance[v]);
+        }
+    }
+    // A convex level set in a black box whose six walls emit 1 reflects exactly ρ: all of it direct light.
+    let mut walls = Vec::new();
+    for axis in 0..3 {
+        for end in [-1.0, 1.0] {
+            let point = |u: f64, v: f64| {
+                let mut p = DVec3::splat(end);
+                (p[(axis + 1) % 3], p[(axis + 2) % 3]) = (u, v);
+                p
+            };
+            let mut v = vec![point(-1., -1.), point(1., -1.), point(1., 1.), point(-1., 1.)];
+            if end > 0.0 {
+                v.reverse();
+            }
+            walls.push(Polygon::new("wall", v, DVec3::ZERO, DVec3::ONE).unwrap());
+        }
+    }
+    let surface = Surface { albedo: rho, outside: Side::Higher, ..Surface::default() };
+    let scene = balls(25, surface, walls);
+    let tracer = GraphTracer::new(&device, &scene).unwrap();
+    let mesh = SurfaceMesh::extract(&scene, c, 1).unwrap();
+    let result = reference(&scene, &tracer, &mesh, c, &settings, &|_| true);
+    for v in (0..mesh.local.len()).filter(|&v| result.sampled[v]) {
+        let off = (result.radiance[v] - rho).abs().max_element();
+        // 2 %: next-event points behind the trilinear surface's own horizon, which the shared normal does not know.
+        assert!(off < 0.02, "vertex {v}: {} instead of {rho}", result.radiance[v]);
+    }
+}
+
+#[test]
+fn a_rectangle_of_light() {
+    // Known answers of the design: the light at z = 1 facing down, above an empty part of the volume.
+    let v = [(-0.25, -0.25), (-0.25, 0.25), (0.25, 0.25), (0.25, -0.25)];
+    let light = Polygon::new("light", v.map(|(x, y)| DVec3::new(x, y, 1.0)).to_vec(), DVec3::ZERO, DVec3::ONE).unwrap();
+    let scene = balls(9, Surface::default(), vec![light]);
+    let device = device();
+    let tracer = SurfaceTracer::new(&device, &scene, 0.001, 1).unwrap();
+    let cases = [
+        (DVec3::new(0.2, 0.3, 0.1), DVec3::Z, 0.217_520_93),
+        (DVec3::new(0.1, 0.1, 0.9), DVec3::new(0.3, 0.2, 1.0).normalize(), 2.292_566_50),
+        (DVec3::new(-0.8, 0.2, 0.3), DVec3::new(1.0, 0.0, -0.35).normalize(), 0.063_425_42),
+    ];
+    for (x, normal, expected) in cases {
+        let position = scene.lattice().to_index(x).as_vec3();
+        let at = Receiver { position, normal, isovalue: 0.001, departure: Departure::Free };
+        let e = PathTracer::new(&scene, &tracer).direct(&at, 64, (1, 1)).x;
+        assert!((e - expected).abs() < 1e-6, "at {x}: {e}, expected {expected}");
+    }
+}
+
+#[test]
+fn the_photon_map_agrees_with_the_path_tracer() {
+    let (scene, device) = (bumps(33), device());
+    let c = scene.field.sweep().isovalue(47.0);
+    let tracer = SurfaceTracer::new(&device, &scene, c, 1).unwrap();
+    let mesh = SurfaceMesh::extract(&scene, c, 1).unwrap();
+    let settings = |integrator, seed| ReferenceSettings {
+        integrator,
+        samples: 256,
+        batches: 32,
+        photons: 1 << 21,
+        vertices: Some(400),
+        seed,
+        ..ReferenceSettings::default()
+    };
+    let photon = reference(&scene, &tracer, &mesh, c, &settings(Integrator::Photon, 1), &|_| true);
+    let path = reference(&scene, &tracer, &mesh, c, &settings(Integrator::Path, 2), &|_| true);
+    let z: Vec<f64> = (0..mesh.local.len())
+        .filter(|&v| path.sampled[v])
+        .map(|v| {
+            let difference = luminance(photon.radiance[v] - path.radiance[v]);
+            // Luminance of standard deviations: the channels share their paths, so that this is an upper bound.
+            let deviation = |r: &isolume::reference::Reference| luminance(r.variance[v].map(f64::sqrt));
+            difference / deviation(&photon).hypot(deviation(&path)).max(1e-9)
+        })
+        .collect();
+    let level = normal_quantile(sidak(0.01, z.len()));
+    let accepted = z.iter().filter(|z| z.abs() < level).count() as f64 / z.len() as f64;
+    let mean = z.iter().sum::<f64>() / z.len() as f64;
+    assert!(accepted >= 0.9975, "{accepted} of {} accepted, mean z {mean}", z.len());
+    assert!(mean.abs() < 0.5, "no common bias worth half a standard deviation: {mean}");
+}
+
+/// A flat square of four vertices with its two triangles, all of radiance `r`.
+fn flat(r: [f64; 4], variance: f64) -> ReferenceMesh {
+    ReferenceMesh {
+        positions: vec![DVec3::ZERO, DVec3::X, DVec3::new(1.0, 1.0, 0.0), DVec3::Y],
+        triangles: vec![[0, 1, 2], [0, 2, 3]],
+        radiance: r.map(DVec3::splat).to_vec(),
+        variance: vec![DVec3::splat(variance); 4],
+        sampled: vec![true; 4],
+    }
+}
+
+#[test]
+fn compare_computes_what_it_says() {
+    // Exposure 2: references 0.4, 0.4, 0.002 (dark), 2 (clamped to 1); errors 0.1, 0, 0.004, and −0.2 after clamping.
+    let reference = flat([0.2, 0.2, 0.001, 1.0], 1e-6);
+    let texture = [0.25, 0.2, 0.003, 0.4].map(DVec3::splat);
+    let (a, per_vertex) = compare(&texture, std::slice::from_ref(&reference), 2.0).unwrap();
+    let squares = [3.0 * 0.01, 0.0, 3.0 * 1.6e-5, 3.0 * 0.04];
+    let rms = |w: [f64; 4]| {
+        let total: f64 = w.iter().sum();
+        100.0 * (squares.iter().zip(w).map(|(s, w)| s * w).sum::<f64>() / total).sqrt()
+    };
+    let close = |x: f64, y: f64| assert!((x - y).abs() < 1e-9, "{x} {y}");
+    close(a.percent_rms, rms([1.0; 4]));
+    close(a.percent_rms_sqrt3, rms([1.0; 4]) / 3f64.sqrt());
+    // Vertices 0 and 2 belong to both triangles.
+    close(a.percent_rms_area, rms([2.0, 1.0, 2.0, 1.0]));
+    close(a.percent_rms_lit, rms([1.0, 1.0, 0.0, 1.0]));
+    close(a.lit, 0.75);
+    close(a.noise_floor, 100.0 * (3.0 * 1e-6f64 * 4.0).sqrt());
+    close(a.max, 100.0 * 0.2 * 3f64.sqrt());
+    close(a.mean, 100.0 * 3f64.sqrt() * (0.1 + 0.004 + 0.2) / 4.0);
+    close(a.bias, 100.0 * (0.1 + 0.004 - 0.2) / 4.0);
+    close(per_vertex[3], 0.2 * 3f64.sqrt());
+    assert!(a.confidence[0] <= a.percent_rms && a.percent_rms <= a.confidence[1]);
+
+    let refuses = |r: &[ReferenceMesh], word: &str| {
+        let message = compare(&texture, r, 2.0).unwrap_err().to_string();
+        assert!(message.contains(word), "{message}");
+    };
+    refuses(&[], "no reference");
+    refuses(&[reference.clone(), reference.clone()], "--seed");
+    refuses(&[reference.clone(), ReferenceMesh { triangles: Vec::new(), ..reference.clone() }], "different meshes");
+    refuses(&[ReferenceMesh { sampled: vec![false; 4], ..reference }], "no vertex");
+}
+
+#[test]
+fn two_references_cancel_their_noise() {
+    // Error 0.01 per channel under noise of 0.05: one reference reports √3·√(0.01² + 0.05²), two the error alone.
+    let n = 40_000;
+    let mut rng = Rng::stream(9, Stage::Test, 0);
+    let mut noisy = || ReferenceMesh {
+        positions: vec![DVec3::ZERO; n],
+        triangles: Vec::new(),
+        radiance: (0..n)
+            .map(|_| DVec3::splat(0.5) + 0.05 * DVec3::new(rng.normal(), rng.normal(), rng.normal()))
+            .collect(),
+        variance: vec![DVec3::splat(0.05 * 0.05); n],
+        sampled: vec![true; n],
+    };
+    let references = [noisy(), noisy()];
+    let texture = vec![DVec3::splat(0.51); n];
+    let (one, _) = compare(&texture, &references[..1], 1.0).unwrap();
+    let (two, _) = compare(&texture, &references, 1.0).unwrap();
+    let root3 = 3f64.sqrt();
+    assert!((one.percent_rms - 100.0 * root3 * (0.01f64 * 0.01 + 0.05 * 0.05).sqrt()).abs() < 0.1, "{one:?}");
+    assert!(two.confidence[0] < root3 && root3 < two.confidence[1], "{two:?}");
+    assert!((two.percent_rms - root3).abs() < 0.25, "{two:?}");
+    assert!((one.noise_floor - 100.0 * root3 * 0.05).abs() < 1e-9);
+}
+
+#[test]
+fn the_interpolation_floor_falls_with_the_grid() {
+    let (scene, device) = (bumps(41), device());
+    let c = scene.field.sweep().isovalue(47.0);
+    let tracer = GraphTracer::new(&device, &scene).unwrap();
+    let mesh = SurfaceMesh::extract(&scene, c, 1).unwrap();
+    let floor = |factor| interpolation_floor(&scene, &tracer, &mesh, c, factor, 64, Some(300)).unwrap().percent_rms;
+    let (coarse, fine) = (floor(1), floor(3));
+    assert!(fine < 0.7 * coarse && coarse < 5.0 && fine > 0.0, "{coarse} {fine}");
+}
+
+#[test]
+fn subsets_are_fixed_random_and_without_repeats() {
+    let s = subset(1000, Some(100));
+    assert!(s.len() == 100 && s.windows(2).all(|w| w[0] < w[1]) && s[99] < 1000);
+    assert_eq!(s, subset(1000, Some(100)));
+    assert_eq!(subset(5, Some(9)), [0, 1, 2, 3, 4]);
+    let mean = s.iter().sum::<usize>() as f64 / 100.0;
+    assert!((mean - 499.5).abs() < 4.0 * 28.9, "{mean}");
+}
+
+#[test]
+fn the_same_bits_on_any_number_of_threads() {
+    let (scene, device) = (bumps(17), device());
+    let c = scene.field.sweep().isovalue(47.0);
+    let tracer = SurfaceTracer::new(&device, &scene, c, 1).unwrap();
+    let mesh = SurfaceMesh::extract(&scene, c, 1).unwrap();
+    for integrator in [Integrator::Path, Integrator::Photon] {
+        let settings = ReferenceSettings {
+            integrator,
+            samples: 8,
+            batches: 2,
+            photons: 4096,
+            vertices: Some(64),
+            ..Default::default()
+        };
+        let run = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| reference(&scene, &tracer, &mesh, c, &settings, &|_| true)).radiance
+        };
+        assert_eq!(run(1), run(3));
+    }
+}
