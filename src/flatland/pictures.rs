@@ -27,7 +27,7 @@ pub struct PictureSettings {
     pub factor: usize,
     /// Gather directions per drawn point; twice as many when ordinary.
     pub gather: u32,
-    /// Shadow rays per drawn point and luminaire; four times as many when ordinary.
+    /// Shadow rays per drawn point and luminaire; sixteen times as many when ordinary.
     pub shadow: u32,
     /// Level sets to draw.
     pub levels: usize,
@@ -83,7 +83,7 @@ impl<'a> Look<'a> {
         let more = if world.transport == Transport::Ordinary { 2 } else { 1 };
         let set = Sobol::set(solution.seed(), Stage::Direct, 0);
         let factor = (s.factor / more as usize).max(1);
-        let direct = Raster::new(world, factor, |r| world.direct(r, s.shadow * more * more, &set));
+        let direct = Raster::new(world, factor, |r| world.direct(r, s.shadow * more * more * more * more, &set));
         let indirect = Raster::new(world, (s.factor / 2).max(1), |r| world.gathered(r, solution, s.gather * more, 0));
         let mut look = Self { world, solution, direct, indirect, exposure: 1.0 };
         // The brightest fiftieth of the sweep's part of the graph may saturate.
@@ -134,7 +134,7 @@ impl<'a> View<'a> {
         let pixels = [width, (width * 4).div_ceil(5)];
         let forward = (target - eye).normalize();
         let right = forward.cross(DVec3::Z).normalize();
-        let scale = 2.0 * f64::to_radians(16.5).tan() / pixels[1] as f64;
+        let scale = 2.0 * f64::to_radians(15.5).tan() / pixels[1] as f64;
         let basis = [forward, right * scale, forward.cross(right) * scale];
         Self { world, geometry, eye, basis, size: pixels }
     }
@@ -300,7 +300,9 @@ pub fn write_pictures(
     settings: &PictureSettings,
 ) -> Result<Vec<String>> {
     let Some((first, _)) = worlds.first() else { return Ok(Vec::new()) };
-    let geometry = GraphSurface::new(device, &first.scene)?;
+    // Walls reach down to a graph that dips a little below the sweep, else a slit would show.
+    let lowest = first.scene.field.samples().iter().fold(0f32, |m, &s| m.min(s)).max(-0.1);
+    let geometry = GraphSurface::with_heights(device, &first.scene, [f64::from(lowest), 1.0])?;
     let view = View::new(first, &geometry, settings.width);
     let levels: Vec<f64> = (0..settings.levels).map(|k| (k as f64 + 0.5) / settings.levels as f64).collect();
     let mut names = Vec::new();

@@ -382,6 +382,15 @@ impl GraphSurface {
     /// # Errors
     /// `Embree` if the library refuses.
     pub fn new(device: &Device, scene: &FlatScene) -> Result<Self> {
+        Self::with_heights(device, scene, [0.0, 1.0])
+    }
+
+    /// [`GraphSurface::new`] with walls and luminaires over other heights than the sweep's, in its units: for pictures
+    /// of a graph that reaches below it.
+    ///
+    /// # Errors
+    /// `Embree` if the library refuses.
+    pub fn with_heights(device: &Device, scene: &FlatScene, heights: [f64; 2]) -> Result<Self> {
         let field = scene.field.clone();
         let [nx, ny] = field.dims();
         let z = |o: usize| if field.samples()[o].is_finite() { field.samples()[o] } else { 0.0 };
@@ -401,7 +410,7 @@ impl GraphSurface {
         let mut builder = SceneBuilder::new(device)?;
         let graph = builder.triangles(&vertices, &indices, u32::MAX)?;
         if !scene.segments.is_empty() {
-            let walls = Extrusions::new(&field, &scene.segments, Some([0.0, 1.0]));
+            let walls = Extrusions::new(&field, &scene.segments, Some(heights));
             builder.user_shared(Arc::new(walls), u32::MAX)?;
         }
         Ok(Self { bvh: builder.commit()?, graph, field, triangles })
