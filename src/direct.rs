@@ -38,9 +38,11 @@ pub fn luminance(rgb: DVec3) -> f64 {
     rgb.dot(DVec3::new(0.2126, 0.7152, 0.0722))
 }
 
-/// Irradiance from all luminaires: for each, Lambert's closed form × Σ V_i g_i / Σ g_i over `shadow_rays`
-/// low-discrepancy points y_i of its part above the horizon, with g = cos θ cos θ′/r². Exact where all or none are visible; the ratio's bias falls with
-/// 1/shadow_rays where some are. The point set is keyed by (seed, stage, index).
+/// Irradiance from all luminaires: for each, Lambert's closed form × Σ V_i g_i / Σ g_i over at most `shadow_rays`
+/// low-discrepancy points y_i of its part above the horizon, with g = cos θ cos θ′/r². Exact where all or none are
+/// visible: there a quarter of the points (16 at least) settles it; the rest is spent in penumbras. The ratio's bias
+/// falls with 1/shadow_rays; a sliver of light or shadow below 4/shadow_rays may be missed. The point set is keyed by
+/// (seed, stage, index).
 pub fn direct_irradiance<T: Tracer>(
     scene: &Scene,
     tracer: &T,
@@ -51,6 +53,7 @@ pub fn direct_irradiance<T: Tracer>(
     let lattice = scene.lattice();
     let x = lattice.to_world(receiver.position.as_dvec3());
     let mut out = Estimate::default();
+    let pilot = (shadow_rays / 4).max(16);
     for &l in scene.luminaires() {
         if receiver.departure == Departure::Polygon(l) {
             continue;
@@ -68,6 +71,9 @@ pub fn direct_irradiance<T: Tracer>(
         let set = Sobol::set(seed, stage, index * scene.luminaires().len() as u64 + u64::from(l));
         let (mut sum, mut seen, mut squares, mut seen_squares) = (0.0, 0.0, 0.0, 0.0);
         for i in 0..shadow_rays {
+            if i == pilot && (seen == 0.0 || seen == sum) {
+                break;
+            }
             let u = set.point2(i, 0);
             let y = part.as_ref().map_or_else(|| light.sample(u), |p| sample_convex(p, u));
             let g = point_term(x, receiver.normal, y, light.normal());

@@ -91,7 +91,7 @@ pub struct BakeOptions {
     /// Where samples are placed
     #[arg(long)]
     pub strategy: Option<StrategyName>,
-    /// Shadow rays per sample and luminaire
+    /// Shadow rays per sample and luminaire: the most; a quarter where all or none reach it
     #[arg(long, value_name = "N")]
     pub shadow_rays: Option<u32>,
     /// Final gather rays per sample; 0 takes indirect light straight from the photon map (BB09's mode)
@@ -223,9 +223,9 @@ impl BakeSettings {
         let preset = o.preset.unwrap_or_default();
         // photons, samples per point, shadow, gather, cache shadow, wall texels, wall isovalues, wall shadow
         let (photons, density, shadow, gather, cache, wall, isovalues, wall_shadow) = match preset {
-            Preset::Preview => (1 << 19, 0.25, 8, 32, 2, 32, 16, 16),
-            Preset::Standard => (1 << 22, 1.0, 16, 64, 4, 64, 32, 32),
-            Preset::Reference => (1 << 24, 4.0, 64, 256, 16, 128, 64, 64),
+            Preset::Preview => (1 << 19, 0.25, 32, 32, 2, 32, 16, 16),
+            Preset::Standard => (1 << 22, 1.0, 128, 64, 4, 64, 32, 32),
+            Preset::Reference => (1 << 24, 4.0, 512, 256, 16, 128, 64, 128),
         };
         let (directions, light_points) = match preset {
             Preset::Preview => (32, 8),
