@@ -133,8 +133,7 @@ fn mirrored_fields_give_the_same_light() {
             sums.iter().zip(&mut shells[which]).for_each(|((a, n), m)| m.push(a / n));
         }
     }
-    for s in 0..4 {
-        let (a, b) = (shells[0][s], shells[1][s]);
+    for (s, (a, b)) in shells[0].iter().zip(&shells[1]).enumerate() {
         family.compare(format!("shell {s}"), b.mean(), a.std_error().hypot(b.std_error()), a.mean());
     }
     family.accept();

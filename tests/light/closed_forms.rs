@@ -168,8 +168,8 @@ fn furnace_of_emitting_walls() {
         let expected = 1.0 / (1.0 - albedo);
         let walls = closed_box(UNIT.0, UNIT.1, albedo, 1.0);
         let scene = ball(17, grey(1.0, Side::Lower), walls);
-        let mut on_ball = vec![Moments::default(); 4];
-        let mut on_walls = vec![Moments::default(); 6];
+        let mut on_ball = [Moments::default(); 4];
+        let mut on_walls = [Moments::default(); 6];
         for seed in 1..4 {
             let settings = isolume::bake::BakeSettings {
                 photons: 1 << 18,
@@ -246,7 +246,7 @@ fn furnace_of_emitting_level_sets() {
         }
         for (name, scene) in scenes {
             for gather in [32, 0] {
-                let mut shells = vec![Moments::default(); 4];
+                let mut shells = [Moments::default(); 4];
                 for seed in 1..4 {
                     let settings =
                         isolume::bake::BakeSettings { photons: 1 << 18, gather_rays: gather, ..at_nodes(seed) };
@@ -268,8 +268,8 @@ fn furnace_of_emitting_level_sets() {
 }
 
 /// A floor z = 0 beside a wall of height 1 that runs along y without end: the field max(−z, min(x, 1 − z)) holds both
-/// exactly at isovalue 0 (which is the lattice's own value on them). All other directions end on luminaires of radiance
-/// 1. The wall takes ½(1 − 1/√(1 + k²)) of the light. Tolerance 1e-3: the share is a ratio of 2¹⁵ low-discrepancy points
+/// exactly at isovalue 0 (which is the lattice's own value on them). All other directions end on luminaires of
+/// radiance one. The wall takes ½(1 − 1/√(1 + k²)) of the light. Tolerance 1e-3: the share is a ratio of 2¹⁵ low-discrepancy points
 /// per luminaire (edge strata 2¹⁵^-¾ ≈ 4e-4), the wall ends after 100 heights.
 #[test]
 fn occlusion_by_an_infinite_wall() {
