@@ -1,5 +1,7 @@
 //! Walls, luminaires and caps: where lines end on them, the (u, v, c) textures that answer there, and what lines bring.
 
+#![allow(clippy::needless_range_loop, reason = "a channel indexes several planes at once")]
+
 use super::directions::Shear;
 use crate::flat::{self, FlatTexture};
 use crate::scene::{Boundary, Scene};

@@ -1,5 +1,7 @@
 //! Sixteen neighbouring lines in lock-step: h and B along them, what they end on, and the next value ≥ h of every sample.
 
+#![allow(clippy::needless_range_loop, reason = "a channel indexes several planes at once")]
+
 use super::directions::Shear;
 use super::flats::{Ends, Flats, Stop, fill_column};
 use super::grid::Planes;

@@ -2,6 +2,8 @@
 //! vectorises it over the sixteen lines of a pack; AVX-512 scans by hand, since its gathers are what the compiler does
 //! not find. No fused multiply-adds: every instruction set gives the same bits.
 
+#![allow(clippy::needless_range_loop, reason = "a channel indexes several planes at once")]
+
 use super::flats::{Ends, Flats};
 use super::gather::{COSINES, accumulate_row, sum_cosines};
 use super::grid::Planes;
