@@ -2,6 +2,7 @@
 
 mod compare;
 mod extract;
+mod flatland;
 mod reference;
 mod study;
 
@@ -63,8 +64,10 @@ enum Verb {
     Reference(reference::ReferenceArgs),
     /// Measure a bake against references
     Compare(compare::Compare),
-    /// Make tables and plots of error and speed
-    Study(study::StudyArgs),
+    /// n = 2: pictures of light on a height field, in horizontal planes and as an ordinary surface
+    Flatland(flatland::Flatland),
+    /// Measure: tables and plots
+    Study(study::Study),
 }
 
 #[derive(clap::Args, Debug)]
@@ -187,6 +190,7 @@ impl Cli {
             Verb::Extract(v) => v.run(progress),
             Verb::Reference(v) => v.run(progress),
             Verb::Compare(v) => v.run(progress),
+            Verb::Flatland(v) => v.run(progress),
             Verb::Study(v) => v.run(progress),
         }
     }
@@ -195,6 +199,12 @@ impl Cli {
 /// Fails now if `path` could not be written later.
 fn writable(path: &Path) -> Result<()> {
     crate::atomic::AtomicFile::create(path).map(drop)
+}
+
+/// Makes an output folder, and fails now if nothing could be written there.
+fn folder(path: &Path) -> Result<()> {
+    std::fs::create_dir_all(path).map_err(|e| Error::io(path, e))?;
+    writable(&path.join("probe"))
 }
 
 fn expect_extension(path: &Path, known: &[&str]) -> Result<()> {
@@ -351,7 +361,7 @@ impl Render {
         let exposure = baked.exposure * self.exposure;
         if self.output.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr")) {
             let attributes = [
-                ("software".to_owned(), format!("isolume {} ({})", env!("CARGO_PKG_VERSION"), env!("ISOLUME_COMMIT"))),
+                ("isolume".to_owned(), format!("{} ({})", env!("CARGO_PKG_VERSION"), env!("ISOLUME_COMMIT"))),
                 ("bake".to_owned(), self.file.display().to_string()),
                 ("isovalue".to_owned(), self.isovalue.to_string()),
                 ("exposure".to_owned(), exposure.to_string()),

@@ -15,21 +15,21 @@ const MAX_STEPS: usize = 64;
 
 impl Cubic {
     /// The value at t (Horner).
-    #[inline]
+    #[inline(always)]
     pub fn value(&self, t: f64) -> f64 {
         let [c0, c1, c2, c3] = self.c;
         c0 + t * (c1 + t * (c2 + t * c3))
     }
 
     /// The slope at t.
-    #[inline]
+    #[inline(always)]
     pub fn slope(&self, t: f64) -> f64 {
         let [_, c1, c2, c3] = self.c;
         c1 + t * (2.0 * c2 + t * (3.0 * c3))
     }
 
     /// The cubic without its root at 0, divided by t. The caller knows that c0 is 0; what is stored there is ignored.
-    #[inline]
+    #[inline(always)]
     pub fn deflate(&self) -> Self {
         Self { c: [self.c[1], self.c[2], self.c[3], 0.0] }
     }
@@ -39,7 +39,7 @@ impl Cubic {
     /// `inside_end` is the state at `end`; if it differs from `inside_start` a t is always returned, whatever rounding
     /// makes of the coefficients. Equal states are searched for a pair of roots between the turning points: a pair
     /// closer than the rounding of the value there (a tangent ray) may be missed, one that is found is a crossing.
-    #[inline]
+    #[inline(always)]
     pub fn first_crossing(&self, end: f64, inside_start: bool, inside_end: bool) -> Option<f64> {
         let mut start = 0.0;
         for turn in self.turning_points(end).into_iter().flatten() {
@@ -52,7 +52,7 @@ impl Cubic {
     }
 
     /// Roots of the slope inside (0, end), ascending.
-    #[inline]
+    #[inline(always)]
     fn turning_points(&self, end: f64) -> [Option<f64>; 2] {
         let [_, c1, c2, c3] = self.c;
         let (a, half_b) = (3.0 * c3, c2);
@@ -71,6 +71,7 @@ impl Cubic {
     /// The root in [lo, hi] on which the caller insists, `inside_lo` being the state at lo: Newton kept inside a
     /// shrinking bracket, bisection when it leaves. Ends when the bracket is as small as f64 allows or the value is 0;
     /// at most 64 steps.
+    #[inline(never)]
     fn bracketed_root(&self, mut lo: f64, mut hi: f64, inside_lo: bool) -> f64 {
         let (f_lo, f_hi) = (self.value(lo), self.value(hi));
         // A secant start; rounding may have left both values on one side, then the middle.

@@ -1,7 +1,8 @@
 //! Direct light at a receiver: closed-form irradiance times the visible share, by shadow rays.
 
 use crate::flattened::{Departure, FlattenedRay};
-use crate::luminaire::{point_term, unoccluded};
+use crate::luminaire::{above_horizon, point_term, unoccluded};
+use crate::polygon::sample_convex;
 use crate::rng::{Sobol, Stage};
 use crate::scene::Scene;
 use crate::tracer::Tracer;
@@ -38,7 +39,7 @@ pub fn luminance(rgb: DVec3) -> f64 {
 }
 
 /// Irradiance from all luminaires: for each, Lambert's closed form × Σ V_i g_i / Σ g_i over `shadow_rays`
-/// low-discrepancy points y_i with g = cos θ cos θ′/r². Exact where all or none are visible; the ratio's bias falls with
+/// low-discrepancy points y_i of its part above the horizon, with g = cos θ cos θ′/r². Exact where all or none are visible; the ratio's bias falls with
 /// 1/shadow_rays where some are. The point set is keyed by (seed, stage, index).
 pub fn direct_irradiance<T: Tracer>(
     scene: &Scene,
@@ -59,10 +60,16 @@ pub fn direct_irradiance<T: Tracer>(
         if open == 0.0 {
             continue;
         }
+        // Points below the horizon would say nothing, and if all were the luminaire would be lost.
+        let part = above_horizon(light, x, receiver.normal);
+        if part.as_ref().is_some_and(|p| p.len() < 3) {
+            continue;
+        }
         let set = Sobol::set(seed, stage, index * scene.luminaires().len() as u64 + u64::from(l));
         let (mut sum, mut seen, mut squares, mut seen_squares) = (0.0, 0.0, 0.0, 0.0);
         for i in 0..shadow_rays {
-            let y = light.sample(set.point2(i, 0));
+            let u = set.point2(i, 0);
+            let y = part.as_ref().map_or_else(|| light.sample(u), |p| sample_convex(p, u));
             let g = point_term(x, receiver.normal, y, light.normal());
             if g == 0.0 {
                 continue;

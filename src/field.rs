@@ -5,6 +5,7 @@ use crate::error::{Error, Result};
 use crate::volume::{Lattice, Volume};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
+use std::sync::Arc;
 
 /// The sweep's isovalue range I = [lo, hi] in source units, mapped affinely to [0, 1].
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -63,6 +64,8 @@ pub struct Field {
     lattice: Lattice,
     sweep: Sweep,
     samples: Vec<f32>,
+    /// The field that gives receiver normals, if this one is a finer copy of it.
+    coarse: Option<Arc<Field>>,
 }
 
 impl Field {
@@ -99,7 +102,27 @@ impl Field {
                 if v.is_finite() { sweep.isovalue(v) } else { f32::NAN }
             })
             .collect();
-        Ok(Self { lattice: volume.lattice.clone(), sweep, samples })
+        Ok(Self { lattice: volume.lattice.clone(), sweep, samples, coarse: None })
+    }
+
+    /// The same function on another lattice over the same Ω: exactly the same where that divides this one's cells.
+    /// Receiver normals stay those of this field, so that a finer grid does not sharpen them.
+    #[must_use]
+    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+    pub fn resampled(&self, lattice: &Lattice) -> Self {
+        let scale = self.lattice.far() / lattice.far();
+        let samples = (0..lattice.len())
+            .into_par_iter()
+            .with_min_len(1 << 14)
+            .map(|o| self.value(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)) * scale) as f32)
+            .collect();
+        Self { lattice: lattice.clone(), sweep: self.sweep, samples, coarse: Some(Arc::new(self.clone())) }
+    }
+
+    /// Index coordinates of the coarse field at index coordinates of this one.
+    #[inline]
+    fn to_coarse(&self, coarse: &Field, p: DVec3) -> DVec3 {
+        p * (coarse.lattice.far() / self.lattice.far())
     }
 
     /// Where the samples stand.
@@ -132,11 +155,13 @@ impl Field {
     }
 
     /// The 8 samples of a cell; bit a of the position says which end along axis a.
-    #[inline]
+    #[inline(always)]
     pub fn corners(&self, [i, j, k]: [usize; 3]) -> [f32; 8] {
         let [nx, ny, _] = self.lattice.dims();
-        let s = &self.samples[(k * ny + j) * nx + i..];
+        let at = (k * ny + j) * nx + i;
+        // One bound for all: the last corner's.
         let (y, z) = (nx, nx * ny);
+        let s = &self.samples[at..at + z + y + 2];
         [s[0], s[1], s[y], s[y + 1], s[z], s[z + 1], s[z + y], s[z + y + 1]]
     }
 
@@ -163,6 +188,9 @@ impl Field {
     /// Central-difference gradient at a node, per world unit: one-sided at Ω's faces and beside non-finite samples,
     /// 0 along an axis without a finite neighbour.
     pub fn node_gradient(&self, [i, j, k]: [usize; 3]) -> DVec3 {
+        if let Some(coarse) = &self.coarse {
+            return coarse.receiver_gradient(self.to_coarse(coarse, DVec3::new(i as f64, j as f64, k as f64)));
+        }
         let dims = self.lattice.dims();
         let strides = [1, dims[0], dims[0] * dims[1]];
         let at = self.lattice.offset(i, j, k);
@@ -185,6 +213,9 @@ impl Field {
     /// The receiver gradient at `p`: central differences at the nodes, interpolated trilinearly, per world unit.
     /// Continuous; its direction is the normal of every cosine in every engine.
     pub fn receiver_gradient(&self, p: DVec3) -> DVec3 {
+        if let Some(coarse) = &self.coarse {
+            return coarse.receiver_gradient(self.to_coarse(coarse, p));
+        }
         let (cell, u) = self.locate(p);
         let dims = self.lattice.dims();
         let interior = (0..3).all(|a| cell[a] > 0 && cell[a] + 2 < dims[a]);
@@ -320,6 +351,18 @@ mod tests {
             .unwrap();
         assert_eq!(f.node_gradient([1, 0, 0]), DVec3::new(0.25, 0.0, 0.0));
         assert!(f.falling_normal(DVec3::new(1.5, 0.5, 0.5)).unwrap().is_finite());
+    }
+
+    #[test]
+    fn a_finer_copy_is_the_same_function_with_the_same_normals() {
+        let f = oblique(|x| (3.0 * x.x).sin() + (x.y * x.z * 0.002).cos());
+        let axes = f.lattice().axes();
+        let fine = f.resampled(&Lattice::new([9, 7, 11], f.lattice().origin(), axes * 0.5).unwrap());
+        for p in [DVec3::new(1.3, 2.2, 3.7), DVec3::new(0.0, 3.0, 5.0), DVec3::new(2.5, 0.25, 1.0)] {
+            assert!((f.value(p) - fine.value(2.0 * p)).abs() < 1e-6);
+            assert!((f.receiver_gradient(p) - fine.receiver_gradient(2.0 * p)).length() < 1e-9);
+        }
+        assert!((fine.node_gradient([3, 2, 5]) - f.receiver_gradient(DVec3::new(1.5, 1.0, 2.5))).length() < 1e-12);
     }
 
     #[test]

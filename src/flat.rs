@@ -1,7 +1,7 @@
 //! Flats: everything planar that holds a (u, v, isovalue) texture of light – walls, luminaires' fronts, and the caps of
 //! Ω's faces. Flat numbers are polygon numbers, then six caps (axis + 3 · far end).
 
-use crate::flattened::Departure;
+use crate::flattened::{Departure, Side};
 use crate::scene::{Boundary, Scene};
 use glam::DVec3;
 
@@ -51,7 +51,7 @@ pub fn flat(scene: &Scene, number: usize) -> Option<Flat> {
         edges: [edge((a + 1) % 3), edge((a + 2) % 3)],
         normal: scene.face_normal(face),
         albedo: scene.surface.albedo,
-        departure: Departure::Free,
+        departure: Departure::Cap(face, Side::Lower),
     })
 }
 

@@ -41,6 +41,8 @@ pub enum Departure {
     Surface(Side),
     /// A polygon of the scene, by number.
     Polygon(u32),
+    /// A cap, axis + 3 · far end, leaving into `Side`. The origin counts as on the face whatever its f32 coordinates.
+    Cap(u8, Side),
 }
 
 /// A ray confined to the hyperplane at height `isovalue`.
@@ -71,7 +73,7 @@ impl FlattenedRay {
         Self { origin, direction, isovalue, reach: f32::INFINITY, departure: Departure::Free, target: None }
     }
 
-    /// Departure and target in 32 bits, for the spare word of an Embree ray: 2 bits of kind, 1 of side or 17 of polygon,
+    /// Departure and target in 32 bits, for the spare word of an Embree ray: 2 bits of kind, 1 of side or 17 of polygon or 4 of cap,
     /// 12 of target + 1.
     #[inline]
     pub fn pack_ends(&self) -> u32 {
@@ -80,6 +82,7 @@ impl FlattenedRay {
             Departure::Surface(Side::Lower) => 1,
             Departure::Surface(Side::Higher) => 1 | 1 << 2,
             Departure::Polygon(id) => 2 | id << 2,
+            Departure::Cap(face, side) => 3 | (u32::from(face) << 1 | side.index() as u32) << 2,
         };
         departure | self.target.map_or(0, |id| id + 1) << 20
     }
@@ -92,7 +95,9 @@ impl FlattenedRay {
             0 => Departure::Free,
             1 if payload & 1 == 0 => Departure::Surface(Side::Lower),
             1 => Departure::Surface(Side::Higher),
-            _ => Departure::Polygon(payload),
+            2 => Departure::Polygon(payload),
+            #[allow(clippy::cast_possible_truncation, reason = "a face is below 6")]
+            _ => Departure::Cap((payload >> 1) as u8, if payload & 1 == 0 { Side::Lower } else { Side::Higher }),
         };
         (departure, (bits >> 20).checked_sub(1))
     }
@@ -137,6 +142,8 @@ mod tests {
             Departure::Surface(Side::Higher),
             Departure::Polygon(0),
             Departure::Polygon(MAX_POLYGONS - 1),
+            Departure::Cap(0, Side::Higher),
+            Departure::Cap(5, Side::Lower),
         ];
         for departure in departures {
             for target in [None, Some(0), Some(7), Some(MAX_TARGETS - 1)] {

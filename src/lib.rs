@@ -45,6 +45,8 @@ pub mod gather;
 pub mod sampling;
 pub mod radiance;
 pub mod illumination_grid;
+pub mod fitted_grid;
+pub mod sweep;
 pub mod bake;
 pub mod scene_file;
 // Products.
@@ -56,5 +58,6 @@ pub mod reference;
 pub mod accuracy;
 pub mod plot;
 pub mod study;
+pub mod flatland;
 // Verbs.
 pub mod cli;

@@ -38,6 +38,28 @@ pub fn unoccluded(polygon: &Polygon, x: DVec3, n: DVec3) -> f64 {
     (-0.5 * sum).max(0.0)
 }
 
+/// The part of `polygon` above the horizon of `x` with normal `n`, as vertices of a convex polygon; `None` if that is all
+/// of it. Fewer than three vertices: nothing is above.
+pub fn above_horizon(polygon: &Polygon, x: DVec3, n: DVec3) -> Option<Vec<DVec3>> {
+    let v = polygon.vertices();
+    let height = |p: DVec3| (p - x).dot(n);
+    if v.iter().all(|&p| height(p) >= 0.0) {
+        return None;
+    }
+    let mut part = Vec::with_capacity(v.len() + 1);
+    for (i, &a) in v.iter().enumerate() {
+        let b = v[(i + 1) % v.len()];
+        let (ha, hb) = (height(a), height(b));
+        if ha >= 0.0 {
+            part.push(a);
+        }
+        if (ha >= 0.0) != (hb >= 0.0) {
+            part.push(a + (b - a) * (ha / (ha - hb)));
+        }
+    }
+    Some(part)
+}
+
 /// θ n · γ of one edge: its angle seen from the origin times the projection of the edge plane's normal.
 #[inline]
 fn edge_term(a: DVec3, b: DVec3, n: DVec3) -> f64 {

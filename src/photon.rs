@@ -20,7 +20,8 @@ pub struct SurfacePhoton {
     pub isovalue: f32,
     /// Power × isovalue per channel, before reflection.
     pub power: Vec3,
-    /// Reflections before this landing: 0 is direct light.
+    /// Reflections before this landing: 0 is direct light of a luminaire. Light of emitting level sets starts at 1,
+    /// since no receiver counts it apart.
     pub bounces: u16,
     /// The side it landed on.
     pub side: Side,
@@ -204,6 +205,8 @@ struct Flight {
     isovalue: f32,
     departure: Departure,
     power: DVec3,
+    /// What the first landing counts as.
+    bounces: u16,
 }
 
 #[allow(clippy::cast_possible_truncation, reason = "storage is f32; indices below 2³²")]
@@ -223,7 +226,8 @@ fn trace_photon<T: Tracer>(
     let bin = ((photon.isovalue * ENERGY_BINS as f32) as usize).min(ENERGY_BINS - 1);
     let energy = &mut out.energy[bin];
     energy.emitted += photon.power.element_sum();
-    for bounces in 0..=u16::MAX {
+    let first = photon.bounces;
+    for bounces in first..=u16::MAX {
         let ray = scene.ray(photon.origin, photon.direction, photon.isovalue, photon.departure);
         out.rays += 1;
         let Some(hit) = tracer.intersect(&ray) else {
@@ -248,13 +252,14 @@ fn trace_photon<T: Tracer>(
                 (scene.surface.albedo, scene.normal(position.as_dvec3(), side), Departure::Surface(side))
             }
             Target::Cap(face, side) => {
-                store_flat(
-                    scene.polygons().len() as u32 + u32::from(face),
-                    crate::flat::face_texture(scene, face, local),
-                );
+                // The texture of a cap is its outer side's.
+                if side == Side::Lower {
+                    let number = scene.polygons().len() as u32 + u32::from(face);
+                    store_flat(number, crate::flat::face_texture(scene, face, local));
+                }
                 let n = scene.face_normal(face);
                 let n = if side == Side::Lower { n } else { -n };
-                (scene.surface.albedo, Some(n), Departure::Free)
+                (scene.surface.albedo, Some(n), Departure::Cap(face, side))
             }
             Target::Polygon(id) => {
                 let p = &scene.polygons()[id as usize];
@@ -278,12 +283,12 @@ fn trace_photon<T: Tracer>(
         }
         let next = reflected / survival;
         energy.absorbed += (photon.power - next).element_sum();
-        if bounces >= settings.max_bounces {
+        if bounces - first >= settings.max_bounces || bounces == u16::MAX {
             energy.terminated += next.element_sum();
             return;
         }
         let direction = Frame::new(normal).to_world(cosine_hemisphere(rng.unit2()));
-        photon = Flight { origin: position, direction, isovalue: photon.isovalue, departure, power: next };
+        photon = Flight { origin: position, direction, departure, power: next, ..photon };
     }
 }
 
@@ -318,6 +323,7 @@ fn emit(scene: &Scene, settings: &PhotonSettings, sources: &[Source], total: f64
                 isovalue,
                 departure: Departure::Polygon(id),
                 power: share,
+                bounces: 0,
             })
         }
         Source::Field(_) => {
@@ -342,6 +348,7 @@ fn emit(scene: &Scene, settings: &PhotonSettings, sources: &[Source], total: f64
                 isovalue: h as f32,
                 departure: Departure::Surface(side),
                 power: share * scene.field.gradient(origin.as_dvec3()).length() * diagonal,
+                bounces: 1,
             })
         }
     }

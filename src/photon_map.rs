@@ -48,8 +48,12 @@ pub enum Normalisation {
     WithoutGradient,
 }
 
-/// Points of the unit ball for ∫_A; several sets so that neighbouring estimates do not share their pattern.
-const FOOTPRINT_POINTS: usize = 64;
+/// Points of the unit ball for ∫_A: a step, the most, and how many accepted ones are enough. Where few are accepted (noise,
+/// thin sheets) a fixed number would make the divisor, and with it the estimate, jump.
+const FOOTPRINT_STEP: usize = 64;
+const FOOTPRINT_POINTS: usize = 1024;
+const FOOTPRINT_ENOUGH: usize = 32;
+/// Several sets, so that neighbouring estimates do not share their pattern.
 const FOOTPRINT_SETS: usize = 16;
 
 /// The photons of one side, sorted for lookup.
@@ -61,7 +65,7 @@ pub struct PhotonMap<'a> {
     grid: PointGrid,
     /// Slot order of `grid`: power, isovalue, unit gradient (cone test).
     photons: Vec<MappedPhoton>,
-    footprints: Vec<[DVec3; FOOTPRINT_POINTS]>,
+    footprints: Vec<Vec<DVec3>>,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -119,7 +123,7 @@ impl<'a> PhotonMap<'a> {
         let footprints = (0..FOOTPRINT_SETS)
             .map(|s| {
                 let set = Sobol::set(0, Stage::Footprint, s as u64);
-                std::array::from_fn(|i| warp::ball(set.point2(i as u32, 0), set.coordinate(i as u32, 2)))
+                (0..FOOTPRINT_POINTS as u32).map(|i| warp::ball(set.point2(i, 0), set.coordinate(i, 2))).collect()
             })
             .collect();
         let diagonal = (lattice.axes() * lattice.far()).length();
@@ -188,8 +192,12 @@ impl<'a> PhotonMap<'a> {
         let hash = position.to_array().iter().fold(0u64, |h, x| (h ^ x.to_bits()).wrapping_mul(0x9e37_79b9_7f4a_7c15));
         let points = &self.footprints[(hash >> 60) as usize % FOOTPRINT_SETS];
         let far = lattice.far();
-        let mut sum = 0.0;
+        let (mut sum, mut accepted, mut tried) = (0.0, 0, 0);
         for b in points {
+            if tried % FOOTPRINT_STEP == 0 && accepted >= FOOTPRINT_ENOUGH {
+                break;
+            }
+            tried += 1;
             let p = position + lattice.direction_to_index(*b * radius);
             if p.cmplt(DVec3::ZERO).any() || p.cmpgt(far).any() {
                 continue;
@@ -203,8 +211,9 @@ impl<'a> PhotonMap<'a> {
             let slope = g.length();
             if g.dot(normal.as_dvec3()) >= self.settings.cone * slope {
                 sum += (1.0 - b.length_squared()) * slope;
+                accepted += 1;
             }
         }
-        sum * (4.0 / 3.0 * std::f64::consts::PI * radius.powi(3)) / FOOTPRINT_POINTS as f64
+        sum * (4.0 / 3.0 * std::f64::consts::PI * radius.powi(3)) / tried as f64
     }
 }

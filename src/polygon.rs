@@ -115,21 +115,7 @@ impl Polygon {
         if self.is_parallelogram() {
             return self.at(u);
         }
-        let fan = |i: usize| {
-            let [a, b, c] = [0, i + 1, i + 2].map(|k| self.vertices[k]);
-            (a, b - a, c - a, 0.5 * (b - a).cross(c - a).length())
-        };
-        let mut rest = u[0] * self.area;
-        let last = self.vertices.len() - 3;
-        for i in 0..=last {
-            let (a, e, f, area) = fan(i);
-            if rest < area || i == last {
-                let [s, t] = crate::warp::triangle([(rest / area).min(1.0), u[1]]);
-                return a + s * e + t * f;
-            }
-            rest -= area;
-        }
-        unreachable!("the last triangle takes the rest")
+        sample_convex(&self.vertices, u)
     }
 
     /// Whether a point of the plane lies inside.
@@ -143,6 +129,22 @@ impl Polygon {
         let v = &self.vertices;
         v.len() == 4 && (v[0] + v[2] - v[1] - v[3]).length() <= 1e-12 * (v[2] - v[0]).length()
     }
+}
+
+/// A point uniform over the area of the planar convex polygon `v` of at least three vertices, by its triangle fan.
+pub fn sample_convex(v: &[DVec3], u: [f64; 2]) -> DVec3 {
+    let area = |i: usize| 0.5 * (v[i + 1] - v[0]).cross(v[i + 2] - v[0]).length();
+    let last = v.len() - 3;
+    let mut rest = u[0] * (0..=last).map(area).sum::<f64>();
+    for i in 0..=last {
+        let area = area(i);
+        if rest < area || i == last {
+            let [s, t] = crate::warp::triangle([if area > 0.0 { (rest / area).min(1.0) } else { 0.0 }, u[1]]);
+            return v[0] + s * (v[i + 1] - v[0]) + t * (v[i + 2] - v[0]);
+        }
+        rest -= area;
+    }
+    unreachable!("the last triangle takes the rest")
 }
 
 /// Corner and edges of the texture of a planar polygon.

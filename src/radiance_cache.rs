@@ -66,6 +66,12 @@ impl RadianceCache {
         Self { nodes, flats, rays: rays.into_inner(), misses: AtomicU64::new(0) }
     }
 
+    /// A cache of radiance known already: per side (lower, higher) RGB at the nodes of the scene's lattice, NaN where
+    /// unknown, and the flats' textures.
+    pub fn from_parts(nodes: [Option<Vec<[f32; 3]>>; 2], flats: Vec<Option<FlatTexture>>) -> Self {
+        Self { nodes, flats, rays: 0, misses: AtomicU64::new(0) }
+    }
+
     /// Total work units that `tick` will see, for a progress bar.
     pub fn work(scene: &Scene) -> u64 {
         scene.lattice().len() as u64

@@ -113,6 +113,12 @@ impl Scene {
         Ok(Self { field, surface, boundary, polygons, luminaires, interior: [lo, hi] })
     }
 
+    /// The same scene with its field on another lattice over the same Ω ([`Field::resampled`]).
+    #[must_use]
+    pub fn resampled(&self, lattice: &Lattice) -> Self {
+        Self { field: self.field.resampled(lattice), ..self.clone() }
+    }
+
     /// Walls and luminaires; luminaires come first.
     pub fn polygons(&self) -> &[Polygon] {
         &self.polygons

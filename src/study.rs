@@ -14,7 +14,6 @@ use crate::accuracy::{Accuracy, ReferenceMesh, compare};
 use crate::bake::{Bake, BakeSettings, bake};
 use crate::embree::{Device, SurfaceTracer};
 use crate::error::{Error, Result};
-use crate::export::bake_file::interpolate;
 use crate::export::ply;
 use crate::progress::Progress;
 use crate::reference::{ReferenceSettings, reference};
@@ -126,7 +125,7 @@ pub fn accuracy_of(bake: &Bake, references: &[ReferenceMesh]) -> Result<Accuracy
     let texture: Vec<DVec3> = references[0]
         .positions
         .par_iter()
-        .map(|&x| interpolate(&bake.lattice, grid, bake.lattice.to_index(x)))
+        .map(|&x| grid.interpolate(&bake.lattice, bake.lattice.to_index(x)))
         .collect();
     Ok(compare(&texture, references, bake.exposure)?.0)
 }

@@ -6,7 +6,7 @@ use isolume::embree::{Device, GraphTracer};
 use isolume::field::{Field, Sweep};
 use isolume::flattened::{Departure, FlattenedRay, Side, Target};
 use isolume::rng::{Rng, Stage};
-use isolume::scene::{Boundary, Scene, Surface};
+use isolume::scene::{Boundary, Scene, Surface, cornell_box};
 use isolume::tracer::Tracer;
 use isolume::volume::{Lattice, Samples, Volume};
 use isolume::warp;
@@ -68,7 +68,7 @@ fn misses(scene: &Scene, levels: u8, rays: u64, seed: u64) -> (u64, u64, u64) {
             let mut rng = Rng::stream(seed, Stage::Test, i);
             let origin = start(&mut rng, dims);
             // Half of the isovalues are integers, which the samples are too.
-            let c = if i % 2 == 0 {
+            let c = if i.is_multiple_of(2) {
                 scene.field.sweep().isovalue((1 + rng.bits() % u64::from(levels - 1)) as f64)
             } else {
                 rng.unit() as f32
@@ -161,4 +161,46 @@ fn rays_that_leave_the_surface_do_not_find_it_again() {
     }
     println!("{trials} spawned rays: {rehits} re-hits, {leaks} leaks, {wrong_side} on the wrong side");
     assert_eq!((rehits, leaks, wrong_side), (0, 0, 0));
+}
+
+#[test]
+fn batches_find_what_single_rays_find() {
+    let plain = noise([33, 34, 35], DVec3::ONE, DVec3::ZERO, 4);
+    for (boundary, margin) in [(Boundary::Open, 0.0), (Boundary::Open, 0.2), (Boundary::Capped, 0.2)] {
+        let polygons = cornell_box(plain.lattice(), margin).unwrap();
+        let scene = Scene::new(plain.field.clone(), Surface::default(), boundary, polygons).unwrap();
+        let device = Device::new(1).unwrap();
+        let tracer = GraphTracer::new(&device, &scene).unwrap();
+        let mut rng = Rng::stream(9, Stage::Test, 0);
+        // Not a multiple of sixteen.
+        let rays: Vec<_> = (0..50_003)
+            .map(|_| {
+                let origin = start(&mut rng, scene.lattice().dims());
+                let mut ray = FlattenedRay::free(origin, direction(&mut rng), 0.9 * rng.unit() as f32);
+                if rng.bits().is_multiple_of(4) {
+                    ray.reach = (10.0 * rng.unit()) as f32;
+                }
+                ray
+            })
+            .collect();
+        let mut hits = vec![None; rays.len()];
+        let mut blocked = vec![false; rays.len()];
+        tracer.intersect_many(&rays, &mut hits);
+        tracer.occluded_many(&rays, &mut blocked);
+        let mut kinds = [0; 3];
+        for ((ray, hit), blocked) in rays.iter().zip(hits).zip(blocked) {
+            assert_eq!(hit.is_some(), blocked, "{ray:?}");
+            // Embree may ask for the volume with the reach that a polygon left over: t can differ in its last bit.
+            let single = tracer.intersect(ray);
+            assert_eq!(hit.map(|h| h.target), single.map(|h| h.target), "{ray:?}");
+            let t = |h: Option<isolume::flattened::FlattenedHit>| h.map_or(0.0, |h| h.t);
+            assert!((t(hit) - t(single)).abs() <= 1e-6 * t(single), "{ray:?}: {hit:?}, {single:?}");
+            kinds[match hit.map(|h| h.target) {
+                Some(Target::Polygon(_)) => 0,
+                Some(_) => 1,
+                None => 2,
+            }] += 1;
+        }
+        assert!(kinds.iter().all(|&n| n > 100), "{kinds:?}: polygons, volume, nothing");
+    }
 }

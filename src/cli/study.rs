@@ -1,22 +1,42 @@
-//! `isolume study`: the tables and plots of the documentation.
+//! `isolume study`: measurements that fill tables, one subcommand each.
 
-use super::device;
 use crate::bake::BakeOptions;
 use crate::error::{Error, Result};
+use crate::flatland::study::{StudySettings, flatland};
 use crate::progress::Progress;
 use crate::scene_file::{SceneOptions, load};
-use crate::study::{Study, Subject, curve, datasets, strategies};
+use crate::study::{self, Subject};
 use std::path::{Path, PathBuf};
 
-/// What to study.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-enum Kind {
-    /// BB09's table: sampling strategies over the sweep.
-    Strategies,
-    /// Error, floor and seconds of each data set.
-    Datasets,
-    /// Error against wall seconds over photons, samples and gather rays.
-    Curve,
+#[derive(clap::Args, Debug)]
+pub(super) struct Study {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(clap::Subcommand, Debug)]
+enum What {
+    /// n = 2: samples on level sets against uniform ones, from 10³ to 10⁶ (BB09's 7.4 % and 2.2 %)
+    Flatland(Flatland),
+    /// BB09's table: sampling strategies at 10⁶ and 10⁷ samples over the sweep
+    Strategies(SceneStudy),
+    /// Error, interpolation floor and seconds of each data set
+    Datasets(SceneStudy),
+    /// Error against wall seconds over photons, samples and gather rays
+    Curve(SceneStudy),
+}
+
+#[derive(clap::Args, Debug)]
+struct Flatland {
+    /// Folder for study.csv, study.md, study.svg and figure5.png; made if it does not exist
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+    /// The largest number of samples
+    #[arg(long, default_value_t = 1_000_000, value_name = "N")]
+    most: u64,
+    /// Seed of all random numbers
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
 }
 
 #[derive(clap::Args, Debug)]
@@ -27,9 +47,7 @@ stopped. References are cached in DIR/references.
 Examples:
   isolume study strategies scenes/cornell-bumps.toml -o results
   isolume study datasets scenes/cornell-bumps.toml --data data -o results")]
-pub(super) struct StudyArgs {
-    /// What to study
-    kind: Kind,
+struct SceneStudy {
     /// Scene files or volumes
     #[arg(required_unless_present = "data", value_name = "SCENE")]
     scenes: Vec<PathBuf>,
@@ -50,8 +68,24 @@ pub(super) struct StudyArgs {
 const DATA: [(&str, &str, [f64; 2], f64); 2] =
     [("brain", "ch2.nii.gz", [15.0, 200.0], 80.0), ("neuron", "neuron.mha", [20.0, 200.0], 60.0)];
 
-impl StudyArgs {
+impl Study {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
+        match self.what {
+            What::Strategies(v) => v.run(study::strategies, progress),
+            What::Datasets(v) => v.run(study::datasets, progress),
+            What::Curve(v) => v.run(study::curve, progress),
+            What::Flatland(v) => {
+                super::folder(&v.output)?;
+                let settings = StudySettings { most: v.most, seed: v.seed, ..StudySettings::default() };
+                flatland(&v.output, &super::device()?, &settings, progress)
+            }
+        }
+    }
+}
+
+impl SceneStudy {
+    /// Loads the scenes and runs `table` on them.
+    fn run(self, table: fn(&study::Study, &[Subject], &BakeOptions) -> Result<()>, progress: Progress) -> Result<()> {
         let mut subjects = Vec::new();
         for path in &self.scenes {
             let loaded = load(path, &SceneOptions::default())?;
@@ -70,12 +104,8 @@ impl StudyArgs {
         if subjects.is_empty() {
             return Err(Error::Invalid("--data: the folder holds neither ch2.nii.gz nor neuron.mha".into()));
         }
-        let study = Study::new(self.output, device()?, progress, self.quick)?;
-        match self.kind {
-            Kind::Strategies => strategies(&study, &subjects, &self.bake),
-            Kind::Datasets => datasets(&study, &subjects, &self.bake),
-            Kind::Curve => curve(&study, &subjects, &self.bake),
-        }
+        let study = study::Study::new(self.output, super::device()?, progress, self.quick)?;
+        table(&study, &subjects, &self.bake)
     }
 }
 

@@ -5,7 +5,10 @@
 //! ray starts and ends on in `ray.time`.
 
 use super::extrusions::{Extrusions, embree_ray, flattened_ray, padded};
-use super::{Device, RayHit, RayView, Scene as Bvh, SceneBuilder, UserGeometry, UserHit};
+use super::{
+    Device, INVALID_ID, Ray16, RayHit, RayHit16, RayView, Scene as Bvh, SceneBuilder, UserGeometry, UserHit,
+    UserHits16, Valid16,
+};
 use crate::error::Result;
 use crate::field::Field;
 use crate::flattened::{FlattenedHit, FlattenedRay, Side, Target};
@@ -69,6 +72,43 @@ impl Tracer for GraphTracer<'_> {
     fn occluded(&self, ray: &FlattenedRay) -> bool {
         self.bvh.occluded1(&mut embree_ray(ray))
     }
+
+    fn intersect_many(&self, rays: &[FlattenedRay], hits: &mut [Option<FlattenedHit>]) {
+        assert_eq!(rays.len(), hits.len(), "a place for every ray's hit");
+        for (rays, hits) in rays.chunks(16).zip(hits.chunks_mut(16)) {
+            let (valid, packet) = packet(rays);
+            let mut rayhit = RayHit16::new(packet);
+            self.bvh.intersect16(&valid, &mut rayhit);
+            for (lane, hit) in hits.iter_mut().enumerate() {
+                let found = &rayhit.hit;
+                *hit = match found.geometry[lane] {
+                    INVALID_ID => None,
+                    id if id == self.volume => Some(decode_target(found.u[lane].to_bits())),
+                    _ => Some(Target::Polygon(found.prim[lane])),
+                }
+                .map(|target| FlattenedHit { t: rayhit.ray.tfar[lane], target });
+            }
+        }
+    }
+
+    fn occluded_many(&self, rays: &[FlattenedRay], blocked: &mut [bool]) {
+        assert_eq!(rays.len(), blocked.len(), "a place for every ray's answer");
+        for (rays, blocked) in rays.chunks(16).zip(blocked.chunks_mut(16)) {
+            let (valid, mut packet) = packet(rays);
+            self.bvh.occluded16(&valid, &mut packet);
+            for (lane, blocked) in blocked.iter_mut().enumerate() {
+                *blocked = packet.tfar[lane] == f32::NEG_INFINITY;
+            }
+        }
+    }
+}
+
+/// Up to sixteen rays as a packet; the lanes that are left over repeat the first and take no part.
+#[inline]
+fn packet(rays: &[FlattenedRay]) -> (Valid16, Ray16) {
+    let packet = Ray16::new(&std::array::from_fn(|i| embree_ray(rays.get(i).unwrap_or(&rays[0]))));
+    let valid = if rays.len() == 16 { Valid16::ALL } else { Valid16::from_bits((1 << rays.len()) - 1) };
+    (valid, packet)
 }
 
 /// A volume hit's target in the 32 bits of `hit.u`: side, and face + 1 of a cap.
@@ -109,5 +149,25 @@ impl UserGeometry for Graph<'_> {
     #[inline]
     fn occluded(&self, _: u32, ray: &RayView) -> bool {
         self.pyramid.occluded(self.field, &flattened_ray(ray), f64::from(ray.tfar))
+    }
+
+    #[inline]
+    fn intersect16(&self, _: u32, active: u16, rays: &Ray16, hits: &mut UserHits16) -> u16 {
+        let mut found = [None; 16];
+        self.pyramid.intersect16(self.field, active, |lane| flattened_ray(&rays.lane(lane)), &mut found);
+        let mut bits = 0;
+        for (lane, hit) in found.iter().enumerate() {
+            if let Some(hit) = hit {
+                hits.t[lane] = hit.t;
+                hits.u[lane] = f32::from_bits(encode_target(hit.target));
+                bits |= 1 << lane;
+            }
+        }
+        bits
+    }
+
+    #[inline]
+    fn occluded16(&self, _: u32, active: u16, rays: &Ray16) -> u16 {
+        self.pyramid.occluded16(self.field, active, |lane| flattened_ray(&rays.lane(lane)))
     }
 }

@@ -268,33 +268,6 @@ impl BakedVolume {
     /// would give it; `None` if the side is not stored.
     pub fn radiance(&self, side: Side, p: DVec3) -> Option<DVec3> {
         let (_, grid) = self.sides.iter().find(|(s, _)| *s == side)?;
-        Some(interpolate(self.lattice(), grid, p))
+        Some(grid.interpolate(self.lattice(), p))
     }
-}
-
-/// Trilinear interpolation of a grid's radiance at index coordinates `p` of its lattice, over points that hold something.
-pub fn interpolate(lattice: &Lattice, grid: &IlluminationGrid, p: DVec3) -> DVec3 {
-    let far = lattice.far();
-    let p = p.clamp(DVec3::ZERO, far);
-    let base = p.floor().min(far - 1.0);
-    let u = p - base;
-    let cell = [base.x, base.y, base.z].map(|x| {
-        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "inside the lattice")]
-        let i = x as usize;
-        i
-    });
-    let (mut sum, mut weight) = (DVec3::ZERO, 0.0);
-    for corner in 0..8 {
-        let [x, y, z] = [corner & 1, corner >> 1 & 1, corner >> 2];
-        let o = lattice.offset(cell[0] + x, cell[1] + y, cell[2] + z);
-        if grid.mask[o] == Mask::Empty {
-            continue;
-        }
-        let w = (if x == 1 { u.x } else { 1.0 - u.x })
-            * (if y == 1 { u.y } else { 1.0 - u.y })
-            * (if z == 1 { u.z } else { 1.0 - u.z });
-        sum += w * DVec3::from_array(grid.radiance[o].map(f64::from));
-        weight += w;
-    }
-    if weight > 0.0 { sum / weight } else { DVec3::ZERO }
 }

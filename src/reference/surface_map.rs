@@ -185,7 +185,7 @@ impl SurfaceMap {
             Departure::Surface(Side::Lower) => (&self.sides[0], at.normal.as_vec3()),
             Departure::Surface(Side::Higher) => (&self.sides[1], -at.normal.as_vec3()),
             Departure::Polygon(id) => (&self.walls[id as usize], Vec3::ZERO),
-            Departure::Free => return DVec3::ZERO,
+            Departure::Free | Departure::Cap(..) => return DVec3::ZERO,
         };
         let wall = normal == Vec3::ZERO;
         let k = self.settings.photons;

@@ -72,4 +72,21 @@ mod tests {
         let message = read_obj(&obj).unwrap_err().to_string();
         assert!(message.contains("box.obj") && message.contains("face 1"), "{message}");
     }
+
+    #[test]
+    fn the_shipped_box_is_the_default_one() {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("scenes/cornell-box.obj");
+        let lattice = crate::volume::Lattice::aligned([5; 3], DVec3::ZERO, DVec3::splat(0.25)).unwrap();
+        let built = super::super::cornell_box(&lattice, 0.0).unwrap();
+        let shipped = read_obj(&path).unwrap();
+        assert_eq!(built.len(), shipped.len());
+        for b in &built {
+            let s = shipped.iter().find(|s| s.name == b.name).unwrap_or_else(|| panic!("{} is missing", b.name));
+            assert!((s.normal() - b.normal()).length() < 1e-6 && (s.area() - b.area()).abs() < 1e-6, "{}", b.name);
+            assert!((s.albedo - b.albedo).length() < 1e-6 && (s.emission - b.emission).length() < 1e-6, "{}", b.name);
+            for v in b.vertices() {
+                assert!(s.vertices().iter().any(|w| (*w - *v).length() < 1e-6), "{}: {v}", b.name);
+            }
+        }
+    }
 }

@@ -1,0 +1,165 @@
+//! BB09's engine: photons, a radiance cache, samples by exact rays, interpolation.
+
+use super::{BakeSettings, Interpolation, Lit, PhotonCounts, StrategyName};
+use crate::embree::{Device, GraphTracer};
+use crate::error::{Error, Result};
+use crate::fitted_grid::fit;
+use crate::illumination_grid::{IlluminationGrid, shepard};
+use crate::mask::{Mask, stand_ins};
+use crate::photon::{PhotonSettings, trace_photons};
+use crate::photon_map::PhotonMap;
+use crate::progress::Progress;
+use crate::radiance::{Indirect, RadianceSample, sample_radiance};
+use crate::radiance_cache::{CacheSettings, RadianceCache};
+use crate::sampling::{Strategy, positions};
+use crate::scene::Scene;
+use crate::volume::Lattice;
+use glam::Vec3;
+use std::time::Instant;
+
+pub(super) fn light(
+    scene: &Scene,
+    settings: &BakeSettings,
+    lattice: &Lattice,
+    masks: &[Mask],
+    device: &Device,
+    progress: Progress,
+) -> Result<Lit> {
+    let mut lit = Lit::default();
+    let begun = Instant::now();
+    let tracer = GraphTracer::new(device, scene)?;
+    lit.seconds.build = begun.elapsed().as_secs_f64();
+
+    let stage = progress.stage("photons", settings.photons);
+    let photon_settings = PhotonSettings {
+        count: settings.photons,
+        max_bounces: settings.bounces,
+        seed: settings.seed,
+        fixed_isovalue: None,
+    };
+    let photons = trace_photons(scene, &tracer, &photon_settings, &|n| stage.tick(n));
+    lit.seconds.photons = stage.end()?;
+    lit.rays = photons.rays;
+    lit.photons = PhotonCounts {
+        emitted: photons.emitted,
+        stored: photons.stored(),
+        without_gradient: photons.flat_gradient,
+        energy_imbalance: photons.energy.iter().map(|e| e.imbalance()).fold(0.0, f64::max),
+    };
+
+    let stage = progress.stage("cache", RadianceCache::work(scene));
+    let cache_settings = CacheSettings {
+        node_shadow_rays: settings.cache_shadow_rays,
+        flat_shadow_rays: settings.wall_shadow_rays,
+        flat_resolution: settings.wall_resolution,
+        isovalue_resolution: settings.wall_isovalues,
+        seed: settings.seed,
+    };
+    let estimate = settings.estimate();
+    let gather = settings.gather_rays > 0;
+    let cache = RadianceCache::new(scene, &tracer, &photons, estimate, &cache_settings, gather, &|n| stage.tick(n));
+    lit.seconds.cache = stage.end()?;
+    lit.rays += cache.rays;
+
+    for side in scene.surface.stored_sides() {
+        let map;
+        let indirect = if gather {
+            Indirect::Gather(&cache, settings.gather_rays)
+        } else {
+            map = PhotonMap::new(scene, &photons.surface, side, |p| p.bounces > 0, estimate);
+            Indirect::Map(&map)
+        };
+        let begun = Instant::now();
+        let (at, owners) = place(scene, settings, lattice, masks)?;
+        let stage = progress.stage("samples", at.len() as u64);
+        let (shadow_rays, seed) = (settings.shadow_rays, settings.seed);
+        let sampled = sample_radiance(scene, &tracer, &indirect, &at, side, shadow_rays, seed, &|n| stage.tick(n));
+        stage.end()?;
+        lit.seconds.samples += begun.elapsed().as_secs_f64();
+        lit.rays += sampled.rays;
+        lit.without_gradient += sampled.without_gradient;
+        lit.samples += at.len() as u64 - sampled.without_gradient;
+
+        let passes = 1 + u64::from(settings.interpolation == Interpolation::Fit);
+        let stage = progress.stage("interpolate", passes * lattice.len() as u64);
+        let grid = match owners {
+            Some(owners) => collect(masks, &owners, &sampled.samples),
+            None => {
+                let samples: Vec<RadianceSample> = sampled.samples.into_iter().flatten().collect();
+                let grid = shepard(&scene.field, lattice, masks, &samples, settings.neighbours, &|n| stage.tick(n));
+                match settings.interpolation {
+                    Interpolation::Shepard => grid,
+                    Interpolation::Fit => fit(&scene.field, lattice, &samples, grid, &|n| stage.tick(n)),
+                }
+            }
+        };
+        lit.seconds.interpolate += stage.end()?;
+        lit.sides.push((side, grid));
+    }
+    lit.misses = cache.misses();
+    lit.flats = cache.into_flats();
+    Ok(lit)
+}
+
+/// Sample positions and, for samples at the grid's own points, the point that each belongs to.
+#[allow(clippy::type_complexity, reason = "a pair")]
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "counts")]
+fn place(
+    scene: &Scene,
+    settings: &BakeSettings,
+    lattice: &Lattice,
+    masks: &[Mask],
+) -> Result<(Vec<Vec3>, Option<Vec<usize>>)> {
+    let needed = masks.iter().filter(|&&m| m != Mask::Empty).count();
+    let count = settings.samples.unwrap_or(((needed as f64 * settings.samples_per_point) as u64).max(1000));
+    // BB09's level sets stand at 39.0 + 17.7 k of the bumps' sweep [3.6, 95]: the same fractions of any sweep.
+    let fractions: Vec<f64> =
+        (-2..=3).map(|k| (39.0 + 17.7 * f64::from(k) - 3.6) / 91.4).filter(|s| (0.0..=1.0).contains(s)).collect();
+    let strategy = match settings.strategy {
+        StrategyName::Uniform => Strategy::Uniform,
+        StrategyName::Planes => Strategy::Planes(fractions.len()),
+        StrategyName::LevelSet => Strategy::LevelSets(fractions),
+        StrategyName::Nodes => {
+            let (mut at, mut owners) = (Vec::new(), Vec::new());
+            for o in (0..lattice.len()).filter(|&o| masks[o] != Mask::Empty) {
+                for p in stand_ins(&scene.field, lattice, o, settings.seed).into_iter().flatten() {
+                    at.push(p.as_vec3());
+                    owners.push(o);
+                }
+            }
+            return Ok((at, Some(owners)));
+        }
+    };
+    let at = positions(&scene.field, &strategy, count, settings.seed)?;
+    if at.is_empty() {
+        return Err(Error::Invalid("no sample landed on an isosurface of the sweep; choose other isovalues".into()));
+    }
+    Ok((at, None))
+}
+
+/// The mean of the samples that each grid point owns.
+#[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+pub(super) fn collect(masks: &[Mask], owners: &[usize], samples: &[Option<RadianceSample>]) -> IlluminationGrid {
+    let mut grid = IlluminationGrid {
+        radiance: vec![[0.0; 3]; masks.len()],
+        std_error: vec![0.0; masks.len()],
+        mask: masks.iter().map(|&m| if m == Mask::Empty { m } else { Mask::Filled }).collect(),
+    };
+    let mut i = 0;
+    while i < owners.len() {
+        let owner = owners[i];
+        let (mut sum, mut variance, mut n) = (Vec3::ZERO, 0.0, 0.0);
+        while i < owners.len() && owners[i] == owner {
+            if let Some(s) = &samples[i] {
+                (sum, variance, n) = (sum + s.radiance, variance + s.variance, n + 1.0);
+            }
+            i += 1;
+        }
+        if n > 0.0 {
+            grid.radiance[owner] = (sum / n).to_array();
+            grid.std_error[owner] = variance.sqrt() / n;
+            grid.mask[owner] = masks[owner];
+        }
+    }
+    grid
+}

@@ -1,0 +1,298 @@
+//! What a user may set about a bake, and the presets.
+
+use crate::error::{Error, Result};
+use crate::illumination_grid::GridSize;
+use crate::photon_map::{EstimateSettings, Normalisation};
+use crate::sweep::SweepSettings;
+use serde::{Deserialize, Serialize};
+
+/// How much work a bake is worth.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum Preset {
+    /// Seconds: a first look.
+    Preview,
+    /// Minutes: fit to publish.
+    #[default]
+    Standard,
+    /// As long as it takes.
+    Reference,
+}
+
+/// How light is computed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum Engine {
+    /// Line sweeps: every grid point and every isovalue at once.
+    Sweep,
+    /// BB09's photons and final gather, by exact rays.
+    #[default]
+    Photon,
+}
+
+/// The placement of samples, by name.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum StrategyName {
+    /// Uniform over the volume.
+    #[default]
+    Uniform,
+    /// On level sets 17.7 apart (in units of a sweep of 91.4), as BB09's strategy 1.
+    LevelSet,
+    /// On as many oblique parallel planes, as BB09's strategy 2.
+    Planes,
+    /// At the grid's points, without interpolation.
+    Nodes,
+}
+
+/// How samples become grid values.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum Interpolation {
+    /// Modified Shepard: the nearest samples blended, as BB09.
+    Shepard,
+    /// Least squares: the grid whose interpolation on isosurfaces is nearest to the samples.
+    #[default]
+    Fit,
+}
+
+/// What a user may set about a bake, in a scene file's `[bake]` table or by flags of the same names. Unset values come
+/// from the preset.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, clap::Args)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+pub struct BakeOptions {
+    /// Amount of work: preview (seconds), standard (minutes) or reference
+    #[arg(long)]
+    pub preset: Option<Preset>,
+    /// How light is computed
+    #[arg(long)]
+    pub engine: Option<Engine>,
+    /// Sweep engine: directions per pass and replicate (a power of two)
+    #[arg(long, value_name = "N")]
+    pub directions: Option<usize>,
+    /// Sweep engine: points per luminaire and replicate (a power of two)
+    #[arg(long, value_name = "N")]
+    pub light_points: Option<usize>,
+    /// Photons to emit
+    #[arg(long, value_name = "N")]
+    pub photons: Option<u64>,
+    /// Reflections after which a photon is cut off (default: Russian roulette only)
+    #[arg(long, value_name = "N")]
+    pub bounces: Option<u16>,
+    /// Photons per irradiance estimate (k nearest)
+    #[arg(long, value_name = "K")]
+    pub photons_per_estimate: Option<usize>,
+    /// Largest isovalue difference of a photon to its estimate, as a fraction of the sweep
+    #[arg(long, value_name = "TAU")]
+    pub tau: Option<f64>,
+    /// Radiance samples per side
+    #[arg(long, value_name = "N")]
+    pub samples: Option<u64>,
+    /// Where samples are placed
+    #[arg(long)]
+    pub strategy: Option<StrategyName>,
+    /// Shadow rays per sample and luminaire
+    #[arg(long, value_name = "N")]
+    pub shadow_rays: Option<u32>,
+    /// Final gather rays per sample; 0 takes indirect light straight from the photon map (BB09's mode)
+    #[arg(long = "gather", value_name = "M")]
+    #[serde(rename = "gather")]
+    pub gather_rays: Option<u32>,
+    /// Nearest samples that Shepard interpolation blends
+    #[arg(long, value_name = "K")]
+    pub neighbours: Option<usize>,
+    /// How samples become grid values
+    #[arg(long)]
+    pub interpolation: Option<Interpolation>,
+    /// Size of the illumination grid: a factor of the volume's such as 2x, or NX,NY,NZ points
+    #[arg(long, value_name = "SIZE")]
+    #[serde(default, with = "grid_text")]
+    pub grid: Option<GridSize>,
+    /// Texels along the longer edge of a wall
+    #[arg(long, value_name = "N")]
+    pub wall_resolution: Option<usize>,
+    /// Seed of all random numbers
+    #[arg(long)]
+    pub seed: Option<u64>,
+}
+
+/// `grid` as text in files.
+mod grid_text {
+    use super::GridSize;
+    use serde::{Deserialize, Deserializer, Serializer};
+
+    pub(super) fn serialize<S: Serializer>(grid: &Option<GridSize>, s: S) -> Result<S::Ok, S::Error> {
+        match grid {
+            Some(g) => s.collect_str(g),
+            None => s.serialize_none(),
+        }
+    }
+
+    pub(super) fn deserialize<'de, D: Deserializer<'de>>(d: D) -> Result<Option<GridSize>, D::Error> {
+        String::deserialize(d)?.parse().map(Some).map_err(serde::de::Error::custom)
+    }
+}
+
+impl BakeOptions {
+    /// These options, with gaps filled from `other`.
+    #[must_use]
+    pub fn or(self, other: &Self) -> Self {
+        Self {
+            preset: self.preset.or(other.preset),
+            engine: self.engine.or(other.engine),
+            directions: self.directions.or(other.directions),
+            light_points: self.light_points.or(other.light_points),
+            photons: self.photons.or(other.photons),
+            bounces: self.bounces.or(other.bounces),
+            photons_per_estimate: self.photons_per_estimate.or(other.photons_per_estimate),
+            tau: self.tau.or(other.tau),
+            samples: self.samples.or(other.samples),
+            strategy: self.strategy.or(other.strategy),
+            shadow_rays: self.shadow_rays.or(other.shadow_rays),
+            gather_rays: self.gather_rays.or(other.gather_rays),
+            neighbours: self.neighbours.or(other.neighbours),
+            interpolation: self.interpolation.or(other.interpolation),
+            grid: self.grid.or(other.grid),
+            wall_resolution: self.wall_resolution.or(other.wall_resolution),
+            seed: self.seed.or(other.seed),
+        }
+    }
+}
+
+/// A bake fully decided.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct BakeSettings {
+    /// The preset that the rest started from.
+    pub preset: Preset,
+    /// How light is computed.
+    pub engine: Engine,
+    /// Sweep directions per pass and replicate.
+    pub directions: usize,
+    /// Sweep points per luminaire and replicate.
+    pub light_points: usize,
+    /// Photons to emit.
+    pub photons: u64,
+    /// Reflections after which a photon is cut off.
+    pub bounces: u16,
+    /// Photons per estimate.
+    pub photons_per_estimate: usize,
+    /// Isovalue window of an estimate.
+    pub tau: f64,
+    /// Radiance samples per side; `None`: as many per grid point as the preset says.
+    pub samples: Option<u64>,
+    /// Samples per needed grid point where `samples` is `None`.
+    pub samples_per_point: f64,
+    /// Placement.
+    pub strategy: StrategyName,
+    /// Shadow rays per sample and luminaire.
+    pub shadow_rays: u32,
+    /// Gather rays per sample; 0: from the map.
+    pub gather_rays: u32,
+    /// Shadow rays per cached node and luminaire.
+    pub cache_shadow_rays: u32,
+    /// Samples blended per grid point.
+    pub neighbours: usize,
+    /// How samples become grid values.
+    pub interpolation: Interpolation,
+    /// Grid size, as text.
+    #[serde(serialize_with = "grid_size_text")]
+    pub grid: GridSize,
+    /// Texels along the longer edge of a flat.
+    pub wall_resolution: usize,
+    /// Texels along the isovalue.
+    pub wall_isovalues: usize,
+    /// Shadow rays per texel and luminaire.
+    pub wall_shadow_rays: u32,
+    /// How photon power becomes irradiance.
+    #[serde(skip)]
+    pub normalisation: Normalisation,
+    /// Seed.
+    pub seed: u64,
+}
+
+fn grid_size_text<S: serde::Serializer>(grid: &GridSize, s: S) -> std::result::Result<S::Ok, S::Error> {
+    s.collect_str(grid)
+}
+
+impl BakeSettings {
+    /// The preset with the options that are set.
+    ///
+    /// # Errors
+    /// `Invalid` for values out of range; the message names the option.
+    pub fn new(o: &BakeOptions) -> Result<Self> {
+        let preset = o.preset.unwrap_or_default();
+        // photons, samples per point, shadow, gather, cache shadow, wall texels, wall isovalues, wall shadow
+        let (photons, density, shadow, gather, cache, wall, isovalues, wall_shadow) = match preset {
+            Preset::Preview => (1 << 19, 0.25, 8, 32, 2, 32, 16, 16),
+            Preset::Standard => (1 << 22, 1.0, 16, 64, 4, 64, 32, 32),
+            Preset::Reference => (1 << 24, 4.0, 64, 256, 16, 128, 64, 64),
+        };
+        let (directions, light_points) = match preset {
+            Preset::Preview => (32, 8),
+            Preset::Standard => (128, 32),
+            Preset::Reference => (512, 128),
+        };
+        let settings = Self {
+            preset,
+            engine: o.engine.unwrap_or_default(),
+            directions: o.directions.unwrap_or(directions),
+            light_points: o.light_points.unwrap_or(light_points),
+            photons: o.photons.unwrap_or(photons),
+            bounces: o.bounces.unwrap_or(u16::MAX),
+            photons_per_estimate: o.photons_per_estimate.unwrap_or(64),
+            tau: o.tau.unwrap_or(EstimateSettings::default().tau),
+            samples: o.samples,
+            samples_per_point: density,
+            strategy: o.strategy.unwrap_or_default(),
+            shadow_rays: o.shadow_rays.unwrap_or(shadow),
+            gather_rays: o.gather_rays.unwrap_or(gather),
+            cache_shadow_rays: cache,
+            neighbours: o.neighbours.unwrap_or(8),
+            interpolation: o.interpolation.unwrap_or_default(),
+            grid: o.grid.unwrap_or(GridSize::Factor(1)),
+            wall_resolution: o.wall_resolution.unwrap_or(wall),
+            wall_isovalues: isovalues,
+            wall_shadow_rays: wall_shadow,
+            normalisation: Normalisation::Accepted,
+            seed: o.seed.unwrap_or(1),
+        };
+        let checks = [
+            (
+                "directions",
+                settings.directions.is_power_of_two() && settings.directions >= 8,
+                "a power of two, 8 or more",
+            ),
+            ("light-points", settings.light_points.is_power_of_two(), "a power of two"),
+            ("samples", settings.samples != Some(0), "at least 1"),
+            ("photons-per-estimate", (2..=4096).contains(&settings.photons_per_estimate), "2 to 4096"),
+            ("neighbours", (1..=1024).contains(&settings.neighbours), "1 to 1024"),
+            ("shadow-rays", (1..=1 << 20).contains(&settings.shadow_rays), "1 to 1048576"),
+            ("gather", settings.gather_rays <= 1 << 20, "0 to 1048576"),
+            ("tau", settings.tau > 0.0 && settings.tau.is_finite(), "above 0"),
+            ("wall-resolution", (2..=2048).contains(&settings.wall_resolution), "2 to 2048"),
+        ];
+        match checks.into_iter().find(|(_, ok, _)| !ok) {
+            Some((name, _, range)) => Err(Error::Invalid(format!("{name}: must be {range}"))),
+            None => Ok(settings),
+        }
+    }
+
+    pub(super) fn sweep(&self) -> SweepSettings {
+        SweepSettings {
+            directions: self.directions,
+            light_points: self.light_points,
+            flat_resolution: (self.wall_resolution, self.wall_isovalues),
+            seed: self.seed,
+            ..SweepSettings::default()
+        }
+    }
+
+    pub(super) fn estimate(&self) -> EstimateSettings {
+        EstimateSettings {
+            photons: self.photons_per_estimate,
+            tau: self.tau,
+            normalisation: self.normalisation,
+            ..EstimateSettings::default()
+        }
+    }
+}

@@ -1,0 +1,137 @@
+//! The fast engine: line sweeps light every node; exact rays fill the points beside the sweep's ends.
+
+use super::photon_engine::collect;
+use super::{BakeSettings, Lit};
+use crate::brdf::reflected;
+use crate::embree::{Device, GraphTracer};
+use crate::error::Result;
+use crate::flattened::Side;
+use crate::illumination_grid::IlluminationGrid;
+use crate::mask::{Mask, stand_ins};
+use crate::progress::Progress;
+use crate::radiance::{Indirect, sample_radiance};
+use crate::radiance_cache::RadianceCache;
+use crate::scene::Scene;
+use crate::sweep::{SweptSide, sweep};
+use crate::volume::Lattice;
+use glam::{DVec3, Vec3};
+use rayon::prelude::*;
+use std::time::Instant;
+
+/// Resolution of the progress bar, since a sweep knows only fractions.
+const STEPS: f64 = 1000.0;
+
+pub(super) fn light(
+    scene: &Scene,
+    settings: &BakeSettings,
+    lattice: &Lattice,
+    masks: &[Mask],
+    device: &Device,
+    progress: Progress,
+) -> Result<Lit> {
+    let mut lit = Lit::default();
+    // Sweeps light the lattice they run on: a finer grid is a finer copy of the same field.
+    let fine;
+    let scene = if lattice == scene.lattice() {
+        scene
+    } else {
+        fine = scene.resampled(lattice);
+        &fine
+    };
+    let stage = progress.stage("sweep", STEPS as u64);
+    let done = std::sync::atomic::AtomicU64::new(0);
+    let swept = sweep(scene, &settings.sweep(), &|fraction| {
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 … 1000")]
+        let now = (fraction * STEPS) as u64;
+        let before = done.fetch_max(now, std::sync::atomic::Ordering::Relaxed);
+        stage.tick(now.saturating_sub(before))
+    })?;
+    lit.seconds.sweep = stage.end()?;
+    lit.sweep_queries = swept.counts.gather_rays + swept.counts.shadow_rays;
+
+    // What the sweep knows is also what rays from the other points gather.
+    let known: Vec<(Side, Vec<[f32; 3]>)> =
+        swept.sides.iter().map(|s| (s.side, widened(lattice, masks, outgoing(scene, masks, s)))).collect();
+    let nodes =
+        [Side::Lower, Side::Higher].map(|side| known.iter().find(|(s, _)| *s == side).map(|(_, nodes)| nodes.clone()));
+    let cache = RadianceCache::from_parts(nodes, swept.flats);
+
+    let begun = Instant::now();
+    let tracer = GraphTracer::new(device, scene)?;
+    lit.seconds.build = begun.elapsed().as_secs_f64();
+    let begun = Instant::now();
+    let (mut at, mut owners): (Vec<Vec3>, Vec<usize>) = (Vec::new(), Vec::new());
+    for o in (0..lattice.len()).filter(|&o| masks[o] == Mask::Filled) {
+        for p in stand_ins(&scene.field, lattice, o, settings.seed).into_iter().flatten() {
+            at.push(p.as_vec3());
+            owners.push(o);
+        }
+    }
+    for (s, (side, _)) in swept.sides.iter().zip(&known) {
+        let stage = progress.stage("samples", at.len() as u64);
+        let indirect = Indirect::Gather(&cache, settings.gather_rays.max(1));
+        let (shadow_rays, seed) = (settings.shadow_rays, settings.seed);
+        let sampled = sample_radiance(scene, &tracer, &indirect, &at, *side, shadow_rays, seed, &|n| stage.tick(n));
+        stage.end()?;
+        lit.rays += sampled.rays;
+        lit.samples += at.len() as u64 - sampled.without_gradient;
+        lit.without_gradient += sampled.without_gradient;
+        let mut grid = collect(masks, &owners, &sampled.samples);
+        merge(&mut grid, masks, outgoing(scene, masks, s), &s.std_error);
+        lit.sides.push((*side, grid));
+    }
+    lit.seconds.samples = begun.elapsed().as_secs_f64();
+    lit.misses = cache.misses();
+    lit.flats = cache.into_flats();
+    Ok(lit)
+}
+
+/// Outgoing radiance at valid nodes, NaN elsewhere.
+fn outgoing(scene: &Scene, masks: &[Mask], s: &SweptSide) -> Vec<[f32; 3]> {
+    let vector = |v: [f32; 3]| DVec3::from_array(v.map(f64::from));
+    (0..masks.len())
+        .into_par_iter()
+        .map(|o| {
+            if masks[o] != Mask::Valid {
+                return [f32::NAN; 3];
+            }
+            let e = vector(s.direct[o]) + vector(s.indirect[o]);
+            (reflected(scene.surface.albedo, e) + scene.surface.emission).as_vec3().to_array()
+        })
+        .collect()
+}
+
+/// Unknown nodes beside known ones become their mean, so that lookups in cells at the sweep's ends find something.
+fn widened(lattice: &Lattice, masks: &[Mask], nodes: Vec<[f32; 3]>) -> Vec<[f32; 3]> {
+    let [nx, ny, nz] = lattice.dims();
+    (0..nodes.len())
+        .into_par_iter()
+        .map(|o| {
+            if masks[o] != Mask::Filled {
+                return nodes[o];
+            }
+            let [i, j, k] = lattice.ijk(o);
+            let (mut sum, mut n) = (Vec3::ZERO, 0.0);
+            for z in k.saturating_sub(1)..=(k + 1).min(nz - 1) {
+                for y in j.saturating_sub(1)..=(j + 1).min(ny - 1) {
+                    for x in i.saturating_sub(1)..=(i + 1).min(nx - 1) {
+                        let v = Vec3::from_array(nodes[lattice.offset(x, y, z)]);
+                        if !v.x.is_nan() {
+                            (sum, n) = (sum + v, n + 1.0);
+                        }
+                    }
+                }
+            }
+            if n > 0.0 { (sum / n).to_array() } else { [f32::NAN; 3] }
+        })
+        .collect()
+}
+
+/// Puts what the sweep knows over what rays filled.
+fn merge(grid: &mut IlluminationGrid, masks: &[Mask], swept: Vec<[f32; 3]>, std_error: &[f32]) {
+    for (o, radiance) in swept.into_iter().enumerate().filter(|(o, _)| masks[*o] == Mask::Valid) {
+        grid.radiance[o] = radiance;
+        grid.std_error[o] = std_error.get(o).copied().unwrap_or(0.0);
+        grid.mask[o] = Mask::Valid;
+    }
+}

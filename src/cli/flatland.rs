@@ -1,0 +1,85 @@
+//! `isolume flatland`.
+
+use crate::error::{Error, Result};
+use crate::flatland::{PictureSettings, Solution, SolveSettings, Transport, World, load, write_pictures};
+use crate::progress::Progress;
+use std::path::PathBuf;
+use std::time::Instant;
+
+#[derive(clap::Args, Debug)]
+#[command(after_help = "\
+Writes flattened.png and .exr, waterlines.png and levelsets.svg; with --ordinary also ordinary.png and .exr, and
+both.png with the two side by side; with --paths also paths.png.
+
+Examples:
+  isolume flatland scenes/flatland-bumps2.toml -o out
+  isolume flatland scenes/flatland-bumps2.toml --ordinary --paths 60 -o out")]
+pub(super) struct Flatland {
+    /// Scene file of n = 2 (.toml)
+    scene: PathBuf,
+    /// Folder for the pictures; made if it does not exist
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+    /// Light the graph as an ordinary surface in R³ too, and put both pictures side by side
+    #[arg(long)]
+    ordinary: bool,
+    /// Draw this many photons that leave the luminaire at half the sweep's height
+    #[arg(long, default_value_t = 0, value_name = "N")]
+    paths: u64,
+    /// Pixels across one picture
+    #[arg(long, default_value_t = 640, value_name = "PIXELS")]
+    width: usize,
+    /// Directions per point: noise falls, time rises
+    #[arg(long, default_value_t = 128, value_name = "M")]
+    gather: u32,
+    /// Seed of all random numbers
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+}
+
+impl Flatland {
+    pub(super) fn run(self, progress: Progress) -> Result<()> {
+        if !(16..=8192).contains(&self.width) {
+            return Err(Error::Invalid(format!("--width {}: 16 to 8192 pixels", self.width)));
+        }
+        if !(1..=1 << 16).contains(&self.gather) {
+            return Err(Error::Invalid(format!("--gather {}: 1 to 65536 directions", self.gather)));
+        }
+        let scene = load(&self.scene)?;
+        super::folder(&self.output)?;
+        let device = super::device()?;
+        let begun = Instant::now();
+        let transports: &[Transport] =
+            if self.ordinary { &[Transport::Flattened, Transport::Ordinary] } else { &[Transport::Flattened] };
+        let mut worlds = Vec::new();
+        for &transport in transports {
+            let world = World::new(&device, scene.clone(), transport)?;
+            // A sphere of directions needs more of them, and more of its luminaire, than a circle.
+            let more = if transport == Transport::Ordinary { 2 } else { 1 };
+            let settings = SolveSettings {
+                gather: self.gather * more,
+                shadow: 16 * more * more,
+                seed: self.seed,
+                ..SolveSettings::default()
+            };
+            let solution = Solution::new(&world, &settings)?;
+            if progress == Progress::Shown {
+                eprintln!(
+                    "{transport:?}: {:.1} M rays, {} passes, {:.2} s so far",
+                    solution.rays as f64 / 1e6,
+                    solution.passes,
+                    begun.elapsed().as_secs_f64()
+                );
+            }
+            worlds.push((world, solution));
+        }
+        let settings =
+            PictureSettings { width: self.width, gather: self.gather, paths: self.paths, ..PictureSettings::default() };
+        let names = write_pictures(&self.output, &device, &worlds, &settings)?;
+        if progress == Progress::Shown {
+            let seconds = begun.elapsed().as_secs_f64();
+            eprintln!("{}: {} in {seconds:.2} s", self.output.display(), names.join(", "));
+        }
+        Ok(())
+    }
+}

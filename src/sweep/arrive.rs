@@ -1,0 +1,274 @@
+//! What lines bring to walls and caps: from a wall's point one line sees every isovalue at once, a staircase of the
+//! running maximum of h.
+
+use super::flats::{Arrivals, Ends, Flats, Stop, fill_column};
+use super::gather::{Pass, local_bounds};
+use super::pack::{LANES, OUTSIDE, Pack, Plan};
+use crate::flattened::Side;
+use crate::rng::{Rng, Stage};
+use glam::DVec3;
+
+/// Lines per texel edge that report to walls: more would only cost.
+const LINES_PER_TEXEL: f64 = 2.0;
+
+/// The walls' part of one family of lines.
+pub(super) struct Walls<'a> {
+    plan: &'a Plan,
+    ends: &'a Ends,
+    flats: &'a Flats,
+    /// Rows of lines that meet the box.
+    pub rows: (isize, isize),
+    columns: (isize, isize),
+    /// Every `stride`-th line along u and v, from `phase` on, reports.
+    stride: isize,
+    phase: [isize; 2],
+    weight: f32,
+    capped: bool,
+    /// Whether all isovalues of lines without samples are this side's.
+    primary: bool,
+    /// Whether the box is wider than Ω, so that lines may miss Ω.
+    margin: bool,
+    caps: u32,
+}
+
+impl<'a> Walls<'a> {
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few thousand lines")]
+    pub(super) fn new(
+        pass: &Pass,
+        plan: &'a Plan,
+        ends: &'a Ends,
+        flats: &'a Flats,
+        side: Side,
+        families: usize,
+    ) -> Self {
+        let shear = &plan.shear;
+        let [lo, hi] = local_bounds(pass.scene);
+        let far = pass.scene.lattice().far();
+        let margin = (lo.min(far - hi)).min_element() < -1e-6;
+        let axes = shear.layout.axes;
+        // Lines that meet the box: bounds of p over its corners.
+        let range = |a: usize| {
+            let slope = shear.slope[a];
+            let ends = [lo[axes[2]], hi[axes[2]]].map(|t| slope * t);
+            let (least, most) = (ends[0].min(ends[1]), ends[0].max(ends[1]));
+            let offset = shear.offset[a];
+            ((lo[axes[a]] - most - offset).floor() as isize, (hi[axes[a]] - least - offset).ceil() as isize)
+        };
+        let side_of_texel = flats.textures.iter().flatten().map(|t| t.texel_area.sqrt()).fold(f64::INFINITY, f64::min);
+        let spacing = pass.scene.lattice().spacing().max_element();
+        let stride = (side_of_texel / (LINES_PER_TEXEL * spacing)).floor().clamp(1.0, 8.0) as isize;
+        let mut rng =
+            Rng::stream(shear.offset[0].to_bits() ^ shear.offset[1].to_bits().rotate_left(32), Stage::Sweep, 0);
+        let phase = [0, 1].map(|_| (rng.unit() * stride as f64) as isize);
+        let none = flats.none();
+        Self {
+            plan,
+            ends,
+            flats,
+            rows: if margin && !none { range(1) } else { (isize::MAX, isize::MIN) },
+            columns: range(0),
+            stride: if none { 0 } else { stride },
+            phase,
+            weight: (4.0 * std::f64::consts::PI / (2 * families) as f64 * shear.area * (stride * stride) as f64) as f32,
+            capped: super::flats::capped(pass.scene),
+            primary: side == pass.primary,
+            margin,
+            caps: pass.scene.polygons().len() as u32,
+        }
+    }
+
+    fn reports(&self, p: isize, q: isize) -> bool {
+        self.stride > 0
+            && (p - self.phase[0]).rem_euclid(self.stride) == 0
+            && (q - self.phase[1]).rem_euclid(self.stride) == 0
+    }
+
+    /// Reports of lines (first + lane, q), whose samples are in `pack`.
+    pub(super) fn through(&self, pack: &Pack, first: isize, q: isize, out: &mut Arrivals) {
+        for lane in 0..LANES {
+            let p = first + lane as isize;
+            if self.reports(p, q) {
+                let span = self.plan.span(p as f64, q as f64);
+                if span[0] <= span[1] && pack.h.iter().any(|h| h[lane] != OUTSIDE) {
+                    self.line(Some((pack, lane, span)), p, q, out);
+                    if self.capped && self.plan.sign > 0.0 {
+                        self.caps(pack, lane, span, (p as f64, q as f64), out);
+                    }
+                } else if self.margin {
+                    self.line(None, p, q, out);
+                }
+            }
+        }
+    }
+
+    /// Reports of the other lines of row q: those that miss Ω.
+    pub(super) fn past(&self, q: isize, within: bool, out: &mut Arrivals) {
+        if !self.margin {
+            return;
+        }
+        let packs = self.plan.first[0]..self.plan.first[0] + self.plan.width as isize;
+        for p in self.columns.0..=self.columns.1 {
+            if self.reports(p, q) && !(within && packs.contains(&p)) {
+                self.line(None, p, q, out);
+            }
+        }
+    }
+
+    /// What every front on one line sees along it.
+    fn line(&self, samples: Option<(&Pack, usize, [f64; 2])>, p: isize, q: isize, out: &mut Arrivals) {
+        let nc = self.flats.isovalues;
+        let mut values = vec![0f32; 3 * nc];
+        let (pf, qf) = (p as f64, q as f64);
+        self.ends.fronts(pf, qf, |wall, forward| {
+            let Some(flat) = wall.flat else { return };
+            let next = self.ends.stop(pf, qf, wall.tau, forward, Some(flat));
+            fill_column(self.flats, next, &mut values);
+            let reach = next.map_or(if forward { f64::INFINITY } else { f64::NEG_INFINITY }, |s| s.tau);
+            let range = match samples {
+                Some((pack, lane, span)) if self.meets(wall.tau, reach, span) => {
+                    self.staircase(pack, lane, span, (wall.tau, reach), (pf, qf), &mut values)
+                }
+                _ if self.primary => (0, nc),
+                _ => (0, 0),
+            };
+            if range.0 < range.1 {
+                out.push(flat, wall.uv, self.weight, range, &values);
+            }
+        });
+    }
+
+    fn meets(&self, from: f64, to: f64, span: [f64; 2]) -> bool {
+        from.min(to) < span[1] + 1e-6 && from.max(to) > span[0] - 1e-6
+    }
+
+    /// Replaces in `values` (what the far end shows) the isovalues that meet a level set first, seen from τ = `from`.
+    /// Returns the isovalues that lie on this side there.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to rows and texels")]
+    fn staircase(
+        &self,
+        pack: &Pack,
+        lane: usize,
+        span: [f64; 2],
+        (from, to): (f64, f64),
+        pq: (f64, f64),
+        values: &mut [f32],
+    ) -> (usize, usize) {
+        let nc = self.flats.isovalues;
+        let rows = pack.h.len();
+        let forward = to > from;
+        // Rows between the two ends: slice k is row k + 1; the entry and exit rows belong to ends outside Ω.
+        let bound = |tau: f64, up: bool| -> usize {
+            if tau <= span[0] + 1e-6 {
+                0
+            } else if tau >= span[1] - 1e-6 {
+                rows
+            } else {
+                (if up { tau.floor() + 2.0 } else { tau.ceil() + 1.0 }) as usize
+            }
+        };
+        let (lo, hi) =
+            if forward { (bound(from, true), bound(to, false)) } else { (bound(to, true), bound(from, false)) };
+        let higher = self.plan.sign < 0.0;
+        // Isovalue number t in ascending order of sign · c.
+        let ordinal = |t: usize| if higher { nc - 1 - t } else { t };
+        let height = |t: usize| (t as f32 + 0.5) / nc as f32 - if higher { 1.0 } else { 0.0 };
+        let mut t = 0;
+        let mut first = None;
+        let mut before: Option<(usize, f32)> = None;
+        for step in 0..hi.saturating_sub(lo) {
+            let row = if forward { lo + step } else { hi - 1 - step };
+            let h = pack.h[row][lane];
+            if h == OUTSIDE || h.is_nan() {
+                continue;
+            }
+            match before {
+                None => {
+                    while t < nc && height(t) <= h {
+                        t += 1;
+                    }
+                    first = Some(t);
+                    if self.capped {
+                        self.cap(span[usize::from(!forward)], pq, t, values);
+                    }
+                }
+                Some((old, h_old)) => {
+                    while t < nc && height(t) <= h {
+                        let f = ((height(t) - h_old) / (h - h_old)).clamp(0.0, 1.0);
+                        for c in 0..3 {
+                            let b = &pack.b[c];
+                            values[c * nc + ordinal(t)] = (1.0 - f) * b[old][lane] + f * b[row][lane];
+                        }
+                        t += 1;
+                    }
+                }
+            }
+            before = Some((row, h));
+            if t == nc {
+                break;
+            }
+        }
+        let first = first.unwrap_or(0);
+        if self.capped {
+            return if higher { (0, 0) } else { (0, nc) };
+        }
+        if higher { (0, nc - first) } else { (first, nc) }
+    }
+
+    /// The first `count` isovalues meet the cap where the line crosses Ω's face at `tau`.
+    fn cap(&self, tau: f64, pq: (f64, f64), count: usize, values: &mut [f32]) {
+        if count == 0 || self.plan.sign < 0.0 {
+            return;
+        }
+        let stop = self.cap_stop(tau, pq);
+        let nc = self.flats.isovalues;
+        let mut column = vec![0f32; 3 * nc];
+        fill_column(self.flats, Some(stop), &mut column);
+        for c in 0..3 {
+            values[c * nc..][..count].copy_from_slice(&column[c * nc..][..count]);
+        }
+    }
+
+    /// The cap at τ of a line, where it crosses a face of Ω.
+    #[allow(clippy::cast_possible_truncation, reason = "texture coordinates")]
+    fn cap_stop(&self, tau: f64, (p, q): (f64, f64)) -> Stop {
+        let shear = &self.plan.shear;
+        let mut local = DVec3::ZERO;
+        let [u, v, a] = shear.layout.axes;
+        local[u] = p + shear.offset[0] + shear.slope[0] * tau;
+        local[v] = q + shear.offset[1] + shear.slope[1] * tau;
+        local[a] = tau;
+        let mut far = DVec3::ZERO;
+        for (x, n) in shear.layout.axes.into_iter().zip(shear.layout.dims) {
+            far[x] = n as f64 - 1.0;
+        }
+        // The face nearest to the point.
+        let face = (0..6)
+            .min_by(|&f, &g| {
+                let gap = |f: usize| if f >= 3 { (local[f - 3] - far[f - 3]).abs() } else { local[f].abs() };
+                gap(f).total_cmp(&gap(g))
+            })
+            .expect("six faces");
+        let x = face % 3;
+        let uv = [(x + 1) % 3, (x + 2) % 3].map(|b| (local[b] / far[b]).clamp(0.0, 1.0) as f32);
+        #[allow(clippy::cast_possible_truncation, reason = "six caps")]
+        Stop { tau, flat: Some(self.caps + face as u32), uv }
+    }
+
+    /// What the caps at a line's entry and exit see outside Ω.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the isovalues")]
+    fn caps(&self, pack: &Pack, lane: usize, span: [f64; 2], pq: (f64, f64), out: &mut Arrivals) {
+        let nc = self.flats.isovalues;
+        let mut values = vec![0f32; 3 * nc];
+        let samples = || pack.h.iter().map(|h| h[lane]).filter(|&h| h != OUTSIDE && !h.is_nan());
+        for (end, h) in [samples().next(), samples().next_back()].into_iter().enumerate() {
+            let Some(h) = h else { continue };
+            let covered = ((h * nc as f32 + 0.5).floor().max(0.0) as usize).min(nc);
+            if covered > 0 {
+                let next = self.ends.stop(pq.0, pq.1, span[end], end == 1, None);
+                fill_column(self.flats, next, &mut values);
+                let cap = self.cap_stop(span[end], pq);
+                out.push(cap.flat.expect("a cap"), cap.uv, self.weight, (0, covered), &values);
+            }
+        }
+    }
+}

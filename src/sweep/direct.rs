@@ -1,0 +1,365 @@
+//! Direct light: the running maximum of h along fans of lines from low-discrepancy points of the luminaires. One line
+//! answers for every isovalue it meets: a sample is lit on its own level set iff it exceeds everything before it.
+
+use super::directions::Layout;
+use super::flats::{Flats, capped};
+use super::grid::{Geometry, Planes};
+use crate::flat;
+use crate::flattened::{Departure, Side};
+use crate::luminaire::{point_term, unoccluded};
+use crate::polygon::{LocalPolygon, Polygon};
+use crate::rng::{Rng, Sobol, Stage};
+use crate::scene::Scene;
+use glam::DVec3;
+use rayon::prelude::*;
+
+/// A sample of a fan that lies in Ω; what it sees of its source on either side.
+const SAMPLED: u8 = 1;
+const LOWER: u8 = 2;
+const HIGHER: u8 = 4;
+
+/// The lines from a point through the unit lattice of the farthest slice of one of the six pyramids around it.
+struct Fan {
+    layout: Layout,
+    /// The source in (u, v, slice).
+    source: [f64; 3],
+    /// Slices from the source to the lattice's plane, with sign.
+    depth: f64,
+    /// First slice and their number, away from the source.
+    slices: (usize, usize),
+    /// First line and their number along u and v, numbered by where they meet the lattice's plane.
+    first: [isize; 2],
+    count: [usize; 2],
+    /// [row][slice][line].
+    seen: Vec<u8>,
+}
+
+impl Fan {
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
+    fn new(geometry: &Geometry, y: DVec3, start: f32, axis: usize, up: bool) -> Option<Self> {
+        let layout = Layout::new(geometry.dims, axis);
+        let [u, v, a] = layout.axes;
+        let source = [y[u], y[v], y[a]];
+        let last = layout.dims[2] as f64 - 1.0;
+        let plane = if up { last } else { 0.0 };
+        let depth = plane - source[2];
+        if if up { depth <= 1e-9 } else { depth >= -1e-9 } {
+            return None;
+        }
+        // The nearest slice strictly beyond the source.
+        let k0 = if up { (source[2] + 1e-9).ceil().max(0.0) } else { (source[2] - 1e-9).floor().min(last) };
+        let slices = (k0 as usize, (plane - k0).abs() as usize + 1);
+        let first = [0, 1].map(|x| (source[x] - depth.abs()).floor() as isize);
+        let count = [0, 1].map(|x| ((source[x] + depth.abs()).ceil() as isize - first[x] + 1).unsigned_abs());
+        let seen = vec![0u8; count[0] * count[1] * slices.1];
+        let mut fan = Self { layout, source, depth, slices, first, count, seen };
+        let mut seen = std::mem::take(&mut fan.seen);
+        let h = geometry.h(&layout);
+        seen.par_chunks_mut(count[0] * slices.1).enumerate().for_each_init(
+            || (Vec::new(), Vec::new()),
+            |(most, least), (row, out)| fan.march(h, start, row, most, least, out),
+        );
+        fan.seen = seen;
+        Some(fan)
+    }
+
+    #[inline]
+    fn slice(&self, step: usize) -> usize {
+        if self.depth > 0.0 { self.slices.0 + step } else { self.slices.0 - step }
+    }
+
+    /// One row of lines, all slices.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
+    fn march(&self, h: &[f32], start: f32, row: usize, most: &mut Vec<f32>, least: &mut Vec<f32>, out: &mut [u8]) {
+        let [nu, nv, _] = self.layout.dims;
+        let [sv, sa] = self.layout.stride;
+        let np = self.count[0];
+        most.clear();
+        least.clear();
+        most.resize(np, start);
+        least.resize(np, if start.is_finite() { start } else { f32::INFINITY });
+        let q = (self.first[1] + row as isize) as f64;
+        for (step, out) in out.chunks_exact_mut(np).enumerate() {
+            let k = self.slice(step);
+            let ratio = (k as f64 - self.source[2]) / self.depth;
+            let v = self.source[1] + (q - self.source[1]) * ratio;
+            if !(v >= 0.0 && v <= (nv - 1) as f64) {
+                continue;
+            }
+            let j = (v as usize).min(nv - 2);
+            let fv = (v - j as f64) as f32;
+            // Lines with u in Ω.
+            let p = |u: f64| self.source[0] + (u - self.source[0]) / ratio - self.first[0] as f64;
+            let lo = p(0.0).ceil().max(0.0) as usize;
+            let hi = (p((nu - 1) as f64).floor().min(np as f64 - 1.0) + 1.0).max(0.0) as usize;
+            let (near, far) = (&h[k * sa + j * sv..][..nu], &h[k * sa + (j + 1) * sv..][..nu]);
+            let u0 = (self.source[0] + (self.first[0] as f64 - self.source[0]) * ratio) as f32;
+            let du = ratio as f32;
+            for p in lo..hi {
+                let u = (u0 + p as f32 * du).max(0.0);
+                let i = (u as usize).min(nu - 2);
+                let fu = u - i as f32;
+                let a = near[i] + fu * (near[i + 1] - near[i]);
+                let b = far[i] + fu * (far[i + 1] - far[i]);
+                let x = a + fv * (b - a);
+                let lit = u8::from(x > most[p]) * LOWER + u8::from(x <= least[p]) * HIGHER + SAMPLED;
+                out[p] = if x.is_nan() { 0 } else { lit };
+                // f32::max and min pass over NaN.
+                most[p] = most[p].max(x);
+                least[p] = least[p].min(x);
+            }
+        }
+    }
+
+    /// The share of the four lines around local `x` that see the source at their own isovalue there: lower, higher side.
+    #[inline]
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the fan")]
+    fn visibility(&self, x: [f64; 3]) -> Option<[f32; 2]> {
+        let [u, v, a] = self.layout.axes;
+        let inverse = self.depth / (x[a] - self.source[2]);
+        let p = self.source[0] + (x[u] - self.source[0]) * inverse - self.first[0] as f64;
+        let q = self.source[1] + (x[v] - self.source[1]) * inverse - self.first[1] as f64;
+        let step = (x[a] as usize).abs_diff(self.slices.0);
+        let (i, j) = ((p as usize).min(self.count[0] - 2), (q as usize).min(self.count[1] - 2));
+        let (f, g) = ((p - i as f64) as f32, (q - j as f64) as f32);
+        let at = |dj: usize| &self.seen[((j + dj) * self.slices.1 + step) * self.count[0] + i..][..2];
+        let (near, far) = (at(0), at(1));
+        let mut sum = [0f32; 3];
+        let lines =
+            [(near[0], (1.0 - f) * (1.0 - g)), (near[1], f * (1.0 - g)), (far[0], (1.0 - f) * g), (far[1], f * g)];
+        for (seen, w) in lines {
+            for (s, bit) in sum.iter_mut().zip([SAMPLED, LOWER, HIGHER]) {
+                *s += if seen & bit != 0 { w } else { 0.0 };
+            }
+        }
+        (sum[0] > 0.0).then(|| [sum[1] / sum[0], sum[2] / sum[0]])
+    }
+}
+
+/// Least and greatest h along the segment from local `a` to `b` inside Ω, at the slices of its dominant axis and its
+/// ends; (∞, −∞) if it misses Ω.
+#[allow(clippy::cast_possible_truncation, reason = "values are f32")]
+fn extrema(scene: &Scene, a: DVec3, b: DVec3) -> (f32, f32) {
+    let far = scene.lattice().far();
+    let d = b - a;
+    let (mut from, mut to) = (0f64, 1f64);
+    for x in 0..3 {
+        if d[x] == 0.0 {
+            if a[x] < 0.0 || a[x] > far[x] {
+                return (f32::INFINITY, f32::NEG_INFINITY);
+            }
+            continue;
+        }
+        let (t0, t1) = (-a[x] / d[x], (far[x] - a[x]) / d[x]);
+        from = from.max(t0.min(t1));
+        to = to.min(t0.max(t1));
+    }
+    if !(from <= to) {
+        return (f32::INFINITY, f32::NEG_INFINITY);
+    }
+    let size = d.abs();
+    let axis = if size.z >= size.x && size.z >= size.y { 2 } else { usize::from(size.y >= size.x) };
+    let mut range = (f32::INFINITY, f32::NEG_INFINITY);
+    let mut take = |t: f64| {
+        let h = scene.field.value(a + t * d) as f32;
+        range = (range.0.min(h), range.1.max(h));
+    };
+    take(from);
+    take(to);
+    if d[axis] != 0.0 {
+        let (p, q) = (a[axis] + from * d[axis], a[axis] + to * d[axis]);
+        let (mut k, end) = (p.min(q).ceil(), p.max(q));
+        while k <= end {
+            take(((k - a[axis]) / d[axis]).clamp(from, to));
+            k += 1.0;
+        }
+    }
+    range
+}
+
+/// What stands between a luminaire and its receivers.
+struct Blockers {
+    polygons: Vec<(u32, LocalPolygon)>,
+}
+
+impl Blockers {
+    /// Polygons that can hide luminaire `light` from a point of `receivers`: all but those that everything is in front of.
+    fn new(scene: &Scene, light: u32, receivers: &[DVec3]) -> Self {
+        let source = &scene.polygons()[light as usize];
+        let polygons = scene.polygons().iter().enumerate().filter_map(|(i, p)| {
+            let i = u32::try_from(i).expect("scenes hold fewer than 2¹⁶ polygons");
+            let slack = 1e-6 * p.area().sqrt();
+            let ahead = |x: &DVec3| (*x - p.vertices()[0]).dot(p.normal()) >= -slack;
+            let all = source.vertices().iter().chain(receivers).all(ahead);
+            (i != light && !all).then(|| (i, LocalPolygon::new(p, scene.lattice())))
+        });
+        Self { polygons: polygons.collect() }
+    }
+
+    fn block(&self, light: u32, receiver: Option<u32>, y: DVec3, x: DVec3) -> bool {
+        self.polygons.iter().any(|(i, p)| {
+            receiver != Some(*i)
+                && p.intersect(*i, (Departure::Polygon(light), receiver), y, x - y, 1.0 - 1e-9).is_some()
+        })
+    }
+}
+
+/// A luminaire's points, low-discrepancy over its area.
+fn points(light: &Polygon, seed: u64, index: u64, number: u32, count: usize) -> Vec<DVec3> {
+    let set = Sobol::set(seed, Stage::Sweep, index << 32 | 1 << 31 | u64::from(number));
+    #[allow(clippy::cast_possible_truncation, reason = "a few thousand points")]
+    (0..count as u32).map(|i| light.sample(set.point2(i, 0))).collect()
+}
+
+/// Direct irradiance of every node, one set of planes per side in `sides`, and of the flats. `index` tells replicates
+/// apart. `tick` is asked before every point; false stops.
+#[allow(clippy::cast_possible_truncation, reason = "irradiance is f32")]
+pub(super) fn direct(
+    scene: &Scene,
+    geometry: &Geometry,
+    flats: &mut Flats,
+    sides: &[Side],
+    (seed, index, count): (u64, u64, usize),
+    tick: &mut dyn FnMut() -> bool,
+) -> (Vec<Planes>, bool) {
+    let n = geometry.h.len();
+    let lattice = scene.lattice();
+    let mut planes: Vec<Planes> = sides.iter().map(|_| super::grid::black(n)).collect();
+    flats.textures.iter_mut().flatten().for_each(|t| t.direct.fill(0.0));
+    let [nx, ny, _] = geometry.dims;
+    let corners: Vec<DVec3> = (0..8)
+        .map(|c| lattice.to_world(lattice.far() * DVec3::from_array([c & 1, c >> 1 & 1, c >> 2].map(f64::from))))
+        .collect();
+    for &number in scene.luminaires() {
+        let light = &scene.polygons()[number as usize];
+        let points = points(light, seed, index, number, count);
+        let blockers = Blockers::new(scene, number, &corners);
+        // Per side Σ V g and Σ g of every node.
+        let mut sums: Vec<[f32; 4]> = vec![[0.0; 4]; n];
+        for &world in &points {
+            if !tick() {
+                return (planes, false);
+            }
+            let y = lattice.to_index(world);
+            let inside = (0..3).all(|a| y[a] >= 0.0 && y[a] <= lattice.far()[a]);
+            let start = if inside { scene.field.value(y) as f32 } else { f32::NEG_INFINITY };
+            let start = if start.is_nan() { f32::NEG_INFINITY } else { start };
+            let fans: [Option<Fan>; 6] = std::array::from_fn(|f| Fan::new(geometry, y, start, f % 3, f >= 3));
+            sums.par_chunks_mut(nx * ny).enumerate().for_each(|(k, slab)| {
+                for (o, sum) in slab.iter_mut().enumerate() {
+                    let Some(normal) = geometry.normal(k * nx * ny + o) else { continue };
+                    let x = DVec3::new((o % nx) as f64, (o / nx) as f64, k as f64);
+                    let place = lattice.to_world(x);
+                    let d = (x - y).to_array();
+                    let size = d.map(f64::abs);
+                    let axis =
+                        if size[2] >= size[0] && size[2] >= size[1] { 2 } else { usize::from(size[1] >= size[0]) };
+                    let g = [normal, -normal].map(|n| point_term(place, n, world, light.normal()) as f32);
+                    if g == [0.0; 2] {
+                        continue;
+                    }
+                    let Some(fan) = &fans[axis + if d[axis] > 0.0 { 3 } else { 0 }] else { continue };
+                    let Some(v) = fan.visibility(x.to_array()) else { continue };
+                    let open = blockers.polygons.is_empty() || !blockers.block(number, None, y, x);
+                    for s in 0..2 {
+                        sum[s] += if open { g[s] * v[s] } else { 0.0 };
+                        sum[s + 2] += g[s];
+                    }
+                }
+            });
+        }
+        for (side, planes) in sides.iter().zip(&mut planes) {
+            let [r, g, b] = planes;
+            let s = side.index();
+            (r, g, b).into_par_iter().with_min_len(1 << 10).enumerate().for_each(|(at, (r, g, b))| {
+                let sum = sums[at];
+                if sum[s] > 0.0 {
+                    let normal = geometry.normal(at).expect("only nodes with a normal were lit");
+                    let normal = if *side == Side::Lower { normal } else { -normal };
+                    let [i, j, k] = lattice.ijk(at).map(|x| x as f64);
+                    let e = unoccluded(light, lattice.to_world(DVec3::new(i, j, k)), normal);
+                    let e = (light.emission * (e * f64::from(sum[s] / sum[s + 2]))).as_vec3();
+                    (*r, *g, *b) = (*r + e.x, *g + e.y, *b + e.z);
+                }
+            });
+        }
+        walls(scene, flats, sides, number, &points, (seed, index));
+    }
+    (planes, true)
+}
+
+/// Direct light of one luminaire on all flats: every texel looks from a point of its own along the segment to each
+/// luminaire point; it is lit at the isovalues above the greatest h there (and, inside solids, up to the least).
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the isovalues")]
+fn walls(scene: &Scene, flats: &mut Flats, sides: &[Side], number: u32, points: &[DVec3], key: (u64, u64)) {
+    let lattice = scene.lattice();
+    let light = &scene.polygons()[number as usize];
+    let nc = flats.isovalues;
+    let caps = scene.polygons().len();
+    let [lower, higher] = [Side::Lower, Side::Higher].map(|s| sides.contains(&s));
+    let higher = higher && !capped(scene);
+    let far = lattice.far();
+    for (id, texture) in flats.textures.iter_mut().enumerate() {
+        let Some(texture) = texture else { continue };
+        let flat = flat::flat(scene, id).expect("textured flats exist");
+        let receiver = (id < caps).then(|| u32::try_from(id).expect("fewer than 2¹⁶ polygons"));
+        let corners: Vec<DVec3> = [[0., 0.], [1., 0.], [0., 1.], [1., 1.]].map(|uv| flat.at(uv)).to_vec();
+        let blockers = Blockers::new(scene, number, &corners);
+        let [nu, nv, _] = texture.dims;
+        texture.direct.par_chunks_mut(3 * nc).enumerate().for_each(|(texel, out)| {
+            let (i, j) = (texel % nu, texel / nu);
+            let place = |a: f64, b: f64| flat.at([(i as f64 + a) / nu as f64, (j as f64 + b) / nv as f64]);
+            let e = unoccluded(light, place(0.5, 0.5), flat.normal);
+            if e == 0.0 {
+                return;
+            }
+            let stream = (key.1 << 32 | u64::from(number)) ^ (id as u64) << 48 ^ (texel as u64) << 16;
+            let mut rng = Rng::stream(key.0, Stage::Sweep, stream ^ 1 << 63);
+            // Number of isovalue texels at or below h.
+            let below = |h: f32| ((h * nc as f32 + 0.5).floor().max(0.0) as usize).min(nc);
+            let (mut lit, mut all) = (vec![0f64; nc], vec![0f64; nc]);
+            for &y in points {
+                let [a, b] = rng.unit2();
+                let x = place(a, b);
+                let g = point_term(x, flat.normal, y, light.normal());
+                if g == 0.0 {
+                    continue;
+                }
+                let (lx, ly) = (lattice.to_index(x), lattice.to_index(y));
+                let within = (0..3).all(|a| lx[a] >= -1e-6 && lx[a] <= far[a] + 1e-6);
+                let here = if within && id < caps && !capped(scene) { below(scene.field.value(lx) as f32) } else { 0 };
+                if lower {
+                    all[here..].iter_mut().for_each(|s| *s += g);
+                }
+                if higher {
+                    all[..here].iter_mut().for_each(|s| *s += g);
+                }
+                if blockers.block(number, receiver, ly, lx) {
+                    continue;
+                }
+                if id >= caps {
+                    lit.iter_mut().for_each(|s| *s += g);
+                    continue;
+                }
+                let (least, most) = extrema(scene, ly, lx);
+                let open = below(most).max(here);
+                if lower {
+                    lit[open..].iter_mut().for_each(|s| *s += g);
+                }
+                if higher {
+                    lit[..below(least).min(open)].iter_mut().for_each(|s| *s += g);
+                }
+            }
+            let rgb = (light.emission * e).to_array();
+            for c in 0..3 {
+                for t in (0..nc).filter(|&t| all[t] > 0.0) {
+                    out[c * nc + t] += (rgb[c] * lit[t] / all[t]) as f32;
+                }
+            }
+        });
+    }
+}
+
+#[cfg(test)]
+#[path = "direct_tests.rs"]
+mod tests;

@@ -1,0 +1,470 @@
+//! Walls, luminaires and caps: where lines end on them, the (u, v, c) textures that answer there, and what lines bring.
+
+use super::directions::Shear;
+use crate::flat::{self, FlatTexture};
+use crate::scene::{Boundary, Scene};
+use glam::DVec3;
+use rayon::prelude::*;
+use std::f32::consts::PI;
+
+/// Light of one flat: isovalues run fastest, then the channel, then u, then v.
+#[derive(Clone, Debug)]
+pub(super) struct Texture {
+    /// Texels along u, v and isovalues.
+    pub dims: [usize; 3],
+    /// Diffuse reflectance.
+    pub albedo: [f32; 3],
+    /// World area of a texel.
+    pub texel_area: f64,
+    /// Direct irradiance; where a texel lies inside the solid at an isovalue, that of its part outside.
+    pub direct: Vec<f32>,
+    /// Indirect irradiance of the last pass.
+    pub indirect: Vec<f32>,
+    /// Reflected radiance B.
+    pub radiance: Vec<f32>,
+    /// ∫cos dω as the pass has seen it, per texel and isovalue: π where no part of it is inside the solid.
+    weight: Vec<f32>,
+}
+
+impl Texture {
+    /// Isovalues.
+    pub(super) fn isovalues(&self) -> usize {
+        self.dims[2]
+    }
+
+    fn sums(&self) -> usize {
+        self.dims.iter().product::<usize>() * 3
+    }
+
+    /// Writes B at (u, v) for every isovalue to `out`: three channels of `isovalues()` numbers.
+    #[inline(always)]
+    pub(super) fn column(&self, uv: [f32; 2], out: &mut [f32]) {
+        let n = 3 * self.dims[2];
+        let [a, b, c, d] = around(self.dims, uv).map(|(t, w)| (&self.radiance[t * n..][..n], w));
+        for (i, o) in out[..n].iter_mut().enumerate() {
+            *o = a.1 * a.0[i] + b.1 * b.0[i] + (c.1 * c.0[i] + d.1 * d.0[i]);
+        }
+    }
+}
+
+/// The four texels around (u, v) and their weights, clamped at the borders.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the texture")]
+fn around(dims: [usize; 3], uv: [f32; 2]) -> [(usize, f32); 4] {
+    let mut base = [0usize; 2];
+    let mut next = [0usize; 2];
+    let mut frac = [0f32; 2];
+    for a in 0..2 {
+        let last = dims[a] - 1;
+        let x = (uv[a] * dims[a] as f32 - 0.5).clamp(0.0, last as f32);
+        base[a] = (x as usize).min(last);
+        next[a] = (base[a] + 1).min(last);
+        frac[a] = x - base[a] as f32;
+    }
+    let row = |v: usize, u: usize| v * dims[0] + u;
+    let [f, g] = frac;
+    [
+        (row(base[1], base[0]), (1.0 - f) * (1.0 - g)),
+        (row(base[1], next[0]), f * (1.0 - g)),
+        (row(next[1], base[0]), (1.0 - f) * g),
+        (row(next[1], next[0]), f * g),
+    ]
+}
+
+/// What one line brought to a flat.
+pub(super) struct Arrival {
+    flat: u32,
+    uv: [f32; 2],
+    weight: f32,
+    /// Isovalue texels that lie on the swept side there.
+    range: (u32, u32),
+    /// Where the radiances start in [`Arrivals::values`].
+    start: usize,
+}
+
+/// What the lines of some rows brought.
+#[derive(Default)]
+pub(super) struct Arrivals {
+    list: Vec<Arrival>,
+    values: Vec<f32>,
+}
+
+impl Arrivals {
+    /// Adds radiances (three channels of isovalues, 0 outside `range`) that stand for `weight` = dω × area across.
+    pub(super) fn push(&mut self, flat: u32, uv: [f32; 2], weight: f32, range: (usize, usize), values: &[f32]) {
+        #[allow(clippy::cast_possible_truncation, reason = "isovalue texels")]
+        let range = (range.0 as u32, range.1 as u32);
+        self.list.push(Arrival { flat, uv, weight, range, start: self.values.len() });
+        self.values.extend_from_slice(values);
+    }
+}
+
+/// All flats of a scene, by flat number; `None` where nothing is reflected.
+pub(super) struct Flats {
+    pub textures: Vec<Option<Texture>>,
+    /// Isovalue texels of every texture.
+    pub isovalues: usize,
+}
+
+impl Flats {
+    pub(super) fn new(scene: &Scene, across: usize, isovalues: usize) -> Self {
+        let textures = (0..flat::count(scene))
+            .map(|number| {
+                let flat = flat::flat(scene, number)?;
+                if flat.albedo == DVec3::ZERO {
+                    return None;
+                }
+                let dims = FlatTexture::resolution(flat.lengths(), across, isovalues);
+                let texels = dims[0] * dims[1];
+                let n = 3 * texels * isovalues;
+                Some(Texture {
+                    dims,
+                    albedo: flat.albedo.as_vec3().to_array(),
+                    texel_area: flat.area() / texels as f64,
+                    direct: vec![0.0; n],
+                    indirect: vec![0.0; n],
+                    radiance: vec![0.0; n],
+                    weight: vec![0.0; texels * isovalues],
+                })
+            })
+            .collect();
+        Self { textures, isovalues }
+    }
+
+    /// Whether nothing reflects.
+    pub(super) fn none(&self) -> bool {
+        self.textures.iter().all(Option::is_none)
+    }
+
+    /// Takes the sums of a pass out, empty, so that lines can read while walls receive.
+    pub(super) fn open(&mut self) -> Incoming {
+        Incoming {
+            sinks: self
+                .textures
+                .iter_mut()
+                .map(|t| {
+                    let t = t.as_mut()?;
+                    let (mut indirect, mut weight) = (std::mem::take(&mut t.indirect), std::mem::take(&mut t.weight));
+                    indirect.fill(0.0);
+                    weight.fill(0.0);
+                    Some(Sink { dims: t.dims, indirect, weight })
+                })
+                .collect(),
+        }
+    }
+
+    /// Gives the sums of a pass back and ends it.
+    pub(super) fn close(&mut self, incoming: Incoming) {
+        for (t, sink) in self.textures.iter_mut().zip(incoming.sinks) {
+            if let (Some(t), Some(sink)) = (t, sink) {
+                (t.indirect, t.weight) = (sink.indirect, sink.weight);
+            }
+        }
+        self.normalise();
+    }
+
+    /// Irradiance = π Σ w L / Σ w, which is exact for equal L however unevenly lines fell on the texels.
+    fn normalise(&mut self) {
+        for t in self.textures.iter_mut().flatten() {
+            let nc = t.isovalues();
+            let weight = &t.weight;
+            t.indirect.par_chunks_mut(3 * nc).zip(weight.par_chunks(nc)).for_each(|(e, w)| {
+                for c in 0..3 {
+                    for i in 0..nc {
+                        e[c * nc + i] = if w[i] > 0.0 { PI * e[c * nc + i] / w[i] } else { 0.0 };
+                    }
+                }
+            });
+        }
+    }
+
+    /// B = ρ/π (direct + scale · indirect); texels that lie inside the solid take the mean of neighbours that do not.
+    pub(super) fn reflect(&mut self, scale: [f32; 3], seen: bool) {
+        for t in self.textures.iter_mut().flatten() {
+            let nc = t.isovalues();
+            for texel in 0..t.dims[0] * t.dims[1] {
+                for c in 0..3 {
+                    let row = (3 * texel + c) * nc..(3 * texel + c + 1) * nc;
+                    for i in row {
+                        t.radiance[i] = t.albedo[c] / PI * (t.direct[i] + scale[c] * t.indirect[i]);
+                    }
+                }
+            }
+            if seen {
+                t.fill();
+            }
+        }
+    }
+}
+
+/// What one flat receives in a pass.
+struct Sink {
+    dims: [usize; 3],
+    indirect: Vec<f32>,
+    weight: Vec<f32>,
+}
+
+/// What all flats receive in a pass.
+pub(super) struct Incoming {
+    sinks: Vec<Option<Sink>>,
+}
+
+impl Incoming {
+    /// Adds what lines brought, in their order.
+    pub(super) fn receive(&mut self, arrivals: &[Arrivals]) {
+        self.sinks.par_iter_mut().enumerate().for_each(|(number, sink)| {
+            let Some(t) = sink else { return };
+            let nc = t.dims[2];
+            for all in arrivals {
+                for a in all.list.iter().filter(|a| a.flat as usize == number) {
+                    let (first, last) = (a.range.0 as usize, a.range.1 as usize);
+                    for (texel, w) in around(t.dims, a.uv) {
+                        let w = w * a.weight;
+                        t.weight[texel * nc..][first..last].iter_mut().for_each(|x| *x += w);
+                        for c in 0..3 {
+                            let from = &all.values[a.start + c * nc..][first..last];
+                            let to = &mut t.indirect[(3 * texel + c) * nc..][first..last];
+                            to.iter_mut().zip(from).for_each(|(x, v)| *x += w * v);
+                        }
+                    }
+                }
+            }
+        });
+    }
+}
+
+impl Texture {
+    /// Copies B into texels that no line reached at an isovalue from those around them that some did.
+    fn fill(&mut self) {
+        let [nu, nv, nc] = self.dims;
+        let old = std::mem::take(&mut self.radiance);
+        let mut new = old.clone();
+        let weight = &self.weight;
+        new.par_chunks_mut(3 * nc).enumerate().for_each(|(texel, out)| {
+            let (u, v) = (texel % nu, texel / nu);
+            for i in 0..nc {
+                if weight[texel * nc + i] > 0.0 {
+                    continue;
+                }
+                let (mut sum, mut count) = ([0f32; 3], 0f32);
+                for y in v.saturating_sub(1)..(v + 2).min(nv) {
+                    for x in u.saturating_sub(1)..(u + 2).min(nu) {
+                        let n = y * nu + x;
+                        if weight[n * nc + i] > 0.0 {
+                            (0..3).for_each(|c| sum[c] += old[(3 * n + c) * nc + i]);
+                            count += 1.0;
+                        }
+                    }
+                }
+                if count > 0.0 {
+                    (0..3).for_each(|c| out[c * nc + i] = sum[c] / count);
+                }
+            }
+        });
+        self.radiance = new;
+    }
+
+    /// `values` (isovalues fastest) in the order of [`FlatTexture`].
+    pub(super) fn export(&self, values: &[f32]) -> FlatTexture {
+        let [nu, nv, nc] = self.dims;
+        let mut out = FlatTexture::black(self.dims);
+        for texel in 0..nu * nv {
+            for i in 0..nc {
+                out.texels[i * nu * nv + texel] = std::array::from_fn(|c| values[(3 * texel + c) * nc + i]);
+            }
+        }
+        debug_assert_eq!(self.sums(), 3 * out.texels.len());
+        out
+    }
+}
+
+/// Where a line meets a flat.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Stop {
+    /// τ along the line, in slices.
+    pub tau: f64,
+    /// The flat, or `None` for a black back.
+    pub flat: Option<u32>,
+    /// Texture coordinates there.
+    pub uv: [f32; 2],
+}
+
+/// The radiance of a stop over isovalues; black where it shows none.
+#[inline(always)]
+pub(super) fn fill_column(flats: &Flats, stop: Option<Stop>, out: &mut [f32]) {
+    let texture = stop.and_then(|s| Some((flats.textures[s.flat? as usize].as_ref()?, s.uv)));
+    match texture {
+        Some((texture, uv)) => texture.column(uv, out),
+        None => out.fill(0.0),
+    }
+}
+
+/// a + b p + c q.
+type Affine = [f64; 3];
+
+#[inline]
+fn at(f: &Affine, p: f64, q: f64) -> f64 {
+    f[0] + f[1] * p + f[2] * q
+}
+
+/// A polygon met by the parallel lines of one family: everything is affine in the line's numbers (p, q).
+struct Met {
+    number: u32,
+    tau: Affine,
+    uv: [Affine; 2],
+    /// Inside is where none of these is below −slack.
+    edges: Vec<Affine>,
+    slack: f64,
+    /// Whether its front faces lines that run towards +τ.
+    front_plus: bool,
+    opaque_back: bool,
+    /// Whether it stands inside Ω: a luminaire that cuts lines.
+    inside: bool,
+    reflects: bool,
+}
+
+/// Finds what the lines of one family end on.
+pub(super) struct Ends {
+    met: Vec<Met>,
+}
+
+impl Ends {
+    pub(super) fn new(scene: &Scene, flats: &Flats, shear: &Shear, inside: &[bool]) -> Self {
+        let lattice = scene.lattice();
+        let [u, v, a] = shear.layout.axes;
+        let [e, f, g] = [u, v, a].map(|x| lattice.axes().col(x));
+        let step = shear.slope[0] * e + shear.slope[1] * f + g;
+        let start = lattice.origin() + shear.offset[0] * e + shear.offset[1] * f;
+        let met = scene
+            .polygons()
+            .iter()
+            .enumerate()
+            .filter_map(|(i, p)| {
+                let n = p.normal();
+                let along = n.dot(step);
+                if along.abs() < 1e-9 * step.length() {
+                    return None;
+                }
+                let v = p.vertices();
+                let tau = [n.dot(v[0] - start) / along, -n.dot(e) / along, -n.dot(f) / along];
+                let point = |p: f64, q: f64| start + p * e + q * f + at(&tau, p, q) * step;
+                let affine = |h: &dyn Fn(DVec3) -> f64| {
+                    let o = h(point(0.0, 0.0));
+                    [o, h(point(1.0, 0.0)) - o, h(point(0.0, 1.0)) - o]
+                };
+                let size = v.iter().map(|&x| (x - v[0]).length()).fold(0.0, f64::max);
+                let edges = (0..v.len())
+                    .map(|k| {
+                        let (x0, x1) = (v[k], v[(k + 1) % v.len()]);
+                        let normal = n.cross(x1 - x0).normalize();
+                        affine(&|x| normal.dot(x - x0))
+                    })
+                    .collect();
+                Some(Met {
+                    number: u32::try_from(i).expect("scenes hold fewer than 2¹⁶ polygons"),
+                    tau,
+                    uv: [affine(&|x| p.texture(x)[0]), affine(&|x| p.texture(x)[1])],
+                    edges,
+                    slack: 1e-9 * size,
+                    front_plus: along < 0.0,
+                    opaque_back: p.opaque_back,
+                    inside: inside[i],
+                    reflects: flats.textures[i].is_some(),
+                })
+            })
+            .collect();
+        Self { met }
+    }
+
+    /// Whether lines may be cut inside Ω.
+    pub(super) fn cut(&self) -> bool {
+        self.met.iter().any(|m| m.inside)
+    }
+
+    /// What line (p, q) meets first beyond `from`, towards +τ (`forward`) or −τ; polygon `except` does not count.
+    #[inline(always)]
+    #[allow(clippy::cast_possible_truncation, reason = "texture coordinates")]
+    pub(super) fn stop(&self, p: f64, q: f64, from: f64, forward: bool, except: Option<u32>) -> Option<Stop> {
+        let mut best: Option<(f64, &Met)> = None;
+        for m in &self.met {
+            if (m.front_plus != forward && !m.opaque_back) || except == Some(m.number) {
+                continue;
+            }
+            let tau = at(&m.tau, p, q);
+            // 1e-6 of a slice: a wall in Ω's face stands where the line leaves Ω, to rounding.
+            let beyond = if forward { tau - from } else { from - tau };
+            if !(beyond >= -1e-6) || best.is_some_and(|(t, _)| if forward { t <= tau } else { t >= tau }) {
+                continue;
+            }
+            if m.edges.iter().all(|e| at(e, p, q) >= -m.slack) {
+                best = Some((tau, m));
+            }
+        }
+        best.map(|(tau, m)| m.stop(p, q, tau, forward))
+    }
+
+    /// Calls `visit` with every reflecting front that line (p, q) meets, and whether it looks towards +τ.
+    pub(super) fn fronts(&self, p: f64, q: f64, mut visit: impl FnMut(Stop, bool)) {
+        for m in self.met.iter().filter(|m| m.reflects) {
+            if m.edges.iter().all(|e| at(e, p, q) >= -m.slack) {
+                visit(m.stop(p, q, at(&m.tau, p, q), m.front_plus), !m.front_plus);
+            }
+        }
+    }
+
+    /// The luminaires that cut line (p, q) between `from` and `to`, in order of τ: how each looks from before and behind.
+    pub(super) fn cuts(&self, p: f64, q: f64, from: f64, to: f64, out: &mut Vec<[Stop; 2]>) {
+        out.clear();
+        for m in self.met.iter().filter(|m| m.inside) {
+            let tau = at(&m.tau, p, q);
+            if tau > from + 1e-6 && tau < to - 1e-6 && m.edges.iter().all(|e| at(e, p, q) >= -m.slack) {
+                out.push([m.stop(p, q, tau, true), m.stop(p, q, tau, false)]);
+            }
+        }
+        out.sort_by(|a, b| a[0].tau.total_cmp(&b[0].tau));
+    }
+}
+
+impl Met {
+    #[inline]
+    #[allow(clippy::cast_possible_truncation, reason = "texture coordinates")]
+    fn stop(&self, p: f64, q: f64, tau: f64, forward: bool) -> Stop {
+        let front = self.front_plus == forward && self.reflects;
+        let uv = [0, 1].map(|a| at(&self.uv[a], p, q).clamp(0.0, 1.0) as f32);
+        Stop { tau, flat: front.then_some(self.number), uv }
+    }
+}
+
+/// Polygons that reach into the interior of Ω (by more than 1e-6 of a cell).
+pub(super) fn inside(scene: &Scene) -> Vec<bool> {
+    let far = scene.lattice().far();
+    scene
+        .polygons()
+        .iter()
+        .map(|p| {
+            let mut points: Vec<DVec3> = p.vertices().iter().map(|&x| scene.lattice().to_index(x)).collect();
+            for a in 0..3 {
+                for (sign, plane) in [(1.0, 1e-6), (-1.0, -(far[a] - 1e-6))] {
+                    let height = |x: DVec3| sign * x[a] - plane;
+                    let mut kept = Vec::new();
+                    for (i, &x) in points.iter().enumerate() {
+                        let y = points[(i + 1) % points.len()];
+                        let (hx, hy) = (height(x), height(y));
+                        if hx > 0.0 {
+                            kept.push(x);
+                        }
+                        if (hx > 0.0) != (hy > 0.0) {
+                            kept.push(x + (y - x) * (hx / (hx - hy)));
+                        }
+                    }
+                    points = kept;
+                }
+            }
+            points.len() >= 3
+        })
+        .collect()
+}
+
+/// Whether caps close Ω's faces.
+pub(super) fn capped(scene: &Scene) -> bool {
+    scene.boundary == Boundary::Capped
+}

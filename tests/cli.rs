@@ -1,0 +1,202 @@
+//! The program as users meet it: verbs, files, exit codes, and one clear line for every kind of bad input.
+
+use isolume::volume::vti::VtiFile;
+use isolume::volume::{Lattice, Samples, Volume};
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output};
+
+fn isolume(dir: &Path, args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_isolume")).current_dir(dir).args(args).output().expect("the program starts")
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+/// Runs what must fail as bad input: exit code 2, one line that holds `words`, and no `out.vti` of any size.
+fn refused(dir: &Path, args: &[&str], words: &[&str]) {
+    let output = isolume(dir, args);
+    let message = text(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{args:?}: {message}");
+    assert_eq!(message.lines().count(), 1, "{args:?}: {message}");
+    for word in words {
+        assert!(message.contains(word), "{args:?}: '{word}' is missing in: {message}");
+    }
+    let left: Vec<String> = fs::read_dir(dir)
+        .unwrap()
+        .map(|e| e.unwrap().file_name().into_string().unwrap())
+        .filter(|n| n.contains("out.vti"))
+        .collect();
+    assert!(left.is_empty(), "{args:?} left {left:?}");
+}
+
+fn ok(dir: &Path, args: &[&str]) -> Output {
+    let output = isolume(dir, args);
+    assert!(output.status.success(), "{args:?}: {}", text(&output.stderr));
+    output
+}
+
+const QUICK: [&str; 8] = ["--photons", "4000", "--samples", "2000", "--gather", "8", "--wall-resolution", "8"];
+
+#[test]
+fn generate_info_bake_render() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "21", "-o", "b.nrrd", "--quiet"]);
+    let info = text(&ok(dir, &["info", "b.nrrd"]).stdout);
+    assert!(info.contains("21") && info.to_lowercase().contains("sweep"), "{info}");
+    let json: serde_json::Value = serde_json::from_slice(&ok(dir, &["info", "b.nrrd", "--json"]).stdout).unwrap();
+    assert_eq!(json["dims"], serde_json::json!([21, 21, 21]));
+
+    let mut bake =
+        vec!["bake", "b.nrrd", "--isovalues", "3.6", "95", "-o", "out.vti", "--report", "r.json", "--sides", "both"];
+    bake.extend(QUICK);
+    let lines = text(&ok(dir, &bake).stderr);
+    assert!(lines.contains("photons") && lines.contains("total"), "plain lines without a terminal: {lines}");
+    let report: serde_json::Value = serde_json::from_slice(&fs::read(dir.join("r.json")).unwrap()).unwrap();
+    for key in ["load", "build", "photons", "samples", "interpolate", "export", "total"] {
+        assert!(report["seconds"][key].is_number(), "seconds.{key}");
+    }
+    for key in ["rays", "rays_per_second", "samples", "masked", "misses", "threads", "seed"] {
+        assert!(report[key].is_number(), "{key}");
+    }
+    assert_eq!(report["photons"]["emitted"], 4000);
+    assert!(report["photons"]["stored"].as_u64().unwrap() > 4000, "photons land more than once");
+    assert!(report["embree"].as_str().unwrap().starts_with("4."));
+    assert!(report["commit"].is_string() && report["settings"]["gather_rays"] == 8);
+
+    let file = VtiFile::read(&dir.join("out.vti")).unwrap();
+    let names: Vec<(&str, usize)> = file.point_data.iter().map(|a| (a.name.as_str(), a.components)).collect();
+    let side = [("radiance", 3), ("rgb", 3), ("std_error", 1), ("mask", 1)];
+    assert_eq!(names[0], ("value", 1));
+    assert_eq!(names[1..5], side);
+    assert_eq!(names[5].0, "radiance_inside");
+    assert_eq!(file.active_scalars.as_deref(), Some("value"));
+    let field: Vec<&str> = file.field_data.iter().map(|a| a.name.as_str()).collect();
+    for name in [
+        "wall_x_min",
+        "wall_x_max",
+        "wall_y_max",
+        "wall_z_min",
+        "wall_z_max",
+        "exposure",
+        "isovalues",
+        "settings.photons",
+    ] {
+        assert!(field.contains(&name), "field data {name} in {field:?}");
+    }
+    let Samples::F32(rgb) = &file.point_data[2].samples else { panic!("rgb is f32") };
+    assert!(rgb.iter().all(|x| (0.0..=1.0).contains(x)));
+
+    // A bake without a volume of its own reads back as one.
+    assert_eq!(Volume::open(dir.join("out.vti")).unwrap().lattice.dims(), [21, 21, 21]);
+    for (name, extra) in [("a.png", None), ("a.exr", None), ("l.png", Some("--local"))] {
+        let mut args = vec!["render", "out.vti", "--isovalue", "47", "-o", name, "--height", "40", "--samples", "4"];
+        args.extend(extra);
+        ok(dir, &args);
+        assert!(fs::metadata(dir.join(name)).unwrap().len() > 500, "{name}");
+    }
+    assert_ne!(fs::read(dir.join("a.png")).unwrap(), fs::read(dir.join("l.png")).unwrap());
+    for file in ["b.nrrd", "r.json"] {
+        let output = isolume(dir, &["render", file, "--isovalue", "47", "-o", "x.png"]);
+        assert_eq!(output.status.code(), Some(2), "{file} is no bake");
+        assert!(text(&output.stderr).contains(file));
+    }
+    let output = isolume(dir, &["render", "out.vti", "--isovalue", "99", "-o", "x.png"]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(text(&output.stderr).contains("outside the baked sweep"));
+}
+
+#[test]
+fn bad_input_is_one_clear_line_and_leaves_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    refused(dir, &["bake", "nowhere.nii.gz", "-o", "out.vti"], &["nowhere.nii.gz"]);
+    refused(dir, &["bake", "nowhere.xyz", "-o", "out.vti"], &["nowhere.xyz"]);
+
+    // A gzip stream cut short.
+    let lattice = Lattice::aligned([8, 8, 8], glam::DVec3::ZERO, glam::DVec3::ONE).unwrap();
+    let ramp = Samples::F32((0..512).map(|i| i as f32).collect());
+    Volume::new("ramp", lattice.clone(), ramp).unwrap().write(dir.join("ramp.nrrd")).unwrap();
+    let header = b"NRRD0004\ntype: float\ndimension: 3\nsizes: 8 8 8\nencoding: gzip\nendian: little\n\n";
+    let mut gz = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    std::io::Write::write_all(&mut gz, &[7; 2048]).unwrap();
+    let packed = gz.finish().unwrap();
+    fs::write(dir.join("cut.nrrd"), [&header[..], &packed[..packed.len() / 2]].concat()).unwrap();
+    refused(dir, &["bake", "cut.nrrd", "-o", "out.vti"], &["cut.nrrd"]);
+
+    // A header that promises 10¹² samples.
+    let big = b"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 10000 10000 10000\nencoding: raw\nendian: little\n\nxx";
+    fs::write(dir.join("big.nrrd"), big).unwrap();
+    refused(dir, &["bake", "big.nrrd", "-o", "out.vti"], &["big.nrrd", "1000000000000"]);
+
+    Volume::new("nan", lattice.clone(), Samples::F32(vec![f32::NAN; 512]))
+        .unwrap()
+        .write(dir.join("nan.nrrd"))
+        .unwrap();
+    refused(dir, &["bake", "nan.nrrd", "-o", "out.vti"], &["nan.nrrd", "finite"]);
+    Volume::new("flat", lattice, Samples::F32(vec![3.0; 512])).unwrap().write(dir.join("flat.nrrd")).unwrap();
+    refused(dir, &["bake", "flat.nrrd", "-o", "out.vti"], &["flat.nrrd", "isosurface"]);
+
+    let ramp = ["bake", "ramp.nrrd", "-o", "out.vti"];
+    let with = |extra: &[&'static str]| [&ramp[..], extra].concat();
+    refused(dir, &with(&["--isovalues", "600", "700"]), &["outside the data", "0 … 511"]);
+    refused(dir, &with(&["--isovalues", "7", "7"]), &["isovalues"]);
+    refused(dir, &with(&["--albedo", "1.5"]), &["albedo"]);
+    refused(dir, &with(&["--boundary", "capped"]), &["margin"]);
+    refused(dir, &with(&["--gather", "9999999"]), &["gather"]);
+    refused(dir, &["bake", "ramp.nrrd", "-o", "missing/folder/out.vti"], &["missing"]);
+    refused(dir, &["bake", "ramp.nrrd", "-o", "out.png"], &["out.png", ".vti"]);
+
+    // A luminaire without area, and a scene with an unknown key.
+    fs::write(dir.join("l.mtl"), "newmtl lamp\nKe 1 1 1\n").unwrap();
+    fs::write(dir.join("l.obj"), "mtllib l.mtl\nv 0 0 0\nv 1 1 1\nv 2 2 2\nusemtl lamp\nf 1 2 3\n").unwrap();
+    refused(dir, &with(&["--box", "l.obj"]), &["l.obj", "face 1", "area"]);
+    fs::write(dir.join("s.toml"), "[volume]\nfile = \"ramp.nrrd\"\n\n[surface]\nalbdo = 0.5\n").unwrap();
+    refused(dir, &["bake", "s.toml", "-o", "out.vti"], &["s.toml:5", "albdo", "albedo"]);
+}
+
+#[test]
+fn a_second_bake_never_harms_the_first_unless_it_finishes() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    fs::write(dir.join("keep.vti"), "precious").unwrap();
+    ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
+    let output = isolume(dir, &["bake", "b.vti", "-o", "keep.vti", "--isovalues", "500", "600"]);
+    assert_eq!(output.status.code(), Some(2));
+    assert_eq!(fs::read(dir.join("keep.vti")).unwrap(), b"precious");
+    let mut bake = vec!["bake", "b.vti", "-o", "keep.vti", "--isovalues", "3.6", "95", "-q"];
+    bake.extend(QUICK);
+    assert_eq!(text(&ok(dir, &bake).stderr), "", "--quiet is quiet");
+    assert!(VtiFile::read(&dir.join("keep.vti")).is_ok());
+}
+
+#[test]
+fn the_same_bits_for_any_number_of_threads() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "17", "-o", "b.vti", "-q"]);
+    let grids: Vec<Vec<f32>> = ["1", "2", "7"]
+        .iter()
+        .map(|threads| {
+            let mut bake = vec!["bake", "b.vti", "-o", "t.vti", "--isovalues", "3.6", "95", "--threads", threads, "-q"];
+            bake.extend(QUICK);
+            ok(dir, &bake);
+            let file = VtiFile::read(&dir.join("t.vti")).unwrap();
+            let walls = file.field_data.iter().filter(|a| a.name.starts_with("wall_"));
+            let arrays = file.point_data.iter().filter(|a| a.name != "mask").chain(walls);
+            arrays
+                .flat_map(|a| match &a.samples {
+                    Samples::F32(v) => v.clone(),
+                    _ => panic!("{} is not f32", a.name),
+                })
+                .collect()
+        })
+        .collect();
+    let bits = |v: &[f32]| v.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+    assert!(grids[0].iter().any(|&x| x > 0.0));
+    for other in &grids[1..] {
+        assert_eq!(bits(&grids[0]), bits(other));
+    }
+}

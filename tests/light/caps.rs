@@ -1,0 +1,141 @@
+//! Capped boundaries, and which side is outside.
+
+use crate::support::*;
+use glam::{DVec3, Vec3};
+use isolume::bake::BakeSettings;
+use isolume::embree::{Device, GraphTracer};
+use isolume::flattened::{Departure, Side, Target};
+use isolume::luminaire::unoccluded;
+use isolume::scene::{Boundary, Scene};
+use isolume::stats::Moments;
+use isolume::tracer::Tracer;
+
+/// A solid 0 ≤ z ≤ 1 − c in [0, 1]³, moved off the origin so that faces are no round f32 numbers, lamps beyond two faces.
+fn solid() -> (Scene, DVec3) {
+    let at = DVec3::new(0.137, -3.211, 7.713);
+    let field = field(lattice([8; 3], at, at + 1.0), 0.0, 1.0, |x| 1.0 - (x - at).z);
+    let right = rectangle("right", at + DVec3::new(1.6, 0.5, 0.5), 0.5 * DVec3::Z, 0.5 * DVec3::Y, 0.0, 1.0);
+    let below = rectangle("below", at + DVec3::new(0.5, 0.5, -0.7), 0.4 * DVec3::X, 0.4 * DVec3::Y, 0.0, 2.0);
+    (Scene::new(field, grey(0.5, Side::Lower), Boundary::Capped, vec![right, below]).unwrap(), at)
+}
+
+/// The textures of caps hold the closed form of direct light. Nothing else: caps of a convex solid do not see each
+/// other, and no light comes back from the dark. 1e-5: f32 storage.
+#[test]
+fn caps_are_lit_like_walls() {
+    let (scene, at) = solid();
+    let bake = run(&scene, &BakeSettings { gather_rays: 0, bounces: 0, ..at_nodes(1) });
+    let mut lit = 0;
+    for face in 0..6u8 {
+        let texture = bake.flats[scene.polygons().len() + usize::from(face)].as_ref().unwrap();
+        let n = scene.face_normal(face);
+        let flat = isolume::flat::flat(&scene, scene.polygons().len() + usize::from(face)).unwrap();
+        let mut worst = 0f64;
+        for (i, texel) in texture.texels.iter().enumerate() {
+            let [u, v, c] = texture.centre(i);
+            let x = flat.at([u, v]);
+            if (x - at).z > 1.0 - c {
+                continue;
+            }
+            let expected: f64 = scene
+                .luminaires()
+                .iter()
+                .map(|&l| &scene.polygons()[l as usize])
+                .map(|p| p.emission.x * unoccluded(p, x, n))
+                .sum();
+            lit += usize::from(expected > 0.0);
+            worst = worst.max((f64::from(texel[0]) - 0.5 * expected / std::f64::consts::PI).abs());
+        }
+        println!("face {face}, normal {n}: worst {worst:.1e}");
+        assert!(worst < 1e-5);
+    }
+    println!("{lit} lit texels");
+    assert!(lit > 10_000);
+}
+
+/// A capped solid is closed: photons from outside stay outside, whatever they bounce off, and what reflects from a cap
+/// goes away from it.
+#[test]
+fn no_photon_gets_through_a_cap() {
+    let (scene, at) = solid();
+    let got = photons(&scene, &emission(1 << 17, 2));
+    let through = got.surface.iter().filter(|p| p.side == Side::Higher).count();
+    let caps = got.flat.iter().filter(|p| p.flat >= 2).count();
+    let again = got.flat.iter().filter(|p| p.flat >= 2 && p.bounces > 0).count();
+    println!(
+        "{} landings on level sets, {through} from inside; {caps} on caps, {again} of them after a bounce",
+        got.surface.len()
+    );
+    assert_eq!(through, 0);
+    assert!(caps > 30_000);
+    assert_eq!(again, 0, "faces of a convex solid do not see each other");
+    // Rays from points a rounding off the face, both ways.
+    let device = Device::new(1).unwrap();
+    let tracer = GraphTracer::new(&device, &scene).unwrap();
+    for off in [-1e-6f32, 0.0, 1e-6] {
+        for direction in [DVec3::new(1.0, 0.3, 0.2), DVec3::new(1e-9, 0.3, 0.2)] {
+            let origin = Vec3::new(7.0 + off, 3.3, 1.1);
+            let out = scene.ray(origin, direction, 0.5, Departure::Cap(3, Side::Lower));
+            assert!(!matches!(tracer.intersect(&out), Some(h) if !matches!(h.target, Target::Polygon(_))), "{off}");
+            let within = scene.ray(origin, -direction, 0.5, Departure::Cap(3, Side::Higher));
+            let hit = tracer.intersect(&within).unwrap();
+            assert!(hit.t > 0.1 && hit.target != Target::Cap(3, Side::Higher), "{off}: {hit:?}");
+        }
+    }
+    assert!(at.is_finite());
+}
+
+/// With both sides stored, the inside of a capped solid without a lamp in it is black.
+#[test]
+fn the_inside_of_a_capped_solid_is_dark() {
+    let (mut scene, _) = solid();
+    scene.surface.both_sides = true;
+    for gather_rays in [0, 16] {
+        let bake = run(&scene, &BakeSettings { gather_rays, photons: 1 << 15, ..at_nodes(1) });
+        let sums: Vec<f64> =
+            bake.sides.iter().map(|s| s.1.radiance.iter().map(|rgb| f64::from(rgb[1])).sum::<f64>()).collect();
+        println!("gather {gather_rays}: outside {:.3}, inside {}", sums[0], sums[1]);
+        assert!(sums[0] > 0.1 && sums[1] == 0.0);
+    }
+}
+
+/// −h with the other side outside is the same scene: the mean radiance of 4 shells agrees, nodes in Ω's faces included
+/// (rays that leave Ω there once met the lower side of their own level set). Errors from 4 seeds each; systematic 0.3 %: `inside` takes h = c to different sides.
+#[test]
+fn mirrored_fields_give_the_same_light() {
+    let build = |sign: f64, outside: Side| {
+        let h = move |x: DVec3| sign * (x.z + 0.1 * (6.0 * x.x).sin() + 0.1 * (5.0 * x.y).cos());
+        let (lo, hi) = if sign > 0.0 { (0.1, 0.8) } else { (-0.8, -0.1) };
+        let field = field(lattice([17; 3], DVec3::ZERO, DVec3::ONE), lo, hi, h);
+        let walls = isolume::scene::cornell_box(field.lattice(), 0.0).unwrap();
+        scene(field, grey(0.6, outside), walls)
+    };
+    let mut family = Family::new("mirror", 0.003);
+    let mut shells = [[Moments::default(); 4]; 2];
+    for (which, scene) in [build(1.0, Side::Higher), build(-1.0, Side::Lower)].iter().enumerate() {
+        for seed in 1..5 {
+            let bake = run(
+                scene,
+                &BakeSettings {
+                    photons: 1 << 18,
+                    gather_rays: 16,
+                    wall_resolution: 16,
+                    wall_isovalues: 8,
+                    ..at_nodes(seed + 10 * which as u64)
+                },
+            );
+            let mut sums = [(0.0, 0.0); 4];
+            for (_, _, h, radiance, _) in valid(&bake, scene) {
+                let h = if which == 0 { h } else { 1.0 - h };
+                let s = &mut sums[((h * 4.0) as usize).min(3)];
+                *s = (s.0 + radiance, s.1 + 1.0);
+            }
+            sums.iter().zip(&mut shells[which]).for_each(|((a, n), m)| m.push(a / n));
+        }
+    }
+    for s in 0..4 {
+        let (a, b) = (shells[0][s], shells[1][s]);
+        family.compare(format!("shell {s}"), b.mean(), a.std_error().hypot(b.std_error()), a.mean());
+    }
+    family.accept();
+}

@@ -1,0 +1,8 @@
+//! Light whose answer is known without a reference (design: section 6), through the stages that a bake runs.
+
+mod caps;
+mod closed_forms;
+mod invariance;
+mod photons;
+mod samplers;
+mod support;

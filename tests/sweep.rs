@@ -1,0 +1,215 @@
+//! The line-sweep engine against answers that are known without a reference, and against exact rays.
+
+use glam::{DMat3, DVec3};
+use isolume::embree::{Device, GraphTracer};
+use isolume::field::{Field, Sweep};
+use isolume::flattened::{Departure, FlattenedRay, Side, Target};
+use isolume::polygon::Polygon;
+use isolume::rng::{Rng, Sobol, Stage};
+use isolume::scene::{Boundary, Scene, Surface, cornell_box};
+use isolume::sweep::{SweepResult, SweepSettings, sweep};
+use isolume::tracer::Tracer;
+use isolume::volume::{Lattice, Samples, Volume};
+use isolume::warp::{Frame, cosine_hemisphere};
+use rayon::prelude::*;
+use std::f64::consts::PI;
+
+/// A field on `lattice` from a function of the world.
+fn field(lattice: Lattice, range: (f64, f64), f: impl Fn(DVec3) -> f64 + Sync) -> Field {
+    let samples = (0..lattice.len())
+        .into_par_iter()
+        .map(|o| {
+            let [i, j, k] = lattice.ijk(o).map(|x| x as f64);
+            f(lattice.to_world(DVec3::new(i, j, k)))
+        })
+        .collect();
+    let volume = Volume::new("test", lattice, Samples::F64(samples)).unwrap();
+    Field::new(&volume, Sweep::new(range.0, range.1).unwrap()).unwrap()
+}
+
+/// The bumps of the design's tables on n³ samples.
+fn bumps(n: usize) -> Field {
+    let lattice = Lattice::aligned([n; 3], DVec3::ZERO, DVec3::splat(1.0 / (n - 1) as f64)).unwrap();
+    field(lattice, (3.6, 95.0), bumps_at)
+}
+
+fn bumps_at(x: DVec3) -> f64 {
+    let g = |m: [f64; 3], s: f64| (-(x - DVec3::from_array(m)).length_squared() / (2.0 * s * s)).exp();
+    100.0 * g([0.5, 0.5, 0.38], 0.16)
+        + 80.0 * (g([0.32, 0.40, 0.74], 0.05) + g([0.62, 0.35, 0.76], 0.05) + g([0.52, 0.66, 0.72], 0.05))
+}
+
+fn run(scene: &Scene, settings: SweepSettings) -> SweepResult {
+    sweep(scene, &settings, &|_| true).unwrap()
+}
+
+fn rms(errors: impl Iterator<Item = f64>) -> f64 {
+    let (sum, n) = errors.fold((0.0, 0), |(s, n), e| (s + e * e, n + 1));
+    (sum / f64::from(n.max(1))).sqrt()
+}
+
+/// Valid nodes at least `skin` nodes from Ω's faces.
+fn nodes(scene: &Scene, skin: usize) -> Vec<usize> {
+    let dims = scene.lattice().dims();
+    (0..scene.lattice().len())
+        .filter(|&o| {
+            let ijk = scene.lattice().ijk(o);
+            (0.0..=1.0).contains(&scene.field.samples()[o])
+                && (0..3).all(|a| ijk[a] >= skin && ijk[a] + skin < dims[a])
+                && scene.field.node_gradient(ijk) != DVec3::ZERO
+        })
+        .collect()
+}
+
+const ONE_BOUNCE: SweepSettings = SweepSettings {
+    directions: 256,
+    light_points: 16,
+    max_bounces: 1,
+    target: 1e-3,
+    replicates: 1,
+    flat_resolution: (16, 16),
+    seed: 1,
+};
+
+/// The share of the cosine-weighted hemisphere over a node that meets the level set itself, by exact rays.
+fn exact_occlusion(tracer: &GraphTracer, scene: &Scene, o: usize, rays: u32) -> f64 {
+    let ijk = scene.lattice().ijk(o).map(|x| x as f64);
+    let p = DVec3::from_array(ijk);
+    let n = scene.normal(p, Side::Lower).unwrap();
+    let set = Sobol::set(3, Stage::Test, o as u64);
+    let frame = Frame::new(n);
+    let hits = (0..rays)
+        .filter(|&i| {
+            let d = frame.to_world(cosine_hemisphere(set.point2(i, 0)));
+            let c = scene.field.samples()[o];
+            let ray = scene.ray(p.as_vec3(), d, c, Departure::Surface(Side::Lower));
+            matches!(tracer.intersect(&ray), Some(h) if matches!(h.target, Target::Surface(_)))
+        })
+        .count();
+    hits as f64 / f64::from(rays)
+}
+
+#[test]
+fn swept_occlusion_agrees_with_exact_rays() {
+    let surface = Surface { albedo: DVec3::ZERO, emission: DVec3::ONE, ..Surface::default() };
+    let scene = Scene::new(bumps(101), surface, Boundary::Open, Vec::new()).unwrap();
+    let device = Device::new(1).unwrap();
+    let tracer = GraphTracer::new(&device, &scene).unwrap();
+    let all = nodes(&scene, 3);
+    let mut rng = Rng::stream(1, Stage::Test, 0);
+    let some: Vec<usize> = (0..1000).map(|_| all[(rng.unit() * all.len() as f64) as usize]).collect();
+    let exact: Vec<f64> = some.par_iter().map(|&o| exact_occlusion(&tracer, &scene, o, 4096)).collect();
+    for (directions, limit) in [(64, 0.114), (256, 0.045), (1024, 0.025)] {
+        let start = std::time::Instant::now();
+        let got = run(&scene, SweepSettings { directions, ..ONE_BOUNCE });
+        let error = || some.iter().zip(&exact).map(|(&o, x)| f64::from(got.sides[0].indirect[o][1]) / PI - x);
+        let bias = error().sum::<f64>() / some.len() as f64;
+        let seconds = start.elapsed().as_secs_f64();
+        println!(
+            "{directions} directions: RMS {:.5}, bias {bias:.5}, {seconds:.2} s, {:.1} M rays/s",
+            rms(error()),
+            got.counts.gather_rays as f64 / seconds * 1e-6
+        );
+        assert!(rms(error()) < limit, "{directions} directions: RMS {}", rms(error()));
+    }
+}
+
+#[test]
+fn integrating_sphere() {
+    // Inside a sphere of any radius the reflected light of a small source is the same everywhere: ρΦ/(4πR²(1−ρ)).
+    let n = 65;
+    let lattice = Lattice::aligned([n; 3], DVec3::splat(-1.0), DVec3::splat(2.0 / (n - 1) as f64)).unwrap();
+    let field = field(lattice, (0.2, 0.9), |x| x.length_squared());
+    let s = 0.01;
+    let v = [(-s, -s), (-s, s), (s, s), (s, -s)].map(|(x, y)| DVec3::new(x, y, 0.004)).to_vec();
+    let light = Polygon::new("light", v, DVec3::ZERO, DVec3::ONE).unwrap();
+    let flux = PI * light.area();
+    let surface = Surface { albedo: DVec3::new(0.5, 0.8, 0.2), ..Surface::default() };
+    let scene = Scene::new(field, surface, Boundary::Open, vec![light]).unwrap();
+    let got =
+        run(&scene, SweepSettings { directions: 128, light_points: 16, target: 1e-4, ..SweepSettings::default() });
+    println!("bounces {} residual {}", got.bounces, got.residual);
+    let all = nodes(&scene, 0);
+    for (c, rho) in [0.5, 0.8, 0.2].into_iter().enumerate() {
+        let errors: Vec<f64> = all
+            .iter()
+            .map(|&o| {
+                let r2 = scene.field.sweep().from_unit(f64::from(scene.field.samples()[o]));
+                let expected = rho * flux / (4.0 * PI * r2 * (1.0 - rho));
+                f64::from(got.sides[0].indirect[o][c]) / expected - 1.0
+            })
+            .collect();
+        for b in 0..7 {
+            let (lo, hi) = (0.2 + 0.1 * b as f64, 0.3 + 0.1 * b as f64);
+            let sel: Vec<f64> = all
+                .iter()
+                .zip(&errors)
+                .filter(|(o, _)| {
+                    let r2 = scene.field.sweep().from_unit(f64::from(scene.field.samples()[**o]));
+                    lo <= r2 && r2 < hi
+                })
+                .map(|(_, e)| *e)
+                .collect();
+            println!(
+                "   r2 {lo:.1} mean {:.4} rms {:.4}",
+                sel.iter().sum::<f64>() / sel.len() as f64,
+                rms(sel.iter().copied())
+            );
+        }
+        let mean = errors.iter().sum::<f64>() / errors.len() as f64;
+        let worst = errors.iter().fold(0.0, |m: f64, e| m.max(e.abs()));
+        println!("ρ = {rho}: mean {mean:.5}, RMS {:.5}, worst {worst:.4}", rms(errors.iter().copied()));
+        assert!(mean.abs() < 0.01 && rms(errors.iter().copied()) < 0.05, "ρ = {rho}");
+    }
+}
+
+/// Walls on Ω's faces that all emit.
+fn emissive_box(lattice: &Lattice, albedo: f64, emission: f64) -> Vec<Polygon> {
+    let far = lattice.far();
+    let mut all = Vec::new();
+    for a in 0..3 {
+        for end in [0.0, far[a]] {
+            let (b, c) = ((a + 1) % 3, (a + 2) % 3);
+            let corner = |s: f64, t: f64| {
+                let mut p = DVec3::ZERO;
+                (p[a], p[b], p[c]) = (end, s * far[b], t * far[c]);
+                lattice.to_world(p)
+            };
+            let mut v = vec![corner(0., 0.), corner(1., 0.), corner(1., 1.), corner(0., 1.)];
+            let middle = lattice.to_world(0.5 * far);
+            if (v[1] - v[0]).cross(v[3] - v[0]).dot(middle - v[0]) < 0.0 {
+                v.reverse();
+            }
+            all.push(Polygon::new(&format!("{a}{end}"), v, DVec3::splat(albedo), DVec3::splat(emission)).unwrap());
+        }
+    }
+    all
+}
+
+#[test]
+fn furnaces() {
+    // Everything emits what it absorbs: radiance 1 everywhere, whatever the level sets look like.
+    let rho = 0.6;
+    let a = 0.5;
+    let surface = Surface { albedo: DVec3::splat(rho), emission: DVec3::splat(1.0 - rho), ..Surface::default() };
+    let f = bumps(41);
+    let walls = emissive_box(f.lattice(), a, 1.0 - a);
+    let scene = Scene::new(f, surface, Boundary::Open, walls).unwrap();
+    let got =
+        run(&scene, SweepSettings { directions: 128, light_points: 64, replicates: 1, ..SweepSettings::default() });
+    println!("bounces {} residual {}", got.bounces, got.residual);
+    for skin in [0, 1, 3] {
+        let errors: Vec<f64> = nodes(&scene, skin)
+            .iter()
+            .map(|&o| f64::from(got.sides[0].direct[o][0] + got.sides[0].indirect[o][0]) / PI - 1.0)
+            .collect();
+        let mean = errors.iter().sum::<f64>() / errors.len() as f64;
+        println!("nodes {skin} from the faces: mean {mean:.5} RMS {:.5}", rms(errors.iter().copied()));
+        assert!(mean.abs() < 0.01);
+    }
+    for t in got.flats.iter().flatten() {
+        let mean = t.texels.iter().map(|t| f64::from(t[0])).sum::<f64>() / t.texels.len() as f64;
+        println!("wall {mean:.4}, {a} expected; RMS {:.4}", rms(t.texels.iter().map(|t| f64::from(t[0]) - a)));
+        assert!((mean - a).abs() < 0.01);
+    }
+}
