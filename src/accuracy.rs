@@ -6,7 +6,7 @@
 
 mod floor;
 
-pub use floor::interpolation_floor;
+pub use floor::{interpolation_floor, through_grid, total_floor};
 
 use crate::error::{Error, Result};
 use crate::export::ply::PlyMesh;

@@ -2,8 +2,8 @@
 
 mod compare;
 mod extract;
-mod reference;
 mod flatland;
+mod reference;
 mod study;
 
 use crate::bake::{BakeOptions, BakeSettings, bake};
@@ -66,8 +66,8 @@ enum Verb {
     Compare(compare::Compare),
     /// n = 2: pictures of light on a height field, in horizontal planes and as an ordinary surface
     Flatland(flatland::Flatland),
-    /// Make tables and plots of error and speed
-    Study(study::StudyArgs),
+    /// Measure: tables and plots
+    Study(study::Study),
 }
 
 #[derive(clap::Args, Debug)]

@@ -24,8 +24,9 @@ pub enum Strategy {
 const MAX_BATCHES: usize = 4096;
 
 /// `count` positions in the local frame. The level set through each is the one it samples; positions whose isovalue
-/// lies outside the sweep are left out, so the result may be shorter for planes and level sets, and for uniform samples
-/// of a sweep that fills less than about `count` / 4·10⁹ of Ω. [`Strategy::Nodes`] gives none: the grid knows its nodes.
+/// lies outside the sweep are left out, so the result may be shorter for level sets at the sweep's ends, and for uniform
+/// samples and planes of a sweep that fills less than about `count` / 4·10⁹ of Ω. All strategies give `count` samples
+/// otherwise, so that they are compared at equal numbers. [`Strategy::Nodes`] gives none: the grid knows its nodes.
 ///
 /// # Errors
 /// From extracting level sets.
@@ -40,34 +41,36 @@ pub fn positions(field: &Field, strategy: &Strategy, count: u64, seed: u64) -> R
     };
     match strategy {
         Strategy::Nodes => Ok(Vec::new()),
-        Strategy::Uniform => {
-            // Batches until enough lie on the sweep, in the order of the sequence.
-            const BATCH: usize = 1 << 20;
-            let mut found: Vec<Vec3> = Vec::new();
-            for batch in 0..MAX_BATCHES {
-                let range = batch * BATCH..(batch + 1) * BATCH;
-                found.par_extend(range.into_par_iter().map(|i| uniform(i).as_vec3()).filter(on_sweep));
-                if found.len() as u64 >= count {
-                    found.truncate(count as usize);
-                    break;
-                }
-            }
-            Ok(found)
-        }
-        Strategy::Planes(planes) => Ok((0..count as usize)
-            .into_par_iter()
-            .filter_map(|i| {
-                // (1,1,1) in units of Ω: each point of a slab goes straight to the plane in the slab's middle.
-                let p = uniform(i) / far;
-                let s = p.element_sum() / 3.0;
-                let plane = ((s * *planes as f64).floor() + 0.5) / *planes as f64;
-                let q = p + (plane - s);
-                (q.cmpge(DVec3::ZERO).all() && q.cmple(DVec3::ONE).all()).then(|| (q * far).as_vec3())
-            })
-            .filter(on_sweep)
-            .collect()),
+        Strategy::Uniform => Ok(in_batches(count, |i| {
+            let p = uniform(i).as_vec3();
+            on_sweep(&p).then_some(p)
+        })),
+        Strategy::Planes(planes) => Ok(in_batches(count, |i| {
+            // (1,1,1) in units of Ω: each point of a slab goes straight to the plane in the slab's middle.
+            let p = uniform(i) / far;
+            let s = p.element_sum() / 3.0;
+            let plane = ((s * *planes as f64).floor() + 0.5) / *planes as f64;
+            let q = p + (plane - s);
+            let q = (q.cmpge(DVec3::ZERO).all() && q.cmple(DVec3::ONE).all()).then(|| (q * far).as_vec3())?;
+            on_sweep(&q).then_some(q)
+        })),
         Strategy::LevelSets(isovalues) => level_set_positions(field, isovalues, count, seed),
     }
+}
+
+/// The first `count` points that `point` gives for 0, 1, 2 …, tried in batches until there are enough.
+#[allow(clippy::cast_possible_truncation, reason = "counts of what fits memory")]
+fn in_batches(count: u64, point: impl Fn(usize) -> Option<Vec3> + Sync) -> Vec<Vec3> {
+    const BATCH: usize = 1 << 20;
+    let mut found: Vec<Vec3> = Vec::new();
+    for batch in 0..MAX_BATCHES {
+        found.par_extend((batch * BATCH..(batch + 1) * BATCH).into_par_iter().filter_map(&point));
+        if found.len() as u64 >= count {
+            found.truncate(count as usize);
+            break;
+        }
+    }
+    found
 }
 
 /// Points uniform by world area over the triangles of the level sets, then moved along ∇h onto the trilinear surface.
@@ -110,6 +113,7 @@ fn level_set_positions(field: &Field, isovalues: &[f64], count: u64, seed: u64) 
             }
             p.as_vec3()
         })
-        .filter(|p| (0.0..=1.0).contains(&field.value(p.as_dvec3())))
+        // A level set at the sweep's very end keeps the half of its points that rounding puts beyond.
+        .filter(|p| (-1e-4..=1.0 + 1e-4).contains(&field.value(p.as_dvec3())))
         .collect())
 }

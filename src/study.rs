@@ -14,7 +14,6 @@ use crate::accuracy::{Accuracy, ReferenceMesh, compare};
 use crate::bake::{Bake, BakeSettings, bake};
 use crate::embree::{Device, SurfaceTracer};
 use crate::error::{Error, Result};
-
 use crate::export::ply;
 use crate::progress::Progress;
 use crate::reference::{ReferenceSettings, reference};

@@ -1,12 +1,12 @@
 //! The interpolation floor: what a lattice can hold at all, whatever fills it.
 
-use super::{Accuracy, ReferenceMesh, compare};
+use super::{Accuracy, ReferenceMesh, compare, display};
 use crate::brdf::reflected;
-use crate::direct::direct_irradiance;
-use crate::error::Result;
+use crate::direct::{Receiver, direct_irradiance};
+use crate::error::{Error, Result};
 use crate::illumination_grid::GridSize;
 use crate::mask::stand_ins;
-use crate::reference::{receiver, subset};
+use crate::reference::{PathTracer, receiver, subset};
 use crate::rng::Stage;
 use crate::scene::Scene;
 use crate::surface_mesh::SurfaceMesh;
@@ -17,8 +17,7 @@ use rayon::prelude::*;
 
 /// Exact direct light at the points of a grid `factor` times as fine as the volume's, interpolated linearly, against
 /// exact direct light at (a fixed subset of) the vertices of the isosurface at `isovalue` (units of the sweep). "Exact" is
-/// the closed form times the visible share of `shadow_rays` low-discrepancy points. Only points that the vertices'
-/// cells touch are computed; points without a level set of their own are filled from their surroundings as bakes do.
+/// the closed form times the visible share of `shadow_rays` low-discrepancy points.
 ///
 /// # Errors
 /// `Invalid` if the grid has too many points or no vertex has a normal.
@@ -31,49 +30,21 @@ pub fn interpolation_floor<T: Tracer>(
     shadow_rays: u32,
     vertices: Option<usize>,
 ) -> Result<Accuracy> {
-    let side = scene.surface.outside;
-    let lattice = GridSize::Factor(factor).lattice(scene.lattice())?;
-    let direct = |p: DVec3, c: f32, index: u64| {
-        let r = receiver(scene, p, c, side)?;
-        let e = direct_irradiance(scene, tracer, &r, shadow_rays, (0, Stage::Direct, index)).mean;
-        Some(reflected(scene.surface.albedo, e))
+    let direct = |r: &Receiver, index: u64| {
+        let e = direct_irradiance(scene, tracer, r, shadow_rays, (0, Stage::Direct, index)).mean;
+        reflected(scene.surface.albedo, e)
     };
     let chosen = subset(mesh.local.len(), vertices);
-    let at_vertices: Vec<Option<DVec3>> =
-        chosen.par_iter().map(|&v| direct(mesh.local[v], isovalue, v as u64)).collect();
-
-    let scale = lattice.far() / scene.lattice().far();
-    let mut points: Vec<usize> =
-        chosen.iter().flat_map(|&v| corners(&lattice, mesh.local[v] * scale).map(|(o, _)| o)).collect();
-    points.sort_unstable();
-    points.dedup();
-    #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
-    let at_points: Vec<Option<DVec3>> = points
-        .par_iter()
-        .map(|&o| {
-            let (mut sum, mut count) = (DVec3::ZERO, 0.0);
-            for (i, p) in stand_ins(&scene.field, &lattice, o, 0).into_iter().flatten().enumerate() {
-                if let Some(value) = direct(p, scene.field.value(p) as f32, (o * 2 + i) as u64) {
-                    (sum, count) = (sum + value, count + 1.0);
-                }
-            }
-            (count > 0.0).then(|| sum / count)
-        })
-        .collect();
-
+    let interpolated = through_grid(scene, mesh, &chosen, factor, &direct)?;
     let n = mesh.local.len();
     let (mut texture, mut radiance, mut sampled) = (vec![DVec3::ZERO; n], vec![DVec3::ZERO; n], vec![false; n]);
-    for (&v, exact) in chosen.iter().zip(at_vertices) {
-        let Some(exact) = exact else { continue };
-        let (mut sum, mut weight) = (DVec3::ZERO, 0.0);
-        for (o, w) in corners(&lattice, mesh.local[v] * scale) {
-            let slot = points.binary_search(&o).expect("all corners are listed");
-            if let Some(value) = at_points[slot] {
-                (sum, weight) = (sum + w * value, weight + w);
-            }
-        }
-        if weight > 0.0 {
-            (texture[v], radiance[v], sampled[v]) = (sum / weight, exact, true);
+    let exact: Vec<Option<DVec3>> = chosen
+        .par_iter()
+        .map(|&v| Some(direct(&receiver(scene, mesh.local[v], isovalue, scene.surface.outside)?, !(v as u64))))
+        .collect();
+    for ((&v, exact), through) in chosen.iter().zip(exact).zip(interpolated) {
+        if let (Some(exact), Some(through)) = (exact, through) {
+            (texture[v], radiance[v], sampled[v]) = (through, exact, true);
         }
     }
     let reference = ReferenceMesh {
@@ -84,6 +55,88 @@ pub fn interpolation_floor<T: Tracer>(
         sampled,
     };
     Ok(compare(&texture, &[reference], scene.exposure())?.0)
+}
+
+/// As [`interpolation_floor`] for all light: path-traced radiance at the grid's points (`paths` each), interpolated,
+/// against two independent references on the same vertices; percent RMS. Two independent sets of paths at the points make
+/// ⟨(t₁ − r₁)·(t₂ − r₂)⟩ free of the noise of both sides. 0 where that is negative.
+///
+/// # Errors
+/// `Invalid` if the grid has too many points.
+pub fn total_floor<T: Tracer>(
+    scene: &Scene,
+    tracer: &T,
+    mesh: &SurfaceMesh,
+    references: &[ReferenceMesh],
+    factor: usize,
+    paths: u32,
+    vertices: usize,
+) -> Result<f64> {
+    let [a, b] = references else {
+        return Err(Error::Invalid("the floor of all light needs two references".into()));
+    };
+    let mut chosen: Vec<usize> = (0..mesh.local.len()).filter(|&v| a.sampled[v] && b.sampled[v]).collect();
+    let keep = subset(chosen.len(), Some(vertices));
+    chosen = keep.into_iter().map(|i| chosen[i]).collect();
+    let texture = |seed: u64| {
+        let value = |r: &Receiver, index: u64| PathTracer::new(scene, tracer).outgoing(r, paths, (seed, index));
+        through_grid(scene, mesh, &chosen, factor, &value)
+    };
+    let (first, second) = (texture(1_000_001)?, texture(1_000_002)?);
+    let exposure = scene.exposure();
+    let (mut sum, mut count) = (0.0, 0.0);
+    for ((&v, t), u) in chosen.iter().zip(first).zip(second) {
+        let (Some(t), Some(u)) = (t, u) else { continue };
+        let d = |t: DVec3, r: &ReferenceMesh| display(t, exposure) - display(r.radiance[v], exposure);
+        sum += d(t, a).dot(d(u, b));
+        count += 1.0;
+    }
+    Ok(100.0 * (sum / f64::max(count, 1.0)).max(0.0).sqrt())
+}
+
+/// Radiance at the vertices `chosen` of `mesh` as a grid `factor` times as fine as the volume's gives it if its points
+/// hold `value(receiver, index)`. Only points that the vertices' cells touch are asked for; those without a level set of
+/// their own are filled from their surroundings as bakes do. `None` where no point of a cell holds anything.
+///
+/// # Errors
+/// `Invalid` if the grid has too many points.
+pub fn through_grid(
+    scene: &Scene,
+    mesh: &SurfaceMesh,
+    chosen: &[usize],
+    factor: usize,
+    value: &(dyn Fn(&Receiver, u64) -> DVec3 + Sync),
+) -> Result<Vec<Option<DVec3>>> {
+    let lattice = GridSize::Factor(factor).lattice(scene.lattice())?;
+    let scale = lattice.far() / scene.lattice().far();
+    let around = |v: usize| corners(&lattice, mesh.local[v] * scale);
+    let mut points: Vec<usize> = chosen.iter().flat_map(|&v| around(v).map(|(o, _)| o)).collect();
+    points.sort_unstable();
+    points.dedup();
+    #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
+    let held: Vec<Option<DVec3>> = points
+        .par_iter()
+        .map(|&o| {
+            let (mut sum, mut count) = (DVec3::ZERO, 0.0);
+            for (i, p) in stand_ins(&scene.field, &lattice, o, 0).into_iter().flatten().enumerate() {
+                if let Some(r) = receiver(scene, p, scene.field.value(p) as f32, scene.surface.outside) {
+                    (sum, count) = (sum + value(&r, (o * 2 + i) as u64), count + 1.0);
+                }
+            }
+            (count > 0.0).then(|| sum / count)
+        })
+        .collect();
+    let at = |&v: &usize| {
+        let (mut sum, mut weight) = (DVec3::ZERO, 0.0);
+        for (o, w) in around(v) {
+            let slot = points.binary_search(&o).expect("all corners are listed");
+            if let Some(value) = held[slot] {
+                (sum, weight) = (sum + w * value, weight + w);
+            }
+        }
+        (weight > 0.0).then(|| sum / weight)
+    };
+    Ok(chosen.iter().map(at).collect())
 }
 
 /// The eight lattice points around index coordinates `p`, with their linear weights.

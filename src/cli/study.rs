@@ -1,30 +1,29 @@
-//! `isolume study`: the tables and plots of the documentation.
+//! `isolume study`: measurements that fill tables, one subcommand each.
 
-use super::device;
 use crate::bake::BakeOptions;
 use crate::error::{Error, Result};
 use crate::flatland::study::{StudySettings, flatland};
 use crate::progress::Progress;
 use crate::scene_file::{SceneOptions, load};
-use crate::study::{Study, Subject, curve, datasets, strategies};
+use crate::study::{self, Subject};
 use std::path::{Path, PathBuf};
 
 #[derive(clap::Args, Debug)]
-pub(super) struct StudyArgs {
+pub(super) struct Study {
     #[command(subcommand)]
-    kind: Kind,
+    what: What,
 }
 
 #[derive(clap::Subcommand, Debug)]
-enum Kind {
-    /// BB09's table: sampling strategies over the sweep
-    Strategies(Tables),
-    /// Error, floor and seconds of each data set
-    Datasets(Tables),
-    /// Error against wall seconds over photons, samples and gather rays
-    Curve(Tables),
+enum What {
     /// n = 2: samples on level sets against uniform ones, from 10³ to 10⁶ (BB09's 7.4 % and 2.2 %)
     Flatland(Flatland),
+    /// BB09's table: sampling strategies at 10⁶ and 10⁷ samples over the sweep
+    Strategies(SceneStudy),
+    /// Error, interpolation floor and seconds of each data set
+    Datasets(SceneStudy),
+    /// Error against wall seconds over photons, samples and gather rays
+    Curve(SceneStudy),
 }
 
 #[derive(clap::Args, Debug)]
@@ -48,7 +47,7 @@ stopped. References are cached in DIR/references.
 Examples:
   isolume study strategies scenes/cornell-bumps.toml -o results
   isolume study datasets scenes/cornell-bumps.toml --data data -o results")]
-struct Tables {
+struct SceneStudy {
     /// Scene files or volumes
     #[arg(required_unless_present = "data", value_name = "SCENE")]
     scenes: Vec<PathBuf>,
@@ -69,23 +68,24 @@ struct Tables {
 const DATA: [(&str, &str, [f64; 2], f64); 2] =
     [("brain", "ch2.nii.gz", [15.0, 200.0], 80.0), ("neuron", "neuron.mha", [20.0, 200.0], 60.0)];
 
-impl StudyArgs {
+impl Study {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
-        match self.kind {
-            Kind::Strategies(tables) => tables.run(progress, strategies),
-            Kind::Datasets(tables) => tables.run(progress, datasets),
-            Kind::Curve(tables) => tables.run(progress, curve),
-            Kind::Flatland(v) => {
+        match self.what {
+            What::Strategies(v) => v.run(study::strategies, progress),
+            What::Datasets(v) => v.run(study::datasets, progress),
+            What::Curve(v) => v.run(study::curve, progress),
+            What::Flatland(v) => {
                 super::folder(&v.output)?;
                 let settings = StudySettings { most: v.most, seed: v.seed, ..StudySettings::default() };
-                flatland(&v.output, &device()?, &settings, progress)
+                flatland(&v.output, &super::device()?, &settings, progress)
             }
         }
     }
 }
 
-impl Tables {
-    fn run(self, progress: Progress, study: fn(&Study, &[Subject], &BakeOptions) -> Result<()>) -> Result<()> {
+impl SceneStudy {
+    /// Loads the scenes and runs `table` on them.
+    fn run(self, table: fn(&study::Study, &[Subject], &BakeOptions) -> Result<()>, progress: Progress) -> Result<()> {
         let mut subjects = Vec::new();
         for path in &self.scenes {
             let loaded = load(path, &SceneOptions::default())?;
@@ -104,7 +104,8 @@ impl Tables {
         if subjects.is_empty() {
             return Err(Error::Invalid("--data: the folder holds neither ch2.nii.gz nor neuron.mha".into()));
         }
-        study(&Study::new(self.output, device()?, progress, self.quick)?, &subjects, &self.bake)
+        let study = study::Study::new(self.output, super::device()?, progress, self.quick)?;
+        table(&study, &subjects, &self.bake)
     }
 }
 

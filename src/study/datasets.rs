@@ -1,7 +1,7 @@
 //! The table of data sets: error and seconds with and without final gather, and where the error comes from.
 
 use super::{Study, Subject, Table, accuracy_of, provenance};
-use crate::accuracy::interpolation_floor;
+use crate::accuracy::{interpolation_floor, total_floor};
 use crate::bake::{BakeOptions, BakeSettings, StrategyName};
 use crate::embree::{GraphTracer, SurfaceTracer};
 use crate::error::Result;
@@ -9,7 +9,7 @@ use crate::reference::{Reference, ReferenceSettings, reference};
 use crate::surface_mesh::SurfaceMesh;
 use std::time::Instant;
 
-const COLUMNS: [&str; 20] = [
+const COLUMNS: [&str; 21] = [
     "scene",
     "mode",
     "isovalue",
@@ -24,6 +24,7 @@ const COLUMNS: [&str; 20] = [
     "floor_1x",
     "floor_2x",
     "floor_3x",
+    "floor_total",
     "triangles_vs_trilinear",
     "build_s",
     "photons_s",
@@ -64,6 +65,8 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
             let floor = interpolation_floor(scene, &tracer, &mesh, unit, factor, shadow, Some(vertices))?;
             floors.push(floor.percent_rms);
         }
+        let paths = if study.quick { 64 } else { 256 };
+        let total = total_floor(scene, &tracer, &mesh, &references, 1, paths, vertices)?;
         let triangles = triangle_error(study, subject, &mesh, unit)?;
         for (mode, options) in &modes {
             if table.has(&key(mode)) {
@@ -85,6 +88,7 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
                 floors[0],
                 floors[1],
                 floors[2],
+                total,
                 triangles,
                 s.build,
                 s.photons,
