@@ -49,6 +49,7 @@ pub struct Cli {
 }
 
 #[derive(Subcommand, Debug)]
+#[allow(clippy::large_enum_variant, reason = "one value per process")]
 enum Verb {
     /// Print what a volume holds: lattice, type, range, percentiles, histogram, a suggested sweep
     Info(Info),

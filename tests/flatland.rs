@@ -169,7 +169,7 @@ fn extruded(flat: &FlatScene, slices: usize) -> Scene {
 #[test]
 fn an_extruded_field_looks_to_n_3_as_to_n_2() {
     let device = Device::new(2).unwrap();
-    let slices = 21;
+    let slices = 11;
     const N: usize = 33;
     for albedo in [0.2, 0.5, 0.8] {
         let flat = smooth_bumps(N, albedo);
@@ -177,13 +177,13 @@ fn an_extruded_field_looks_to_n_3_as_to_n_2() {
         let options = BakeOptions {
             strategy: Some(StrategyName::Nodes),
             photons: Some(1 << 20),
-            shadow_rays: Some(16),
+            shadow_rays: Some(64),
             gather_rays: Some(256),
             wall_resolution: Some(24),
             ..BakeOptions::default()
         };
         let mut settings = BakeSettings::new(&options).unwrap();
-        (settings.wall_shadow_rays, settings.wall_isovalues, settings.cache_shadow_rays) = (2, 32, 4);
+        (settings.wall_shadow_rays, settings.wall_isovalues, settings.cache_shadow_rays) = (4, 32, 16);
         let baked = bake(&scene, &settings, &device, Progress::Quiet).unwrap();
         let world = World::new(&device, flat, Transport::Flattened).unwrap();
         let fine = SolveSettings { factor: 4, gather: 256, shadow: 32, ..SolveSettings::default() };
