@@ -242,7 +242,8 @@ mod tests {
         assert_eq!(draw(1, Stage::Photon, 9).to_bits(), draw(1, Stage::Photon, 9).to_bits());
         // Neighbouring indices, stages and seeds: mean product of centred pairs within 5σ of 0 (σ = 1/12/√n).
         let n = 100_000u32;
-        let pairs: [(&str, fn(u64) -> (f64, f64)); 3] = [
+        type Pair = fn(u64) -> (f64, f64);
+        let pairs: [(&str, Pair); 3] = [
             ("index", |i| (Rng::stream(1, Stage::Photon, i).unit(), Rng::stream(1, Stage::Photon, i + 1).unit())),
             ("stage", |i| (Rng::stream(1, Stage::Photon, i).unit(), Rng::stream(1, Stage::Sample, i).unit())),
             ("seed", |i| (Rng::stream(1, Stage::Photon, i).unit(), Rng::stream(2, Stage::Photon, i).unit())),
