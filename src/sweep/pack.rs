@@ -86,9 +86,10 @@ impl Taps {
     #[inline(always)]
     fn many(&self, plane: &[f32], lo: usize, hi: usize, out: &mut Lanes) {
         if lo == 0 && hi == LANES {
-            let [a, b, c, d] = self
-                .at
-                .map(|at| -> &[f32; LANES] { plane[at.unsigned_abs()..][..LANES].try_into().expect("sixteen lanes") });
+            let lanes = |t: usize| -> &[f32; LANES] {
+                plane[self.at[t].unsigned_abs()..][..LANES].try_into().expect("sixteen lanes")
+            };
+            let (a, b, c, d) = (lanes(0), lanes(1), lanes(2), lanes(3));
             let w = self.weight;
             for l in 0..LANES {
                 out[l] = (w[0] * a[l] + w[1] * b[l]) + (w[2] * c[l] + w[3] * d[l]);
@@ -186,11 +187,16 @@ impl Pack {
                     at: [at, at + 1, at + sv as isize, at + sv as isize + 1],
                     weight: [(1.0 - fu) * (1.0 - fv), fu * (1.0 - fv), (1.0 - fu) * fv, fu * fv],
                 };
-                let mut line = [OUTSIDE; LANES];
-                Taps { weight: taps.weight.map(|w| w * plan.sign), ..taps }.many(h, lo, hi, &mut line);
-                self.h[row] = line;
+                // Whole packs wherever memory allows: lanes outside Ω read a neighbouring row and are blanked.
+                let whole = at >= 0 && at.unsigned_abs() + sv + 1 + LANES <= h.len();
+                let (l0, l1) = if whole { (0, LANES) } else { (lo, hi) };
+                let line = &mut self.h[row];
+                Taps { weight: taps.weight.map(|w| w * plan.sign), ..taps }.many(h, l0, l1, line);
+                for (l, x) in line.iter_mut().enumerate() {
+                    *x = if lo <= l && l < hi { *x } else { OUTSIDE };
+                }
                 for c in 0..3 {
-                    taps.many(&b[c], lo, hi, &mut self.b[c][row]);
+                    taps.many(&b[c], l0, l1, &mut self.b[c][row]);
                 }
                 range = (range.0.min(row), row);
             } else {
