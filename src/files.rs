@@ -168,6 +168,7 @@ pub(crate) fn write_atomically(path: &Path, write: impl FnOnce(&mut AtomicFile) 
 mod tests {
     use super::*;
     use flate2::{Compression, write::GzEncoder};
+    use std::io::Write;
 
     fn gz(bytes: &[u8]) -> Vec<u8> {
         let mut e = GzEncoder::new(Vec::new(), Compression::fast());
