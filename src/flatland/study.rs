@@ -265,20 +265,22 @@ fn write(path: &Path, text: &str) -> Result<()> {
 /// Samples as dots of their radiance, and the grid made from them.
 fn figure5(bench: &Bench, positions: &[DVec2], grid: &[DVec3]) -> crate::export::picture::Picture {
     const FACTOR: usize = 5;
+    /// A blue that no light of the box has.
+    const OFF_SWEEP: DVec3 = DVec3::new(0.08, 0.12, 0.25);
     let field = &bench.world.scene.field;
     let exposure = 0.8 * bench.world.exposure();
     let values: Vec<[f32; 3]> = grid.iter().map(|c| c.as_vec3().to_array()).collect();
     let dims = field.dims();
     let colour = |p: DVec2| lookup(&values, dims, [p.x as f32, p.y as f32]) * exposure;
     let inside = |p: DVec2| (0.0..=1.0).contains(&field.value(p));
-    let mut dots = map(field, FACTOR, |_| DVec3::ONE);
+    let mut dots = map(field, FACTOR, |_| OFF_SWEEP);
     for &p in positions {
         let (x, y) = ((p.x * FACTOR as f64) as usize, (p.y * FACTOR as f64) as usize);
         let (x, y) = (x.min(dots.width - 1), dots.height - 1 - y.min(dots.height - 1));
         let at = y * dots.width + x;
-        dots.rgb[at] = (colour(p) * 0.8).as_vec3().to_array();
+        dots.rgb[at] = colour(p).as_vec3().to_array();
     }
-    let interpolated = map(field, FACTOR, |p| if inside(p) { colour(p) } else { DVec3::ONE });
+    let interpolated = map(field, FACTOR, |p| if inside(p) { colour(p) } else { OFF_SWEEP });
     side_by_side(&[dots, interpolated])
 }
 

@@ -40,7 +40,8 @@ fn closed_curves_let_no_ray_out() {
                 2 => d[1] *= 1e-7,
                 _ => {}
             }
-            let c = scene.field.sweep().isovalue((1 + rng.bits() % (levels - 1).max(1)) as f64);
+            let c =
+                scene.field.sweep().isovalue(if levels == 2 { 0.5 } else { (1 + rng.bits() % (levels - 2)) as f64 });
             let ray = FlattenedRay::free(Vec3::new(p[0], p[1], 0.0), Vec3::new(d[0], d[1], 0.0), c);
             if !(scene.field.value(DVec2::new(p[0].into(), p[1].into())) > f64::from(c)) {
                 continue;
