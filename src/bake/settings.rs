@@ -31,11 +31,10 @@ pub enum Engine {
 }
 
 /// The placement of samples, by name.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub enum StrategyName {
     /// Uniform over the volume.
-    #[default]
     Uniform,
     /// On level sets 17.7 apart (in units of a sweep of 91.4), as BB09's strategy 1.
     LevelSet,
@@ -85,10 +84,10 @@ pub struct BakeOptions {
     /// Largest isovalue difference of a photon to its estimate, as a fraction of the sweep
     #[arg(long, value_name = "TAU")]
     pub tau: Option<f64>,
-    /// Radiance samples per side
+    /// Scattered radiance samples per side (default: one at each grid point)
     #[arg(long, value_name = "N")]
     pub samples: Option<u64>,
-    /// Where samples are placed
+    /// Where samples are placed (default: nodes, or uniform if --samples is given)
     #[arg(long)]
     pub strategy: Option<StrategyName>,
     /// Shadow rays per sample and luminaire: the most; a quarter where all or none reach it
@@ -243,7 +242,12 @@ impl BakeSettings {
             tau: o.tau.unwrap_or(EstimateSettings::default().tau),
             samples: o.samples,
             samples_per_point: density,
-            strategy: o.strategy.unwrap_or_default(),
+            // A number of samples asks for scattered ones.
+            strategy: o.strategy.unwrap_or(if o.samples.is_some() {
+                StrategyName::Uniform
+            } else {
+                StrategyName::Nodes
+            }),
             shadow_rays: o.shadow_rays.unwrap_or(shadow),
             gather_rays: o.gather_rays.unwrap_or(gather),
             cache_shadow_rays: cache,
