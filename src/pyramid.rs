@@ -3,7 +3,7 @@
 //! A node has 4×4×4 children, and their 64 ranges of h stand together in a [`Tile`]: so one step of the walk finds, as
 //! the bits of a word, all children of a node that both hold the isovalue and lie on the ray (`walk`).
 
-mod avx512;
+mod simd;
 mod children;
 mod packet;
 #[cfg(test)]
@@ -12,10 +12,10 @@ mod walk;
 
 use crate::field::Field;
 use crate::flattened::{FlattenedHit, FlattenedRay};
-use avx512::Avx512;
 use children::Scalar;
 use glam::Vec4;
 use rayon::prelude::*;
+use simd::Avx512;
 
 /// Levels at most: children are cells, then blocks of 4³, 16³ and 64³ cells.
 const LEVELS: usize = 4;
