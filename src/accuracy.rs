@@ -1,4 +1,4 @@
-//! How far a bake is from references: percent RMS as BB09 measured it. [BB09 §3]
+//! How far a bake is from references: percent RMS as BB09 measured it. \[BB09 §3\]
 //!
 //! Colours are linear, rgb = L π / (ρ_max E₀) clamped to [0, 1]. BB09 print the squared vertex error as |Δ|, without the
 //! square; read as a squared Euclidean norm, `percent_rms = 100 √⟨|rgb_tex − rgb_ref|²⟩` is what this crate reports, and

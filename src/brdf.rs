@@ -1,4 +1,4 @@
-//! The one reflectance: Lambert's, f = ρ/π in three dimensions and f♭ = ρ/2 in flatland. [BB09 Eqs. 1, 2]
+//! The one reflectance: Lambert's, f = ρ/π in three dimensions and f♭ = ρ/2 in flatland. \[BB09 Eqs. 1, 2\]
 
 use glam::DVec3;
 use std::f64::consts::PI;

@@ -29,7 +29,7 @@ impl Cell {
     }
 
     /// h − c along p + t d as a cubic in t, by 37-operation coefficients: h = P(x,y) + z Q(x,y), each restricted to the
-    /// ray. [HSEAM22, after Parker99]
+    /// ray. \[HSEAM22, after Parker99\]
     #[inline(always)]
     pub fn cubic(&self, c: f64, p: DVec3, d: DVec3) -> Cubic {
         let s = self.s.map(f64::from);

@@ -1,6 +1,6 @@
 //! Cubics in f64: where one first changes sign on an interval, by signs that the caller owns.
 //!
-//! A trilinear cell restricted to a ray is a cubic [Parker99]. Neighbouring cells must agree whether a ray crosses the
+//! A trilinear cell restricted to a ray is a cubic \[Parker99\]. Neighbouring cells must agree whether a ray crosses the
 //! level set, so the signs at the ends come from outside (the shared faces), and the solver only has to say where.
 
 /// c0 + c1 t + c2 t² + c3 t³.

@@ -32,7 +32,7 @@ pub struct Estimate {
     pub rays: u64,
 }
 
-/// Luminance of linear RGB with sRGB's primaries. [BT.709]
+/// Luminance of linear RGB with sRGB's primaries. \[BT.709\]
 #[inline]
 pub fn luminance(rgb: DVec3) -> f64 {
     rgb.dot(DVec3::new(0.2126, 0.7152, 0.0722))

@@ -259,7 +259,7 @@ impl Field {
     }
 
     /// Unit normal of the level set at `p`, towards falling h (the lower side); `None` where ∇h vanishes or no value
-    /// is finite. [BB09 §2.3: N♭]
+    /// is finite. \[BB09 §2.3: N♭\]
     #[inline]
     pub fn falling_normal(&self, p: DVec3) -> Option<DVec3> {
         unit(-self.receiver_gradient(p))

@@ -1,4 +1,4 @@
-//! n = 2: light on height fields, where BB09's idea shows in one picture. [BB09 §2–2.2]
+//! n = 2: light on height fields, where BB09's idea shows in one picture. \[BB09 §2–2.2\]
 //!
 //! h₂: R² → R has a surface in R³ for a graph. *Flattened*, light stays in horizontal planes: the plane at height c holds
 //! the level curve L(h, c), the walls and the luminaire as segments, and a point reflects by f♭ = ρ/2. *Ordinary*, the
@@ -31,9 +31,9 @@ use std::sync::Arc;
 /// How light travels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Transport {
-    /// In horizontal planes, a circle of directions about every point. [BB09 Eq. 2]
+    /// In horizontal planes, a circle of directions about every point. \[BB09 Eq. 2\]
     Flattened,
-    /// In R³, a sphere of directions about every point. [BB09 Eq. 1]
+    /// In R³, a sphere of directions about every point. \[BB09 Eq. 1\]
     Ordinary,
 }
 

@@ -1,4 +1,4 @@
-//! Flattened rays and hits: a ray of R⁴ that never leaves its hyperplane h = c. [BB09 §2.3]
+//! Flattened rays and hits: a ray of R⁴ that never leaves its hyperplane h = c. \[BB09 §2.3\]
 //!
 //! Space is the *local frame*: index coordinates of the scene's lattice. It keeps f32 fine-grained wherever the data
 //! stand in the world, and t is the same number in every affine frame.

@@ -1,4 +1,4 @@
-//! Final gather: one bounce of rays into the radiance cache. [Jensen01; Christensen99]
+//! Final gather: one bounce of rays into the radiance cache. \[Jensen01; Christensen99\]
 
 use crate::direct::{Estimate, Receiver, luminance};
 use crate::flattened::FlattenedRay;
@@ -15,7 +15,7 @@ use std::f64::consts::PI;
 const PACKET: usize = 16;
 
 /// Indirect irradiance at `receiver`: π/M Σ L over `rays` cosine-distributed directions. Luminaires count 0, since
-/// direct light is counted apart; what leaves everything carries nothing. [BB09 Eq. 2]
+/// direct light is counted apart; what leaves everything carries nothing. \[BB09 Eq. 2\]
 pub fn gathered_irradiance<T: Tracer>(
     scene: &Scene,
     tracer: &T,

@@ -110,7 +110,7 @@ impl IlluminationGrid {
 }
 
 /// Modified Shepard interpolation: the `neighbours` nearest samples, weighted ((R − d)/(R d))² with R the distance of
-/// the farthest. [Shepard68; FN80] `tick(n)` reports n points done; returning false stops early.
+/// the farthest. \[Shepard68; FN80\] `tick(n)` reports n points done; returning false stops early.
 #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
 pub fn shepard(
     field: &Field,

@@ -1,5 +1,5 @@
 //! Photons in the flattened scene: emission over luminaires and isovalues, scattering inside one hyperplane, energy
-//! kept to the last bit. [BB09 §2.3; Jensen01]
+//! kept to the last bit. \[BB09 §2.3; Jensen01\]
 
 use crate::flattened::{Departure, Side, Target};
 use crate::rng::{Rng, Sobol, Stage};

@@ -1,5 +1,5 @@
 //! Planar convex polygons of R³: walls and luminaires, extruded over the sweep's isovalue range by standing in every
-//! hyperplane alike. [BB09 §2.3: p × I]
+//! hyperplane alike. \[BB09 §2.3: p × I\]
 
 use crate::error::{Error, Result};
 use crate::flattened::{Departure, FlattenedRay};

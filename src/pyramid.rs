@@ -1,6 +1,6 @@
 //! The min/max hierarchy over all cells, valid for every isovalue, and the walk of a flattened ray through it.
 //!
-//! A node has 4×4×4 children, and their 64 ranges of h stand together in a [`Tile`]: so one step of the walk finds, as
+//! A node has 4×4×4 children, and their 64 ranges of h stand together in a tile: so one step of the walk finds, as
 //! the bits of a word, all children of a node that both hold the isovalue and lie on the ray (`walk`).
 
 mod simd;

@@ -1,4 +1,4 @@
-//! Radiance samples: direct light by shadow rays, indirect light from the photon map or by final gather. [BB09 §2.3]
+//! Radiance samples: direct light by shadow rays, indirect light from the photon map or by final gather. \[BB09 §2.3\]
 
 use crate::brdf::reflected;
 use crate::direct::{Receiver, direct_irradiance, luminance};

@@ -1,5 +1,5 @@
 //! The radiance that a gather ray finds where it lands: reflected light cached at the lattice's nodes, per side, and on
-//! flats as (u, v, c) textures. Direct light by shadow rays plus photons without their first landings. [Christensen99]
+//! flats as (u, v, c) textures. Direct light by shadow rays plus photons without their first landings. \[Christensen99\]
 
 use crate::brdf::reflected;
 use crate::direct::{Receiver, direct_irradiance};

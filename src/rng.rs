@@ -30,7 +30,7 @@ pub enum Stage {
     Test = 11,
 }
 
-/// The finaliser of SplitMix64: a bijection in which every input bit moves every output bit. [Steele14]
+/// The finaliser of SplitMix64: a bijection in which every input bit moves every output bit. \[Steele14\]
 #[inline]
 fn mix(mut z: u64) -> u64 {
     z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -40,7 +40,7 @@ fn mix(mut z: u64) -> u64 {
 
 const GOLDEN: u64 = 0x9e37_79b9_7f4a_7c15;
 
-/// A stream of independent numbers, SplitMix64 keyed by (seed, stage, index). [Steele14]
+/// A stream of independent numbers, SplitMix64 keyed by (seed, stage, index). \[Steele14\]
 #[derive(Clone, Debug)]
 pub struct Rng {
     state: u64,
@@ -72,7 +72,7 @@ impl Rng {
         [self.unit(), self.unit()]
     }
 
-    /// A standard normal number (Box–Muller). [BM58]
+    /// A standard normal number (Box–Muller). \[BM58\]
     pub fn normal(&mut self) -> f64 {
         let [u, v] = self.unit2();
         (-2.0 * (1.0 - u).ln()).sqrt() * (std::f64::consts::TAU * v).cos()
@@ -88,7 +88,7 @@ fn key(seed: u64, stage: Stage, index: u64) -> u64 {
 pub const SOBOL_DIMENSIONS: usize = 6;
 
 /// Direction numbers as byte tables: point = XOR of four table entries. Dimension 0 is van der Corput's, the others
-/// come from the primitive polynomials and initial numbers of [JoeKuo08].
+/// come from the primitive polynomials and initial numbers of \[JoeKuo08\].
 static DIRECTIONS: [[[u32; 256]; 4]; SOBOL_DIMENSIONS] = direction_tables();
 
 const fn direction_tables() -> [[[u32; 256]; 4]; SOBOL_DIMENSIONS] {
@@ -145,7 +145,7 @@ const fn direction_tables() -> [[[u32; 256]; 4]; SOBOL_DIMENSIONS] {
     tables
 }
 
-/// The first 2³² points of the Sobol sequence, Owen-scrambled by hashing [Burley20], with the index shuffled the same
+/// The first 2³² points of the Sobol sequence, Owen-scrambled by hashing \[Burley20\], with the index shuffled the same
 /// way, so that two sets with different seeds are independent and every power-of-two prefix is stratified.
 #[derive(Clone, Copy, Debug)]
 pub struct Sobol {
@@ -184,7 +184,7 @@ impl Sobol {
 }
 
 /// Nested uniform (Owen) scrambling: bit k is flipped by a hash of the bits above it. The Laine–Karras hash with
-/// Vegdahl's constants. [Burley20]
+/// Vegdahl's constants. \[Burley20\]
 #[inline]
 fn scramble(x: u32, seed: u32) -> u32 {
     let mut x = x.reverse_bits();

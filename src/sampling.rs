@@ -1,4 +1,4 @@
-//! Where radiance is sampled: the strategies of [BB09 §3], and the grid's own nodes.
+//! Where radiance is sampled: the strategies of \[BB09 §3\], and the grid's own nodes.
 
 use crate::error::Result;
 use crate::field::Field;

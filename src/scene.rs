@@ -48,7 +48,7 @@ impl Surface {
     }
 }
 
-/// A scene: {graph of h, walls × I, luminaires × I}. [BB09 §2.3]
+/// A scene: {graph of h, walls × I, luminaires × I}. \[BB09 §2.3\]
 #[derive(Clone, Debug)]
 pub struct Scene {
     /// h, its lattice and the sweep.

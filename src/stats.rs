@@ -1,6 +1,6 @@
 //! Statistics that judge: running moments, z and χ² tests, Šidák's correction.
 
-/// Running mean and variance. [Welford62]
+/// Running mean and variance. \[Welford62\]
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Moments {
     n: u64,
@@ -39,7 +39,7 @@ impl Moments {
     }
 }
 
-/// The level each of `n` independent tests must be run at so that the family errs with probability `alpha`. [Šidák67]
+/// The level each of `n` independent tests must be run at so that the family errs with probability `alpha`. \[Šidák67\]
 pub fn sidak(alpha: f64, n: usize) -> f64 {
     1.0 - (1.0 - alpha).powf(1.0 / n as f64)
 }
@@ -65,7 +65,7 @@ pub fn normal_quantile(p: f64) -> f64 {
     0.5 * (lo + hi)
 }
 
-/// The regularised lower incomplete gamma function P(a, x): series below a + 1, continued fraction above. [DLMF 8.11, 8.9]
+/// The regularised lower incomplete gamma function P(a, x): series below a + 1, continued fraction above. \[DLMF 8.11, 8.9\]
 fn lower_gamma(a: f64, x: f64) -> f64 {
     if x <= 0.0 {
         return 0.0;
@@ -102,7 +102,7 @@ fn lower_gamma(a: f64, x: f64) -> f64 {
     }
 }
 
-/// ln Γ by Lanczos' approximation, relative error below 1e-13 for a > 0. [Lanczos64]
+/// ln Γ by Lanczos' approximation, relative error below 1e-13 for a > 0. \[Lanczos64\]
 fn ln_gamma(a: f64) -> f64 {
     const G: f64 = 7.0;
     const P: [f64; 9] = [

@@ -79,7 +79,7 @@ impl Study {
     /// the cache or computed; `None` if there is no surface.
     ///
     /// # Errors
-    /// As [`reference`], or from reading the cache.
+    /// As `reference()`, or from reading the cache.
     pub fn references(&self, subject: &Subject, isovalue: f64) -> Result<Option<Vec<ReferenceMesh>>> {
         let (vertices, samples) = if self.quick { (500, 128) } else { (4000, 1024) };
         let scene = &subject.scene;

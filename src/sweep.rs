@@ -4,7 +4,7 @@
 //! * Direct light: along a line from a luminaire's point, a sample is lit on its own level set iff h there exceeds the
 //!   running maximum. One fan of lines lights every node and every isovalue.
 //! * Indirect light: along a line, the first hit of the ray that leaves sample k is the next value ≥ h_k
-//!   (all nearest greater values, amortised O(1) with a stack [BSV93]). There h = h_k again, so the grid itself holds
+//!   (all nearest greater values, amortised O(1) with a stack \[BSV93\]). There h = h_k again, so the grid itself holds
 //!   the right level set's radiance. A pass over all directions is one bounce for every node and isovalue; passes are
 //!   iterated (Jacobi) until what is left out is small.
 //!
@@ -383,7 +383,7 @@ struct Totals {
     sides: Vec<Side>,
     direct: Vec<Planes>,
     indirect: Vec<Planes>,
-    /// Running mean and sum of squared deviations of the luminance of ρE/π. [Welford62]
+    /// Running mean and sum of squared deviations of the luminance of ρE/π. \[Welford62\]
     spread: Vec<Vec<[f32; 2]>>,
     count: f32,
 }

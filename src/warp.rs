@@ -3,7 +3,7 @@
 use glam::DVec3;
 use std::f64::consts::{PI, TAU};
 
-/// An orthonormal frame whose third axis is a given unit normal. [Duff17]
+/// An orthonormal frame whose third axis is a given unit normal. \[Duff17\]
 #[derive(Clone, Copy, Debug)]
 pub struct Frame {
     /// First tangent.
@@ -35,7 +35,7 @@ impl Frame {
     }
 }
 
-/// Concentric map of the unit square onto the unit disk: area-preserving, so strata stay compact. [Shirley97]
+/// Concentric map of the unit square onto the unit disk: area-preserving, so strata stay compact. \[Shirley97\]
 #[inline]
 pub fn disk([u, v]: [f64; 2]) -> [f64; 2] {
     let (x, y) = (2.0 * u - 1.0, 2.0 * v - 1.0);

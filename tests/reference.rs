@@ -344,7 +344,7 @@ fn the_interpolation_floor_falls_with_the_grid() {
     let c = scene.field.sweep().isovalue(47.0);
     let tracer = GraphTracer::new(&device, &scene).unwrap();
     let mesh = SurfaceMesh::extract(&scene, c, 1).unwrap();
-    let floor = |factor| interpolation_floor(&scene, &tracer, &mesh, c, factor, 64, Some(300)).unwrap().percent_rms;
+    let floor = |factor| interpolation_floor(&scene, &tracer, &mesh, c, factor, 1024, Some(300)).unwrap().percent_rms;
     let (coarse, fine) = (floor(1), floor(3));
     assert!(fine < 0.7 * coarse && coarse < 5.0 && fine > 0.0, "{coarse} {fine}");
 }

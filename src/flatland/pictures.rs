@@ -365,7 +365,7 @@ fn draw_paths(view: &View, world: &World, picture: &mut Picture, plane: f64, cou
     }
 }
 
-/// The level sets in the plane with walls and luminaire. [BB09 Fig. 2]
+/// The level sets in the plane with walls and luminaire. \[BB09 Fig. 2\]
 fn write_svg(path: &Path, scene: &super::FlatScene, levels: &[f64]) -> Result<()> {
     let [lo, hi] = scene.field.bounds();
     let scale = 480.0 / (hi - lo).max_element();

@@ -1,5 +1,5 @@
 //! BB09's n = 2 experiment: radiance samples on level sets against samples anywhere, by the error of the grid that is
-//! interpolated from them. [BB09 §2.2, Fig. 5]
+//! interpolated from them. \[BB09 §2.2, Fig. 5\]
 
 use super::contour::level_curve;
 use super::pictures::{map, side_by_side, stacked};
@@ -188,7 +188,7 @@ impl Bench {
     }
 
     /// Modified Shepard interpolation onto the grid's points, as for n = 3: the nearest samples weighted
-    /// ((R − d)/(R d))², R the distance of the farthest. [Shepard68; FN80]
+    /// ((R − d)/(R d))², R the distance of the farthest. \[Shepard68; FN80\]
     fn shepard(&self, samples: &[(DVec2, DVec3)]) -> Vec<DVec3> {
         let field = &self.world.scene.field;
         let points: Vec<Vec3> = samples.iter().map(|(p, _)| (*p * field.spacing()).extend(0.0).as_vec3()).collect();

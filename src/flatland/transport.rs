@@ -32,7 +32,7 @@ pub struct Receiver {
     pub position: Vec3,
     /// Its plane when flattened.
     pub isovalue: f32,
-    /// Unit normal in the world, towards the lit side; horizontal when flattened. [BB09 §2.1: N♭]
+    /// Unit normal in the world, towards the lit side; horizontal when flattened. \[BB09 §2.1: N♭\]
     pub normal: DVec3,
     /// What rays from it start on.
     pub departure: Departure,
@@ -59,7 +59,7 @@ pub struct PathVertex {
 }
 
 /// Irradiance per unit radiance at `x` with unit normal `n` from the segment a–b, over 2: ½ (sin θ₂ − sin θ₁) of the
-/// part above the horizon, from either face. 1 where the segment fills the half-plane. [Heckbert92]
+/// part above the horizon, from either face. 1 where the segment fills the half-plane. \[Heckbert92\]
 pub fn unoccluded_share(ends: [DVec2; 2], x: DVec2, n: DVec2) -> f64 {
     sine_range(ends, x, n).map_or(0.0, |(lo, hi)| 0.5 * (hi - lo))
 }
@@ -396,7 +396,7 @@ impl World {
     }
 
     /// The vertices of photon `index`, from the first luminaire at height `s` (units of the sweep): emission ∝ cos θ, the
-    /// next direction ∝ cos θ, survival with the albedo's mean, at most `bounces` reflections. [BB09 Fig. 3]
+    /// next direction ∝ cos θ, survival with the albedo's mean, at most `bounces` reflections. \[BB09 Fig. 3\]
     pub fn photon_path(&self, seed: u64, index: u64, s: f64, bounces: usize) -> Vec<PathVertex> {
         let Some((id, _)) = self.lights.first() else { return Vec::new() };
         let mut rng = Rng::stream(seed, Stage::Photon, index);

@@ -1,4 +1,4 @@
-//! Unbiased path tracing with next-event estimation. [Kajiya86]
+//! Unbiased path tracing with next-event estimation. \[Kajiya86\]
 
 use crate::brdf::reflected;
 use crate::direct::Receiver;

@@ -1,4 +1,4 @@
-//! A photon map of one isosurface in 3D: irradiance per area of mesh and walls, and final gather from it. [Jensen01]
+//! A photon map of one isosurface in 3D: irradiance per area of mesh and walls, and final gather from it. \[Jensen01\]
 
 use super::path::{PathTracer, landing};
 use crate::brdf::reflected;

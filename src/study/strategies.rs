@@ -1,4 +1,4 @@
-//! BB09's table: where radiance is sampled, against the isovalue. [BB09 §3]
+//! BB09's table: where radiance is sampled, against the isovalue. \[BB09 §3\]
 
 use super::{Study, Subject, Table, accuracy_of, provenance};
 use crate::bake::{BakeOptions, BakeSettings, StrategyName};

@@ -75,7 +75,7 @@ impl Shear {
 }
 
 /// `directions`/2 lines, low-discrepancy and uniform over the projective sphere in **world** space, each family with its
-/// own lattice offset: a Fibonacci lattice of the hemisphere [Marques13], turned at random. Sets of different `index`
+/// own lattice offset: a Fibonacci lattice of the hemisphere \[Marques13\], turned at random. Sets of different `index`
 /// are independent.
 #[allow(clippy::cast_possible_truncation, reason = "at most 2³¹ directions")]
 pub(super) fn lines(lattice: &Lattice, seed: u64, index: u64, directions: usize) -> Vec<Shear> {
@@ -100,7 +100,7 @@ pub(super) fn lines(lattice: &Lattice, seed: u64, index: u64, directions: usize)
 
 const GOLDEN_RATIO: f64 = 1.618_033_988_749_895;
 
-/// A rotation uniform over all from three uniforms. [Shoemake92]
+/// A rotation uniform over all from three uniforms. \[Shoemake92\]
 fn rotation([u, v, w]: [f64; 3]) -> DMat3 {
     let (a, b) = ((1.0 - u).sqrt(), u.sqrt());
     let ((s1, c1), (s2, c2)) = ((TAU * v).sin_cos(), (TAU * w).sin_cos());

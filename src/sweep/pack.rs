@@ -288,7 +288,7 @@ impl Pack {
     }
 
     /// For every sample, the radiance its ray towards +τ (`forward`) or −τ meets: B where h is first back at the sample's
-    /// value, or what stands at the end. [BSV93: all nearest greater values, one line per lane]
+    /// value, or what stands at the end. \[BSV93: all nearest greater values, one line per lane\]
     ///
     /// Writes slice k to `out` at k · width + start. With `strict` the next value must be greater.
     #[allow(clippy::cast_possible_truncation, reason = "rows of a pack")]
