@@ -238,12 +238,36 @@ impl SceneFile {
     /// # Errors
     /// `Io`; `Invalid` with file, line and key.
     pub fn read(path: &Path) -> Result<Self> {
+        Source::read(path).and_then(|source| source.parse())
+    }
+}
+
+/// A scene file's text, for messages that name the line of a key.
+struct Source {
+    path: PathBuf,
+    text: String,
+}
+
+impl Source {
+    fn read(path: &Path) -> Result<Self> {
         let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
-        toml::from_str(&text).map_err(|e| {
-            let line = e.span().map_or(1, |s| text[..s.start.min(text.len())].matches('\n').count() + 1);
-            let message = e.message().replace('\n', " ");
-            Error::Invalid(format!("{}:{line}: {message}", path.display()))
+        Ok(Self { path: path.to_path_buf(), text })
+    }
+
+    fn parse(&self) -> Result<SceneFile> {
+        toml::from_str(&self.text).map_err(|e| {
+            let before = e.span().map_or(0, |s| s.start.min(self.text.len()));
+            let line = self.text[..before].matches('\n').count() + 1;
+            Error::Invalid(format!("{}:{line}: {}", self.path.display(), e.message().replace('\n', " ")))
         })
+    }
+
+    /// `error` as the fault of `key`, at the line where it stands.
+    fn blame(&self, key: &str, error: &Error) -> Error {
+        let names_key =
+            |l: &str| l.trim_start().strip_prefix(key).is_some_and(|rest| rest.trim_start().starts_with('='));
+        let line = self.text.lines().position(names_key).map_or(String::new(), |n| format!(":{}", n + 1));
+        Error::Invalid(format!("{}{line}: {key}: {error}", self.path.display()))
     }
 }
 
@@ -253,13 +277,21 @@ impl SceneFile {
 /// `Io`, `Invalid` or `NotSupported`; messages name the file and what is wrong in it.
 pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
     let is_scene = input.extension().is_some_and(|e| e.eq_ignore_ascii_case("toml"));
-    let (file, folder) = if is_scene {
-        (SceneFile::read(input)?, input.parent().unwrap_or(Path::new("")).to_path_buf())
-    } else {
-        let volume = VolumeSource { file: Some(input.to_path_buf()), ..VolumeSource::default() };
-        (SceneFile { volume, ..SceneFile::default() }, PathBuf::new())
+    let source = if is_scene { Some(Source::read(input)?) } else { None };
+    let (file, folder) = match &source {
+        Some(source) => (source.parse()?, input.parent().unwrap_or(Path::new("")).to_path_buf()),
+        None => {
+            let volume = VolumeSource { file: Some(input.to_path_buf()), ..VolumeSource::default() };
+            (SceneFile { volume, ..SceneFile::default() }, PathBuf::new())
+        }
     };
-    let volume = load_volume(input, &file.volume, &folder, &options.raw)?;
+    // What a flag brought is the flag's fault, the rest its key's.
+    let blame = |key: &'static str, flag: bool| {
+        let source = source.as_ref().filter(|_| !flag);
+        move |e: Error| source.map_or_else(|| Error::Invalid(e.to_string()), |s| s.blame(key, &e))
+    };
+    let key = if file.volume.file.is_some() { "file" } else { "generator" };
+    let volume = load_volume(&file.volume, &folder, &options.raw).map_err(blame(key, false))?;
     let isovalues = match (options.isovalues.as_deref(), file.isovalues) {
         (Some(&[lo, hi]), _) => [lo, hi],
         (_, Some(range)) => range,
@@ -268,17 +300,20 @@ pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
             Some((v, _)) => Error::invalid(&volume.name, format!("every sample is {v}: it holds no isosurface")),
         })?,
     };
-    let where_ = |e: Error| if is_scene && options.isovalues.is_none() { e.in_file(input) } else { e };
-    let sweep = Sweep::new(isovalues[0], isovalues[1]).map_err(where_)?;
-    let field = Field::new(&volume, sweep)?;
-    let polygons = surroundings(&file.surroundings, &options.surroundings, &folder, &field)?;
+    let given = options.isovalues.is_some() || file.isovalues.is_none();
+    let sweep = Sweep::new(isovalues[0], isovalues[1]).map_err(blame("isovalues", given))?;
+    let field = Field::new(&volume, sweep).map_err(blame("isovalues", given))?;
+    let boxed = options.surroundings.kind.is_some() || options.surroundings.margin.is_some();
+    let key = if file.surroundings.kind.is_some() { "kind" } else { "margin" };
+    let polygons =
+        surroundings(&file.surroundings, &options.surroundings, &folder, &field).map_err(blame(key, boxed))?;
     let (surface, boundary) = surface(&file.surface, &options.surface);
     let scene =
         Scene::new(field, surface, boundary, polygons).map_err(|e| if is_scene { e.in_file(input) } else { e })?;
     Ok(Loaded { volume, scene, bake: file.bake })
 }
 
-fn load_volume(input: &Path, source: &VolumeSource, folder: &Path, raw: &RawOptions) -> Result<Volume> {
+fn load_volume(source: &VolumeSource, folder: &Path, raw: &RawOptions) -> Result<Volume> {
     match (&source.file, &source.generator) {
         (Some(file), None) => {
             let path = folder.join(file);
@@ -288,11 +323,8 @@ fn load_volume(input: &Path, source: &VolumeSource, folder: &Path, raw: &RawOpti
                 None => Volume::open(&path),
             }
         }
-        (None, Some(name)) => {
-            let generator = Generator::from_name(name).map_err(|e| e.in_file(input))?;
-            generator.sample([source.size.unwrap_or(101); 3]).map_err(|e| e.in_file(input))
-        }
-        _ => Err(Error::invalid(input, "[volume] needs either file or generator")),
+        (None, Some(name)) => Generator::from_name(name)?.sample([source.size.unwrap_or(101); 3]),
+        _ => Err(Error::Invalid("[volume] needs either file or generator".into())),
     }
 }
 
@@ -367,9 +399,11 @@ mod tests {
         let e = error_of("[volume]\ngenerator = \"bumps\"\ncolour = 3\n");
         assert!(e.contains("scene.toml:3:") && e.contains("colour") && !e.contains('\n'), "{e}");
         let e = error_of("isovalues = [5, 5]\n[volume]\ngenerator = \"bumps\"\nsize = 9\n");
-        assert!(e.contains("scene.toml") && e.contains("isovalues"), "{e}");
+        assert!(e.contains("scene.toml:1: isovalues"), "{e}");
         let e = error_of("[volume]\nfile = \"nowhere.vti\"\n");
-        assert!(e.contains("nowhere.vti"), "{e}");
+        assert!(e.contains("scene.toml:2: file") && e.contains("nowhere.vti"), "{e}");
+        let e = error_of("[volume]\ngenerator = \"bumps\"\nsize = 9\n[box]\nmargin = -1.0\n");
+        assert!(e.contains("scene.toml:5: margin"), "{e}");
         assert!(error_of("[volume]\n").contains("file or generator"));
         let e = error_of("isovalues = [200, 300]\n[volume]\ngenerator = \"bumps\"\nsize = 9\n");
         assert!(e.contains("outside the data"), "{e}");
