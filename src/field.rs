@@ -3,7 +3,7 @@
 
 use crate::error::{Error, Result};
 use crate::volume::{Lattice, Volume};
-use glam::{DVec3, Vec3};
+use glam::DVec3;
 use rayon::prelude::*;
 use std::sync::Arc;
 
@@ -263,12 +263,6 @@ impl Field {
     #[inline]
     pub fn falling_normal(&self, p: DVec3) -> Option<DVec3> {
         unit(-self.receiver_gradient(p))
-    }
-
-    /// Index coordinates as stored in rays.
-    #[inline]
-    pub fn position(p: Vec3) -> DVec3 {
-        p.as_dvec3()
     }
 }
 

@@ -37,16 +37,6 @@ pub enum Transport {
     Ordinary,
 }
 
-impl Transport {
-    /// Irradiance under radiance 1 from everywhere above: 2 on a curve, π on a surface.
-    pub fn full_irradiance(self) -> f64 {
-        match self {
-            Transport::Flattened => 2.0,
-            Transport::Ordinary => std::f64::consts::PI,
-        }
-    }
-}
-
 /// A wall or luminaire of the plane: a straight segment, extruded over all heights when flattened and over the sweep's
 /// when ordinary. It stands on the ground in world units.
 ///

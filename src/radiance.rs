@@ -29,8 +29,6 @@ pub struct RadianceSample {
     pub position: Vec3,
     /// Reflected plus emitted, RGB.
     pub radiance: Vec3,
-    /// The part of `radiance` reflected from luminaires directly.
-    pub direct: Vec3,
     /// Variance of the luminance.
     pub variance: f32,
 }
@@ -102,7 +100,6 @@ pub fn sample_radiance<T: Tracer>(
                     Some(RadianceSample {
                         position,
                         radiance: (reflected(albedo, direct.mean + mean) + scene.surface.emission).as_vec3(),
-                        direct: reflected(albedo, direct.mean).as_vec3(),
                         variance: ((direct.variance + variance) * scale * scale) as f32,
                     })
                 })
