@@ -38,9 +38,6 @@ pub fn luminance(rgb: DVec3) -> f64 {
     rgb.dot(DVec3::new(0.2126, 0.7152, 0.0722))
 }
 
-/// Shadow rays asked for at once.
-const PACKET: usize = 16;
-
 /// Irradiance from all luminaires: for each, Lambert's closed form × Σ V_i g_i / Σ g_i over at most `shadow_rays`
 /// low-discrepancy points y_i of its part above the horizon, with g = cos θ cos θ′/r². Exact where all or none are
 /// visible: there a quarter of the points (16 at least) settles it; the rest is spent in penumbras. The ratio's bias
@@ -57,7 +54,6 @@ pub fn direct_irradiance<T: Tracer>(
     let x = lattice.to_world(receiver.position.as_dvec3());
     let mut out = Estimate::default();
     let pilot = (shadow_rays / 4).max(16);
-    let nothing = FlattenedRay::free(receiver.position, Vec3::ZERO, receiver.isovalue);
     for &l in scene.luminaires() {
         if receiver.departure == Departure::Polygon(l) {
             continue;
@@ -75,42 +71,29 @@ pub fn direct_irradiance<T: Tracer>(
         let set =
             Sobol::set(seed, stage, index.wrapping_mul(scene.luminaires().len() as u64).wrapping_add(u64::from(l)));
         let (mut sum, mut seen, mut squares, mut seen_squares) = (0.0, 0.0, 0.0, 0.0);
-        let mut next = 0;
-        while next < shadow_rays {
-            if next >= pilot && (seen == 0.0 || seen == sum) {
+        for i in 0..shadow_rays {
+            if i == pilot && (seen == 0.0 || seen == sum) {
                 break;
             }
-            // In packets, as the tracer likes them, that end where the pilot does.
-            let end = if next < pilot { shadow_rays.min(pilot) } else { shadow_rays };
-            let (mut rays, mut terms, mut n) = ([nothing; PACKET], [0.0; PACKET], 0);
-            while next < end && n < PACKET {
-                let u = set.point2(next, 0);
-                next += 1;
-                let y = part.as_ref().map_or_else(|| light.sample(u), |p| sample_convex(p, u));
-                let g = point_term(x, receiver.normal, y, light.normal());
-                if g == 0.0 {
-                    continue;
-                }
-                let direction = lattice.to_index(y).as_vec3() - receiver.position;
-                rays[n] = FlattenedRay {
-                    reach: 1.0,
-                    departure: receiver.departure,
-                    target: Some(l),
-                    ..FlattenedRay::free(receiver.position, direction, receiver.isovalue)
-                };
-                terms[n] = g;
-                n += 1;
+            let u = set.point2(i, 0);
+            let y = part.as_ref().map_or_else(|| light.sample(u), |p| sample_convex(p, u));
+            let g = point_term(x, receiver.normal, y, light.normal());
+            if g == 0.0 {
+                continue;
             }
-            let mut blocked = [false; PACKET];
-            tracer.occluded_many(&rays[..n], &mut blocked[..n]);
-            out.rays += n as u64;
-            for (&g, &blocked) in terms[..n].iter().zip(&blocked[..n]) {
-                sum += g;
-                squares += g * g;
-                if !blocked {
-                    seen += g;
-                    seen_squares += g * g;
-                }
+            let direction = lattice.to_index(y).as_vec3() - receiver.position;
+            let ray = FlattenedRay {
+                reach: 1.0,
+                departure: receiver.departure,
+                target: Some(l),
+                ..FlattenedRay::free(receiver.position, direction, receiver.isovalue)
+            };
+            out.rays += 1;
+            sum += g;
+            squares += g * g;
+            if !tracer.occluded(&ray) {
+                seen += g;
+                seen_squares += g * g;
             }
         }
         if sum == 0.0 {
