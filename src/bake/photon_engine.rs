@@ -3,6 +3,7 @@
 use super::{BakeSettings, Interpolation, Lit, PhotonCounts, StrategyName};
 use crate::embree::{Device, GraphTracer};
 use crate::error::{Error, Result};
+use crate::field::Field;
 use crate::fitted_grid::fit;
 use crate::illumination_grid::{IlluminationGrid, shepard};
 use crate::mask::{Mask, stand_ins};
@@ -120,13 +121,7 @@ fn place(
         StrategyName::Planes => Strategy::Planes(fractions.len()),
         StrategyName::LevelSet => Strategy::LevelSets(fractions),
         StrategyName::Nodes => {
-            let (mut at, mut owners) = (Vec::new(), Vec::new());
-            for o in (0..lattice.len()).filter(|&o| masks[o] != Mask::Empty) {
-                for p in stand_ins(&scene.field, lattice, o, settings.seed).into_iter().flatten() {
-                    at.push(p.as_vec3());
-                    owners.push(o);
-                }
-            }
+            let (at, owners) = at_points(&scene.field, lattice, settings.seed, |o| masks[o] != Mask::Empty);
             return Ok((at, Some(owners)));
         }
     };
@@ -135,6 +130,17 @@ fn place(
         return Err(Error::Invalid("no sample landed on an isosurface of the sweep; choose other isovalues".into()));
     }
     Ok((at, None))
+}
+
+/// Sample positions that stand for the points of `lattice` that `wanted` picks, and the point that each belongs to.
+pub(super) fn at_points(
+    field: &Field,
+    lattice: &Lattice,
+    seed: u64,
+    wanted: impl Fn(usize) -> bool,
+) -> (Vec<Vec3>, Vec<usize>) {
+    let points = (0..lattice.len()).filter(|&o| wanted(o));
+    points.flat_map(|o| stand_ins(field, lattice, o, seed).into_iter().flatten().map(move |p| (p.as_vec3(), o))).unzip()
 }
 
 /// The mean of the samples that each grid point owns.

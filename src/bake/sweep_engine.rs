@@ -1,13 +1,13 @@
 //! The fast engine: line sweeps light every node; exact rays fill the points beside the sweep's ends.
 
-use super::photon_engine::collect;
+use super::photon_engine::{at_points, collect};
 use super::{BakeSettings, Lit};
 use crate::brdf::reflected;
 use crate::embree::{Device, GraphTracer};
 use crate::error::Result;
 use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
-use crate::mask::{Mask, stand_ins};
+use crate::mask::Mask;
 use crate::progress::Progress;
 use crate::radiance::{Indirect, sample_radiance};
 use crate::radiance_cache::RadianceCache;
@@ -50,35 +50,30 @@ pub(super) fn light(
     lit.sweep_queries = swept.counts.gather_rays + swept.counts.shadow_rays;
 
     // What the sweep knows is also what rays from the other points gather.
-    let known: Vec<(Side, Vec<[f32; 3]>)> =
-        swept.sides.iter().map(|s| (s.side, widened(lattice, masks, outgoing(scene, masks, s)))).collect();
-    let nodes =
-        [Side::Lower, Side::Higher].map(|side| known.iter().find(|(s, _)| *s == side).map(|(_, nodes)| nodes.clone()));
+    let radiance: Vec<Vec<[f32; 3]>> = swept.sides.iter().map(|s| outgoing(scene, masks, s)).collect();
+    let nodes = [Side::Lower, Side::Higher].map(|side| {
+        let stored = swept.sides.iter().position(|s| s.side == side)?;
+        Some(widened(lattice, masks, &radiance[stored]))
+    });
     let cache = RadianceCache::from_parts(nodes, swept.flats);
 
     let begun = Instant::now();
     let tracer = GraphTracer::new(device, scene)?;
     lit.seconds.build = begun.elapsed().as_secs_f64();
     let begun = Instant::now();
-    let (mut at, mut owners): (Vec<Vec3>, Vec<usize>) = (Vec::new(), Vec::new());
-    for o in (0..lattice.len()).filter(|&o| masks[o] == Mask::Filled) {
-        for p in stand_ins(&scene.field, lattice, o, settings.seed).into_iter().flatten() {
-            at.push(p.as_vec3());
-            owners.push(o);
-        }
-    }
-    for (s, (side, _)) in swept.sides.iter().zip(&known) {
+    let (at, owners) = at_points(&scene.field, lattice, settings.seed, |o| masks[o] == Mask::Filled);
+    for (s, radiance) in swept.sides.iter().zip(radiance) {
         let stage = progress.stage("samples", at.len() as u64);
         let indirect = Indirect::Gather(&cache, settings.gather_rays.max(1));
         let (shadow_rays, seed) = (settings.shadow_rays, settings.seed);
-        let sampled = sample_radiance(scene, &tracer, &indirect, &at, *side, shadow_rays, seed, &|n| stage.tick(n));
+        let sampled = sample_radiance(scene, &tracer, &indirect, &at, s.side, shadow_rays, seed, &|n| stage.tick(n));
         stage.end()?;
         lit.rays += sampled.rays;
         lit.samples += at.len() as u64 - sampled.without_gradient;
         lit.without_gradient += sampled.without_gradient;
         let mut grid = collect(masks, &owners, &sampled.samples);
-        merge(&mut grid, masks, outgoing(scene, masks, s), &s.std_error);
-        lit.sides.push((*side, grid));
+        merge(&mut grid, masks, radiance, &s.std_error);
+        lit.sides.push((s.side, grid));
     }
     lit.seconds.samples = begun.elapsed().as_secs_f64();
     lit.misses = cache.misses();
@@ -102,7 +97,7 @@ fn outgoing(scene: &Scene, masks: &[Mask], s: &SweptSide) -> Vec<[f32; 3]> {
 }
 
 /// Unknown nodes beside known ones become their mean, so that lookups in cells at the sweep's ends find something.
-fn widened(lattice: &Lattice, masks: &[Mask], nodes: Vec<[f32; 3]>) -> Vec<[f32; 3]> {
+fn widened(lattice: &Lattice, masks: &[Mask], nodes: &[[f32; 3]]) -> Vec<[f32; 3]> {
     let [nx, ny, nz] = lattice.dims();
     (0..nodes.len())
         .into_par_iter()

@@ -70,17 +70,17 @@ pub fn write(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
         })
         .collect();
     let exposure = bake.exposure as f32;
-    let sides: Vec<(Vec<f32>, Vec<f32>, Vec<u8>)> = bake
+    let sides: Vec<(Vec<f32>, Samples)> = bake
         .sides
         .iter()
         .map(|(_, grid)| {
-            let radiance: Vec<f32> = grid.radiance.concat();
-            let rgb = radiance.par_iter().map(|&x| srgb_encode((x * exposure).clamp(0.0, 1.0))).collect();
-            (radiance, rgb, grid.mask.iter().map(|&m| m as u8).collect())
+            let radiance = grid.radiance.as_flattened().par_iter();
+            let rgb = radiance.map(|&x| srgb_encode((x * exposure).clamp(0.0, 1.0))).collect();
+            (rgb, Samples::U8(grid.mask.iter().map(|&m| m as u8).collect()))
         })
         .collect();
     let mut textures = Vec::new();
-    let texels: Vec<(usize, String, Vec<f32>)> = bake
+    let texels: Vec<(String, &[f32])> = bake
         .flats
         .iter()
         .enumerate()
@@ -88,7 +88,7 @@ pub fn write(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
             let t = t.as_ref()?;
             let name = format!("wall_{}", flat_name(scene, n));
             textures.push((n, name.clone(), t.dims));
-            Some((n, name, t.texels.concat()))
+            Some((name, t.texels.as_flattened()))
         })
         .collect();
     let description = Description {
@@ -114,21 +114,20 @@ pub fn write(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
     };
     let json = serde_json::to_string(&description).expect("the description is plain data");
 
-    let masks: Vec<Samples> = sides.iter().map(|s| Samples::U8(s.2.clone())).collect();
     let range = [sweep.lo(), sweep.hi()];
     let mut numbers = Vec::new();
     flatten("", &report, &mut numbers);
     let mut writer = VtiWriter::new(lattice).point_data("value", 1, &values[..]).active_scalars("value");
-    for (i, (((_, grid), side), mask)) in bake.sides.iter().zip(&sides).zip(&masks).enumerate() {
+    for (i, ((_, grid), (rgb, mask))) in bake.sides.iter().zip(&sides).enumerate() {
         let s = suffix(i);
         writer = writer
-            .point_data(&format!("radiance{s}"), 3, &side.0[..])
-            .point_data(&format!("rgb{s}"), 3, &side.1[..])
+            .point_data(&format!("radiance{s}"), 3, grid.radiance.as_flattened())
+            .point_data(&format!("rgb{s}"), 3, &rgb[..])
             .point_data(&format!("std_error{s}"), 1, &grid.std_error[..])
             .point_data(&format!("mask{s}"), 1, mask);
     }
-    for (_, name, data) in &texels {
-        writer = writer.field_data(name, 3, &data[..]);
+    for (name, data) in &texels {
+        writer = writer.field_data(name, 3, *data);
     }
     let constants: Vec<(String, Samples)> = numbers
         .into_iter()
