@@ -97,16 +97,17 @@ impl FlatTexture {
         Self { dims, texels: vec![[0.0; 3]; dims.iter().product()] }
     }
 
-    /// Texel-centred trilinear lookup at (u, v, c) ∈ [0, 1]³, clamped at the borders.
+    /// Texel-centred trilinear lookup at (u, v, c) ∈ [0, 1]³, continued linearly over the outer half texels (a constant
+    /// there would darken what a wall sends, since radiance peaks beside its neighbours); never negative.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the texture")]
     pub fn lookup(&self, uvc: [f64; 3]) -> DVec3 {
         let mut base = [0usize; 3];
         let mut frac = [0f64; 3];
         for a in 0..3 {
             let last = self.dims[a] - 1;
-            let x = (uvc[a] * self.dims[a] as f64 - 0.5).clamp(0.0, last as f64);
-            base[a] = (x as usize).min(last.saturating_sub(1));
-            frac[a] = x - base[a] as f64;
+            let x = uvc[a].clamp(0.0, 1.0) * self.dims[a] as f64 - 0.5;
+            base[a] = (x.max(0.0) as usize).min(last.saturating_sub(1));
+            frac[a] = if last == 0 { 0.0 } else { x - base[a] as f64 };
         }
         let mut sum = DVec3::ZERO;
         for corner in 0..8usize {
@@ -117,7 +118,7 @@ impl FlatTexture {
                 w *= if bit == 1 { frac[a] } else { 1.0 - frac[a] };
                 at[a] = (base[a] + bit).min(self.dims[a] - 1);
             }
-            if w > 0.0 {
+            if w != 0.0 {
                 let t = self.texels[(at[2] * self.dims[1] + at[1]) * self.dims[0] + at[0]];
                 sum += w * DVec3::from_array(t.map(f64::from));
             }
@@ -163,6 +164,8 @@ mod tests {
         }
         let got = t.lookup([0.37, 0.61, 0.44]);
         assert!((got - DVec3::new(0.37, 1.66, 1.0)).length() < 1e-6, "{got}");
-        assert!((t.lookup([0.0, 0.0, 0.0]).x - 0.1).abs() < 1e-7, "clamped to the first centre");
+        let corner = t.lookup([1.0, 1.0, 1.0]);
+        assert!((corner - DVec3::new(1.0, 3.0, 1.0)).length() < 1e-6, "continued to the border: {corner}");
+        assert_eq!(t.lookup([2.0, 1.0, 1.0]), corner, "and no further");
     }
 }

@@ -183,7 +183,7 @@ fn an_extruded_field_looks_to_n_3_as_to_n_2() {
             photons: Some(1 << 20),
             shadow_rays: Some(64),
             gather_rays: Some(256),
-            wall_resolution: Some(24),
+            wall_resolution: Some(64),
             ..BakeOptions::default()
         };
         let mut settings = BakeSettings::new(&options).unwrap();
@@ -231,10 +231,9 @@ fn an_extruded_field_looks_to_n_3_as_to_n_2() {
             100.0 * (stored.lock().unwrap().iter().sum::<f64>() / two - 1.0),
         );
         assert!(count > 150.0);
-        // n = 2 is settled: its stored radiance and its paths agree to 0.07 %. At albedo 0.8 the photons' kernels leave
-        // n = 3 0.77 % low, with four times the photons too (0.73 %): the 0.5 % waits for a better cache there.
-        let allowed = if albedo > 0.6 { 0.01 } else { 0.005 };
-        assert!((three / two - 1.0).abs() < allowed, "albedo {albedo}: {three} against {two}");
+        // n = 2 is settled: its stored radiance and its paths agree to 0.07 %. Walls hold most of what n = 3 gathers: with
+        // 24 instead of 64 texels across, their smoothed photons leave it 0.77 % low at albedo 0.8.
+        assert!((three / two - 1.0).abs() < 0.005, "albedo {albedo}: {three} against {two}");
         assert!((beyond as f64) < 0.06 * count, "albedo {albedo}: {beyond} of {count} beyond 3σ + 0.5 %");
     }
 }
