@@ -1,4 +1,4 @@
-//! Where radiance is sampled: the strategies of \[BB09 §3\], and the grid's own nodes.
+//! Where scattered radiance samples are placed: the strategies of \[BB09 §3\].
 
 use crate::error::Result;
 use crate::field::Field;
@@ -16,8 +16,6 @@ pub enum Strategy {
     LevelSets(Vec<f64>),
     /// Strategy 2: uniform over this many parallel planes across the diagonal of Ω.
     Planes(usize),
-    /// At the nodes of the illumination grid: no interpolation.
-    Nodes,
 }
 
 /// Batches of 2²⁰ points that a uniform search for samples on the sweep may take: 4·10⁹ points.
@@ -26,7 +24,7 @@ const MAX_BATCHES: usize = 4096;
 /// `count` positions in the local frame. The level set through each is the one it samples; positions whose isovalue
 /// lies outside the sweep are left out, so the result may be shorter for level sets at the sweep's ends, and for uniform
 /// samples and planes of a sweep that fills less than about `count` / 4·10⁹ of Ω. All strategies give `count` samples
-/// otherwise, so that they are compared at equal numbers. [`Strategy::Nodes`] gives none: the grid knows its nodes.
+/// otherwise, so that they are compared at equal numbers.
 ///
 /// # Errors
 /// From extracting level sets.
@@ -40,7 +38,6 @@ pub fn positions(field: &Field, strategy: &Strategy, count: u64, seed: u64) -> R
         far * DVec3::new(x, y, set.coordinate(i as u32, 2))
     };
     match strategy {
-        Strategy::Nodes => Ok(Vec::new()),
         Strategy::Uniform => Ok(in_batches(count, |i| {
             let p = uniform(i).as_vec3();
             on_sweep(&p).then_some(p)

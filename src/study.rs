@@ -2,6 +2,7 @@
 
 mod curve;
 mod datasets;
+mod figure6;
 mod strategies;
 mod table;
 
@@ -46,6 +47,15 @@ impl Subject {
     }
 }
 
+/// How good a reference is made.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Effort {
+    /// 4000 vertices of 1024 paths: for the numbers of a table.
+    Table,
+    /// 1500 vertices of 512 paths: for a point of a curve.
+    Curve,
+}
+
 /// What all studies share.
 pub struct Study {
     /// Where tables, plots and cached references go.
@@ -80,8 +90,12 @@ impl Study {
     ///
     /// # Errors
     /// As `reference()`, or from reading the cache.
-    pub fn references(&self, subject: &Subject, isovalue: f64) -> Result<Option<Vec<ReferenceMesh>>> {
-        let (vertices, samples) = if self.quick { (500, 128) } else { (4000, 1024) };
+    pub fn references(&self, subject: &Subject, isovalue: f64, effort: Effort) -> Result<Option<Vec<ReferenceMesh>>> {
+        let (vertices, samples) = match effort {
+            _ if self.quick => (500, 128),
+            Effort::Table => (4000, 1024),
+            Effort::Curve => (1500, 512),
+        };
         let scene = &subject.scene;
         let c = scene.field.sweep().isovalue(isovalue);
         let Ok(mesh) = SurfaceMesh::extract(scene, c, 1) else { return Ok(None) };
@@ -105,14 +119,27 @@ impl Study {
         Ok(Some(out))
     }
 
-    /// A bake of `subject`, and its wall seconds without loading and export.
+    /// A bake of `subject`, and the wall and processor seconds it took without loading and export.
     ///
     /// # Errors
     /// As [`bake`].
-    pub fn bake(&self, subject: &Subject, settings: &BakeSettings) -> Result<(Bake, f64)> {
-        let begun = Instant::now();
+    pub fn bake(&self, subject: &Subject, settings: &BakeSettings) -> Result<(Bake, [f64; 2])> {
+        let (begun, worked) = (Instant::now(), processor_seconds());
         let result = bake(&subject.scene, settings, &self.device, self.progress)?;
-        Ok((result, begun.elapsed().as_secs_f64()))
+        Ok((result, [begun.elapsed().as_secs_f64(), processor_seconds() - worked]))
+    }
+}
+
+/// Seconds that all threads of this process have worked, which other work on the machine hardly changes; NaN where the
+/// system does not tell.
+fn processor_seconds() -> f64 {
+    // Fields 14 and 15, counted from behind the name's parenthesis, in ticks of 10 ms.
+    let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
+    let mut fields =
+        stat.rsplit(')').next().unwrap_or_default().split_whitespace().skip(11).map_while(|f| f.parse::<f64>().ok());
+    match (fields.next(), fields.next()) {
+        (Some(user), Some(system)) => (user + system) * 0.01,
+        _ => f64::NAN,
     }
 }
 

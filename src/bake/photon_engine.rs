@@ -1,6 +1,6 @@
 //! BB09's engine: photons, a radiance cache, samples by exact rays, interpolation.
 
-use super::{BakeSettings, Interpolation, Lit, PhotonCounts, StrategyName};
+use super::{BakeSettings, Interpolation, Lit, PhotonCounts};
 use crate::embree::{Device, GraphTracer};
 use crate::error::{Error, Result};
 use crate::field::Field;
@@ -12,7 +12,7 @@ use crate::photon_map::PhotonMap;
 use crate::progress::Progress;
 use crate::radiance::{Indirect, RadianceSample, sample_radiance};
 use crate::radiance_cache::{CacheSettings, RadianceCache};
-use crate::sampling::{Strategy, positions};
+use crate::sampling::positions;
 use crate::scene::Scene;
 use crate::volume::Lattice;
 use glam::Vec3;
@@ -113,17 +113,9 @@ fn place(
 ) -> Result<(Vec<Vec3>, Option<Vec<usize>>)> {
     let needed = masks.iter().filter(|&&m| m != Mask::Empty).count();
     let count = settings.samples.unwrap_or(((needed as f64 * settings.samples_per_point) as u64).max(1000));
-    // BB09's level sets stand at 39.0 + 17.7 k of the bumps' sweep [3.6, 95]: the same fractions of any sweep.
-    let fractions: Vec<f64> =
-        (-2..=3).map(|k| (39.0 + 17.7 * f64::from(k) - 3.6) / 91.4).filter(|s| (0.0..=1.0).contains(s)).collect();
-    let strategy = match settings.strategy {
-        StrategyName::Uniform => Strategy::Uniform,
-        StrategyName::Planes => Strategy::Planes(fractions.len()),
-        StrategyName::LevelSet => Strategy::LevelSets(fractions),
-        StrategyName::Nodes => {
-            let (at, owners) = at_points(&scene.field, lattice, settings.seed, |o| masks[o] != Mask::Empty);
-            return Ok((at, Some(owners)));
-        }
+    let Some(strategy) = settings.strategy.placed() else {
+        let (at, owners) = at_points(&scene.field, lattice, settings.seed, |o| masks[o] != Mask::Empty);
+        return Ok((at, Some(owners)));
     };
     let at = positions(&scene.field, &strategy, count, settings.seed)?;
     if at.is_empty() {

@@ -3,6 +3,7 @@
 use crate::error::{Error, Result};
 use crate::illumination_grid::GridSize;
 use crate::photon_map::{EstimateSettings, Normalisation};
+use crate::sampling::Strategy;
 use crate::sweep::SweepSettings;
 use serde::{Deserialize, Serialize};
 
@@ -42,6 +43,21 @@ pub enum StrategyName {
     Planes,
     /// At the grid's points, without interpolation.
     Nodes,
+}
+
+impl StrategyName {
+    /// How scattered samples are placed; `None` for those at the grid's points. BB09's level sets stand at 39.0 + 17.7 k
+    /// of the bumps' sweep [3.6, 95]: the same fractions of any sweep, and as many planes.
+    pub fn placed(self) -> Option<Strategy> {
+        let fractions =
+            || (-2..=3).map(|k| (39.0 + 17.7 * f64::from(k) - 3.6) / 91.4).filter(|s| (0.0..=1.0).contains(s));
+        match self {
+            Self::Uniform => Some(Strategy::Uniform),
+            Self::Planes => Some(Strategy::Planes(fractions().count())),
+            Self::LevelSet => Some(Strategy::LevelSets(fractions().collect())),
+            Self::Nodes => None,
+        }
+    }
 }
 
 /// How samples become grid values.

@@ -1,79 +1,120 @@
 //! Error against wall seconds: how every change of speed or accuracy is judged.
 
-use super::{Study, Subject, Table, accuracy_of, provenance};
-use crate::bake::{BakeOptions, BakeSettings, StrategyName};
+use super::{Effort, Study, Subject, Table, accuracy_of, provenance};
+use crate::bake::{BakeOptions, BakeSettings, Engine, StrategyName};
 use crate::error::Result;
 use crate::plot::{Plot, Series};
 
-const COLUMNS: [&str; 9] =
-    ["scene", "strategy", "photons", "samples", "gather", "percent_rms", "worst", "seconds", "rays_per_second"];
+const COLUMNS: [&str; 11] = [
+    "scene",
+    "way",
+    "photons",
+    "samples",
+    "gather",
+    "directions",
+    "percent_rms",
+    "worst",
+    "seconds",
+    "cpu_seconds",
+    "rays_per_second",
+];
 
-/// Bakes over photons × samples × gather rays × strategy; the error is the RMS over five isovalues of the sweep.
+/// One way to bake.
+struct Candidate {
+    /// Engine and strategy, as the plot's series.
+    name: &'static str,
+    options: BakeOptions,
+}
+
+/// The photon engine over photons × samples × gather rays × strategy, and the sweep engine over directions.
+fn candidates(quick: bool) -> Vec<Candidate> {
+    let photons: &[u64] = if quick { &[1 << 17, 1 << 19] } else { &[1 << 18, 1 << 20, 1 << 22] };
+    let samples: &[u64] = if quick { &[10_000, 100_000] } else { &[10_000, 100_000, 1_000_000] };
+    let gathers: &[u32] = if quick { &[0, 16] } else { &[0, 16, 64, 256] };
+    let directions: &[usize] = if quick { &[32, 64] } else { &[32, 64, 128, 256, 512] };
+    let mut out = Vec::new();
+    for &photons in photons {
+        for &gather in gathers {
+            let exact = BakeOptions {
+                engine: Some(Engine::Photon),
+                photons: Some(photons),
+                gather_rays: Some(gather),
+                ..BakeOptions::default()
+            };
+            let nodes = BakeOptions { strategy: Some(StrategyName::Nodes), ..exact.clone() };
+            out.push(Candidate { name: "nodes", options: nodes });
+            for &samples in samples {
+                let uniform =
+                    BakeOptions { strategy: Some(StrategyName::Uniform), samples: Some(samples), ..exact.clone() };
+                out.push(Candidate { name: "uniform", options: uniform });
+            }
+        }
+    }
+    for &directions in directions {
+        let options = BakeOptions {
+            engine: Some(Engine::Sweep),
+            directions: Some(directions),
+            light_points: Some(directions / 4),
+            ..BakeOptions::default()
+        };
+        out.push(Candidate { name: "sweep", options });
+    }
+    out
+}
+
+/// Bakes in many ways; the error is the RMS over five isovalues of the sweep.
 ///
 /// # Errors
 /// As bakes, references and tables.
 pub fn curve(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Result<()> {
-    let mut table = Table::open(study.folder.join("curve.csv"), &COLUMNS, 5)?;
-    let photons: &[u64] = if study.quick { &[1 << 17, 1 << 19] } else { &[1 << 18, 1 << 20, 1 << 22] };
-    let samples: &[u64] = if study.quick { &[10_000, 100_000] } else { &[10_000, 100_000, 1_000_000] };
-    let gathers: &[u32] = if study.quick { &[0, 16] } else { &[0, 16, 64, 256] };
+    let mut table = Table::open(study.folder.join("curve.csv"), &COLUMNS, 6)?;
     for subject in subjects {
         let fractions: &[f64] = if study.quick { &[0.475] } else { &[0.18, 0.344, 0.475, 0.617, 0.836] };
         let mut references = Vec::new();
         for &f in fractions {
-            references.extend(study.references(subject, subject.at(f))?);
+            references.extend(study.references(subject, subject.at(f), Effort::Curve)?);
         }
-        for (strategy, name) in [(StrategyName::Uniform, "uniform"), (StrategyName::Nodes, "nodes")] {
-            for &photons in photons {
-                for &samples in samples {
-                    // Nodes have their own count.
-                    if strategy == StrategyName::Nodes && samples != 10_000 {
-                        continue;
-                    }
-                    for &gather in gathers {
-                        let key: Vec<String> = vec![
-                            subject.name.clone(),
-                            name.into(),
-                            photons.to_string(),
-                            samples.to_string(),
-                            gather.to_string(),
-                        ];
-                        if table.has(&key) {
-                            continue;
-                        }
-                        study.say(&format!(
-                            "{}: {name}, {photons} photons, {samples} samples, {gather} gather rays",
-                            subject.name
-                        ));
-                        let options = BakeOptions {
-                            strategy: Some(strategy),
-                            photons: Some(photons),
-                            samples: Some(samples),
-                            gather_rays: Some(gather),
-                            ..BakeOptions::default()
-                        };
-                        let (bake, seconds) = study.bake(subject, &BakeSettings::new(&options.or(base))?)?;
-                        let (mut sum, mut worst) = (0.0, 0f64);
-                        for r in &references {
-                            let a = accuracy_of(&bake, r)?;
-                            sum += a.percent_rms * a.percent_rms;
-                            worst = worst.max(a.percent_rms);
-                        }
-                        let rms = (sum / references.len().max(1) as f64).sqrt();
-                        let mut row = key;
-                        row.extend([
-                            format!("{rms:.4}"),
-                            format!("{worst:.4}"),
-                            format!("{seconds:.3}"),
-                            format!("{:.0}", bake.report.rays_per_second),
-                        ]);
-                        table.push(row)?;
-                    }
-                }
+        for Candidate { name, options } in candidates(study.quick) {
+            let number = |n: Option<u64>| n.map_or_else(|| "-".to_owned(), |n| n.to_string());
+            let key: Vec<String> = vec![
+                subject.name.clone(),
+                name.into(),
+                number(options.photons),
+                number(options.samples),
+                number(options.gather_rays.map(u64::from)),
+                number(options.directions.map(|n| n as u64)),
+            ];
+            if table.has(&key) {
+                continue;
             }
+            study.say(&format!("{}: {}", subject.name, described(&key)));
+            let (bake, seconds) = study.bake(subject, &BakeSettings::new(&options.or(base))?)?;
+            let (mut sum, mut worst) = (0.0, 0f64);
+            for r in &references {
+                let a = accuracy_of(&bake, r)?;
+                sum += a.percent_rms * a.percent_rms;
+                worst = worst.max(a.percent_rms);
+            }
+            let rms = (sum / references.len().max(1) as f64).sqrt();
+            let mut row = key;
+            row.extend([
+                format!("{rms:.4}"),
+                format!("{worst:.4}"),
+                format!("{:.3}", seconds[0]),
+                format!("{:.3}", seconds[1]),
+                format!("{:.0}", bake.report.rays_per_second),
+            ]);
+            table.push(row)?;
         }
     }
     summarise(study, subjects, &table)
+}
+
+/// What a row is about, in words.
+fn described(row: &[String]) -> String {
+    let units = ["photons", "samples", "gather rays", "directions"];
+    let set = row[2..6].iter().zip(units).filter(|(n, _)| *n != "-").map(|(n, unit)| format!(", {n} {unit}"));
+    set.fold(row[1].clone(), |text, part| text + &part)
 }
 
 /// The rows that no other beats in both seconds and error, by seconds.
@@ -97,12 +138,12 @@ fn summarise(study: &Study, subjects: &[Subject], table: &Table) -> Result<()> {
         notes += &format!("Pareto front of {}:\n\n", subject.name);
         for p in &front {
             if let Some(r) = rows.iter().find(|r| point(r) == *p) {
-                notes += &format!("* {:.2} s, {:.3} %: {}\n", p.0, p.1, r[1..5].join(" "));
+                notes += &format!("* {:.2} s, {:.3} %: {}\n", p.0, p.1, described(r));
             }
         }
         let mut series: Vec<Series> = Vec::new();
         for r in &rows {
-            let name = format!("{}, gather {}", r[1], r[4]);
+            let name = if r[4] == "-" { r[1].clone() } else { format!("{}, gather {}", r[1], r[4]) };
             match series.iter_mut().find(|s| s.name == name) {
                 Some(s) => s.points.push(point(r)),
                 None => series.push(Series { name, points: vec![point(r)], line: false, marks: true }),

@@ -1,6 +1,6 @@
 //! The table of data sets: error and seconds with and without final gather, and where the error comes from.
 
-use super::{Study, Subject, Table, accuracy_of, provenance};
+use super::{Effort, Study, Subject, Table, accuracy_of, provenance};
 use crate::accuracy::{interpolation_floor, total_floor};
 use crate::bake::{BakeOptions, BakeSettings, StrategyName};
 use crate::embree::{GraphTracer, SurfaceTracer};
@@ -57,9 +57,9 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
         let begun = Instant::now();
         let mesh = SurfaceMesh::extract(scene, unit, 1)?;
         let extract_seconds = begun.elapsed().as_secs_f64();
-        let Some(references) = study.references(subject, c)? else { continue };
+        let Some(references) = study.references(subject, c, Effort::Table)? else { continue };
         let tracer = GraphTracer::new(&study.device, scene)?;
-        let (shadow, vertices) = if study.quick { (64, 300) } else { (512, 2000) };
+        let (shadow, vertices) = if study.quick { (64, 300) } else { (1024, 2000) };
         let mut floors = Vec::new();
         for factor in 1..=3 {
             let floor = interpolation_floor(scene, &tracer, &mesh, unit, factor, shadow, Some(vertices))?;

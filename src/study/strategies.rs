@@ -1,15 +1,18 @@
 //! BB09's table: where radiance is sampled, against the isovalue. \[BB09 §3\]
 
-use super::{Study, Subject, Table, accuracy_of, provenance};
+use super::figure6::figure6;
+use super::{Effort, Study, Subject, Table, accuracy_of, provenance};
 use crate::bake::{BakeOptions, BakeSettings, StrategyName};
 use crate::error::Result;
+use crate::illumination_grid::GridSize;
 use crate::plot::{Plot, Series};
 
-const COLUMNS: [&str; 12] = [
+const COLUMNS: [&str; 14] = [
     "scene",
     "samples",
     "strategy",
     "isovalue",
+    "taken",
     "percent_rms",
     "ci_lo",
     "ci_hi",
@@ -18,6 +21,7 @@ const COLUMNS: [&str; 12] = [
     "percent_rms_lit",
     "max",
     "seconds",
+    "cpu_seconds",
 ];
 
 const STRATEGIES: [(StrategyName, &str); 4] = [
@@ -27,35 +31,38 @@ const STRATEGIES: [(StrategyName, &str); 4] = [
     (StrategyName::Nodes, "nodes"),
 ];
 
-/// Error of the strategies at 10⁶ and 10⁷ samples over the whole sweep. `nodes` samples each grid point once, whatever the
-/// count.
+/// Error of the strategies at 10⁵, 10⁶ and 10⁷ samples over the whole sweep, and Figure 6 at 10⁶. `nodes` samples a grid
+/// of at most that many points; the others interpolate onto the volume's lattice.
 ///
 /// # Errors
 /// As bakes, references and tables.
 pub fn strategies(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Result<()> {
     let mut table = Table::open(study.folder.join("strategies.csv"), &COLUMNS, 4)?;
-    let counts: &[u64] = if study.quick { &[20_000, 100_000] } else { &[1_000_000, 10_000_000] };
+    let counts: &[u64] = if study.quick { &[20_000, 100_000] } else { &[100_000, 1_000_000, 10_000_000] };
     for subject in subjects {
         let isovalues = isovalues(study, subject);
         for &count in counts {
             for (strategy, name) in STRATEGIES {
-                if strategy == StrategyName::Nodes && count != counts[0] {
-                    continue;
-                }
                 let key = |c: f64| vec![subject.name.clone(), count.to_string(), name.to_owned(), format!("{c:.3}")];
                 if isovalues.iter().all(|&c| table.has(&key(c))) {
                     continue;
                 }
                 study.say(&format!("{}: {count} samples, {name}", subject.name));
-                let options = BakeOptions { samples: Some(count), strategy: Some(strategy), ..BakeOptions::default() };
+                let mut options =
+                    BakeOptions { samples: Some(count), strategy: Some(strategy), ..BakeOptions::default() };
+                if strategy == StrategyName::Nodes {
+                    options.grid = Some(GridSize::Points(dims_of(subject, count)));
+                }
                 let (bake, seconds) = study.bake(subject, &BakeSettings::new(&options.or(base))?)?;
                 for &c in &isovalues {
                     if table.has(&key(c)) {
                         continue;
                     }
-                    let Some(references) = study.references(subject, c)? else { continue };
+                    let effort = if is_in_table(subject, c) { Effort::Table } else { Effort::Curve };
+                    let Some(references) = study.references(subject, c, effort)? else { continue };
                     let a = accuracy_of(&bake, &references)?;
                     let mut row = key(c);
+                    row.push(bake.report.samples.to_string());
                     let numbers = [
                         a.percent_rms,
                         a.confidence[0],
@@ -64,10 +71,14 @@ pub fn strategies(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Re
                         a.percent_rms_area,
                         a.percent_rms_lit,
                         a.max,
-                        seconds,
+                        seconds[0],
+                        seconds[1],
                     ];
                     row.extend(numbers.map(|x| format!("{x:.4}")));
                     table.push(row)?;
+                }
+                if strategy != StrategyName::Nodes && count == counts[1] {
+                    figure6(study, subject, name, strategy, bake)?;
                 }
             }
         }
@@ -75,16 +86,32 @@ pub fn strategies(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Re
     summarise(study, subjects, &table, counts)
 }
 
-/// Level sets of strategy 1, the middles between them, 47.0, and a regular comb; source units, increasing.
+/// The largest grid of Ω's proportions with at most `count` points, at least 2 along each axis.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "counts")]
+fn dims_of(subject: &Subject, count: u64) -> [usize; 3] {
+    let dims = subject.scene.lattice().dims();
+    let factor = (count as f64 / subject.scene.lattice().len() as f64).cbrt();
+    dims.map(|n| ((n as f64 * factor) as usize).max(2))
+}
+
+/// Whether an isovalue is among those that are read off the table rather than the plot.
+fn is_in_table(subject: &Subject, isovalue: f64) -> bool {
+    [35.0, 47.0, 80.0].iter().any(|c| (subject.at((c - 3.6) / 91.4) - isovalue).abs() < 1e-9)
+}
+
+/// Level sets of strategy 1, the middles between them, 35, 47 and 80 of [3.6, 95], and a regular comb; source units,
+/// increasing.
 fn isovalues(study: &Study, subject: &Subject) -> Vec<f64> {
     let mut fractions: Vec<f64> = level_sets();
-    fractions.push((47.0 - 3.6) / 91.4);
     if !study.quick {
         fractions.extend(level_sets().windows(2).map(|w| 0.5 * (w[0] + w[1])));
-        fractions.extend((1..=15).map(|i| f64::from(i) / 16.0));
+        fractions.extend((1..=9).map(|i| f64::from(i) / 10.0));
     }
+    let main = [35.0, 47.0, 80.0].map(|c| (c - 3.6) / 91.4);
+    fractions.retain(|f| main.iter().all(|m| (f - m).abs() > 0.008));
+    fractions.extend(if study.quick { &main[1..2] } else { &main[..] });
     fractions.sort_by(f64::total_cmp);
-    fractions.dedup_by(|a, b| (*a - *b).abs() < 0.004);
+    fractions.dedup_by(|a, b| (*a - *b).abs() < 0.008);
     fractions.into_iter().map(|f| subject.at(f)).collect()
 }
 
