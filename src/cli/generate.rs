@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 #[command(after_help = "\
 Simulations run for a minute or two; the same seed gives the same file on any number of threads.
   pasta  nucleons of a neutron star's crust; densities in nucleons/fm³ over a periodic cube, world in fm
-  fluid  a Lennard-Jones liquid that wets the walls x_min and x_max of a slit pore; reduced units
+  fluid  a Lennard-Jones liquid: droplets in a slit pore, a film on its walls x_min and x_max; reduced units
 
 Examples:
   isolume generate bumps -o bumps.vti
@@ -46,10 +46,10 @@ struct SimulationOptions {
     /// Seed of all random numbers (default: 1)
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
-    /// Particles (default: 6000, fluid 9000)
+    /// Particles (default: 6000, fluid 7000)
     #[arg(long, value_name = "N")]
     particles: Option<usize>,
-    /// Particles per unit of volume (default: 0.04 per fm³, fluid 0.15 per σ³)
+    /// Particles per unit of volume (default: 0.04 per fm³, fluid 0.1 per σ³)
     #[arg(long, value_name = "N")]
     density: Option<f64>,
     /// pasta: protons per nucleon (default: 0.3)

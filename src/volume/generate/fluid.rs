@@ -1,4 +1,4 @@
-//! A Lennard-Jones fluid quenched in a slit pore whose walls it wets. \[AT17\] Reduced units: the fluid's σ, ε and m are 1.
+//! A Lennard-Jones fluid quenched in a closed slit pore whose two wide walls it wets. \[AT17\] Reduced units: the fluid's σ, ε and m are 1.
 
 use super::molecular_dynamics::{MolecularDynamics, PairTerm, Schedule, spread_evenly};
 use super::neighbours::SimulationBox;
@@ -7,12 +7,15 @@ use crate::error::{Error, Result};
 use crate::progress::Progress;
 use glam::DVec3;
 
-/// Cut-off of the pair potential, σ. With shifted force its critical temperature is 0.94. \[TD73\]
+/// Cut-off of the pair potential, σ. With shifted force the critical temperature is lower than the full potential's 1.3.
 const CUTOFF: f64 = 2.5;
 /// Skin of the neighbour lists, σ.
 const SKIN: f64 = 0.4;
 /// Strength of the walls, ε: the well at 0.858 σ is 1.05 of it deep, enough for the liquid to spread over them.
 const WALL: f64 = 3.0;
+
+/// Least distance of the walls, σ.
+const LEAST_EDGE: f64 = 6.0;
 
 /// Two atoms closer than this, σ, belong to the same cluster. \[Stillinger63\]
 pub const LINK: f64 = 1.5;
@@ -23,13 +26,20 @@ pub fn lennard_jones(r: f64) -> [f64; 2] {
     [4.0 * s * (s - 1.0), -24.0 * s * (2.0 * s - 1.0) / r]
 }
 
-/// V = ε_w (2/15 z⁻⁹ − z⁻³) at a distance z from a wall, and dV/dz: a half-space of Lennard-Jones atoms. \[Steele73\]
+/// V = ε_w (2/15 z⁻⁹ − z⁻³) at a distance z from a wall, and dV/dz: a half-space of Lennard-Jones atoms. \[AT17\]
 pub fn wall(z: f64) -> [f64; 2] {
     let s = z.powi(-3);
     [WALL * s * (2.0 / 15.0 * s * s - 1.0), WALL * s * (3.0 - 1.2 * s * s) / z]
 }
 
-/// What to simulate: a cube whose faces x = 0 and x = edge are walls, periodic along y and z.
+/// The repelling part of [`wall`]: a wall that is not wetted.
+pub fn rim(z: f64) -> [f64; 2] {
+    let v = WALL * 2.0 / 15.0 * z.powi(-9);
+    [v, -9.0 * v / z]
+}
+
+/// What to simulate: a cube whose faces x = 0 and x = edge are attracting walls. The other four repel, so that whatever
+/// condenses is whole: nothing is cut at the faces of the volume.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Fluid {
     /// Atoms.
@@ -46,7 +56,7 @@ pub struct Fluid {
 
 impl Default for Fluid {
     fn default() -> Self {
-        Self { atoms: 9000, density: 0.15, temperature: 0.7, steps: 12_000, seed: 1 }
+        Self { atoms: 7000, density: 0.1, temperature: 0.7, steps: 12_000, seed: 1 }
     }
 }
 
@@ -69,10 +79,10 @@ impl Fluid {
             return fail(format!("--temperature {}: from above 0 to 10 ε", self.temperature));
         }
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a small count")]
-        let least = ((2.0 * (CUTOFF + SKIN)).powi(3) * self.density).ceil() as usize + 1;
+        let least = (LEAST_EDGE.powi(3) * self.density).ceil() as usize + 1;
         if !(least..=1_000_000).contains(&self.atoms) {
             return fail(format!(
-                "--particles {}: {least} to 1000000 at this density, or the forces would reach around the box",
+                "--particles {}: {least} to 1000000 at this density, or the walls would meet",
                 self.atoms
             ));
         }
@@ -82,13 +92,19 @@ impl Fluid {
     /// The hot gas before the quench.
     pub fn gas(&self) -> MolecularDynamics {
         let edge = (self.atoms as f64 / self.density).cbrt();
-        let bounds = SimulationBox { size: DVec3::splat(edge), periodic: [false, true, true] };
+        let bounds = SimulationBox { size: DVec3::splat(edge), periodic: [false; 3] };
         // None starts in a wall.
-        let inner = DVec3::new(edge - 2.0, edge, edge);
-        let positions = spread_evenly(inner, self.atoms, self.seed).into_iter().map(|x| x + DVec3::X).collect();
+        let inner = bounds.size - 2.0;
+        let positions = spread_evenly(inner, self.atoms, self.seed).into_iter().map(|x| x + 1.0).collect();
         let walls = move |x: DVec3| {
-            let ([left, push], [right, pull]) = (wall(x.x), wall(edge - x.x));
-            (left + right, DVec3::X * (pull - push))
+            let (mut energy, mut force) = (0.0, DVec3::ZERO);
+            for a in 0..3 {
+                let of = if a == 0 { wall } else { rim };
+                let ([low, rise], [high, fall]) = (of(x[a]), of(edge - x[a]));
+                energy += low + high;
+                force[a] = fall - rise;
+            }
+            (energy, force)
         };
         let pairs =
             PairTerm::new(vec![PairPotential::new(CUTOFF, lennard_jones)], [[Some(0), None], [None, None]], SKIN);

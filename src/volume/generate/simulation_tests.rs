@@ -39,12 +39,13 @@ fn pair_potentials_are_those_of_the_papers() {
     assert!((v + 1.0).abs() < 1e-12 && d.abs() < 1e-12, "the well is 1 deep: {v} {d}");
     let [v, d] = fluid::wall(0.4f64.powf(1.0 / 6.0));
     assert!((v + 3.0 * 10.0f64.sqrt() / 3.0).abs() < 1e-12 && d.abs() < 1e-12, "√10/3 of its strength: {v} {d}");
-    let slopes: [(&str, fn(f64) -> [f64; 2]); 5] = [
+    let slopes: [(&str, fn(f64) -> [f64; 2]); 6] = [
         ("like", |r| pasta::nuclear(true, r)),
         ("unlike", |r| pasta::nuclear(false, r)),
         ("coulomb", pasta::coulomb),
         ("lennard-jones", fluid::lennard_jones),
         ("wall", fluid::wall),
+        ("rim", fluid::rim),
     ];
     for (name, f) in slopes {
         for r in [0.8, 1.0, 1.3, 2.2, 4.0] {
@@ -80,8 +81,10 @@ fn all_pairs(md: &MolecularDynamics, name: &str) -> f64 {
             }
         }
         if name == "fluid" {
-            let x = md.positions[i].x;
-            energy += fluid::wall(x)[0] + fluid::wall(size.x - x)[0];
+            for a in 0..3 {
+                let (x, of) = (md.positions[i][a], if a == 0 { fluid::wall } else { fluid::rim });
+                energy += of(x)[0] + of(size[a] - x)[0];
+            }
         }
     }
     energy
@@ -134,8 +137,8 @@ fn energy_and_momentum_are_conserved() {
         let after = window(&mut md);
         let drift = (after - before).abs() / md.kinetic_energy();
         assert!(drift < 1e-4, "{name}: {drift:e} of the kinetic energy in 2000 steps");
-        // The walls take momentum along x.
-        let lost = (md.momentum() - p) * if name == "fluid" { DVec3::new(0.0, 1.0, 1.0) } else { DVec3::ONE };
+        // The fluid's walls take momentum.
+        let lost = if name == "fluid" { DVec3::ZERO } else { md.momentum() - p };
         let scale: f64 = md.velocities.iter().map(|v| v.length()).sum();
         assert!(lost.length() < 1e-9 * scale, "{name}: {lost}");
     }
@@ -182,8 +185,11 @@ fn the_liquid_wets_the_walls() {
         let near = md.positions.iter().filter(|x| x.x.min(edge - x.x) < 1.5).count() as f64;
         near / (700.0 * 3.0 / edge)
     };
-    assert!(md.positions.iter().all(|x| x.x > 0.5 && x.x < edge - 0.5), "no atom is in a wall");
+    let inside = |x: &DVec3| x.min_element() > 0.4 && x.max_element() < edge - 0.4;
+    assert!(md.positions.iter().all(inside), "no atom is in a wall");
     let (before, after) = (wet(&fluid.gas()), wet(&md));
+    let rims = md.positions.iter().filter(|x| x.y.min(edge - x.y) < 1.5).count() as f64 / (700.0 * 3.0 / edge);
+    assert!(rims < 0.5 * after, "the rims stay dry: {rims} {after}");
     assert!(before < 1.0 && after > 1.5, "density at the walls over the mean: {before} {after}");
 }
 
