@@ -171,7 +171,7 @@ impl Generate {
 
     fn spread(&self, default: f64) -> Result<f64> {
         let sigma = self.simulation.spread.unwrap_or(default);
-        if sigma >= 0.05 && sigma <= 10.0 {
+        if (0.05..=10.0).contains(&sigma) {
             return Ok(sigma);
         }
         Err(Error::Invalid(format!("--spread {sigma}: 0.05 to 10")))

@@ -39,7 +39,8 @@ fn pair_potentials_are_those_of_the_papers() {
     assert!((v + 1.0).abs() < 1e-12 && d.abs() < 1e-12, "the well is 1 deep: {v} {d}");
     let [v, d] = fluid::wall(0.4f64.powf(1.0 / 6.0));
     assert!((v + 3.0 * 10.0f64.sqrt() / 3.0).abs() < 1e-12 && d.abs() < 1e-12, "√10/3 of its strength: {v} {d}");
-    let slopes: [(&str, fn(f64) -> [f64; 2]); 6] = [
+    type Potential = fn(f64) -> [f64; 2];
+    let slopes: [(&str, Potential); 6] = [
         ("like", |r| pasta::nuclear(true, r)),
         ("unlike", |r| pasta::nuclear(false, r)),
         ("coulomb", pasta::coulomb),
