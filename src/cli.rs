@@ -3,6 +3,7 @@
 mod compare;
 mod extract;
 mod flatland;
+mod generate;
 mod reference;
 mod study;
 
@@ -14,7 +15,6 @@ use crate::progress::{self, Progress};
 use crate::render::{Camera, Rendered, Shading, render};
 use crate::scene_file::{RawOptions, SceneOptions, load};
 use crate::volume::Volume;
-use crate::volume::generate::Generator;
 use crate::volume::statistics::VolumeStatistics;
 use clap::{Parser, Subcommand};
 use glam::DVec3;
@@ -53,8 +53,8 @@ pub struct Cli {
 enum Verb {
     /// Print what a volume holds: lattice, type, range, percentiles, histogram, a suggested sweep
     Info(Info),
-    /// Make a volume from a formula
-    Generate(Generate),
+    /// Make a volume from a formula, or simulate one
+    Generate(generate::Generate),
     /// Illuminate every isosurface of a volume or scene and write one file that holds both
     Bake(Bake),
     /// Draw an isosurface of a bake inside its box
@@ -80,18 +80,6 @@ struct Info {
     json: bool,
     #[command(flatten)]
     raw: RawOptions,
-}
-
-#[derive(clap::Args, Debug)]
-struct Generate {
-    /// bumps, sphere, linear[:a,b,c], xyz, or two-cylinders[:gap]
-    kind: String,
-    /// Samples along each edge
-    #[arg(long, default_value_t = 101, value_name = "N")]
-    size: usize,
-    /// Output: .vti or .nrrd
-    #[arg(short, long, value_name = "FILE")]
-    output: PathBuf,
 }
 
 #[derive(clap::Args, Debug)]
@@ -233,20 +221,6 @@ impl Info {
             println!("{}", serde_json::to_string_pretty(&statistics).expect("statistics are plain data"));
         } else {
             print!("{}", statistics.to_text());
-        }
-        Ok(())
-    }
-}
-
-impl Generate {
-    fn run(self, progress: Progress) -> Result<()> {
-        let generator = Generator::from_name(&self.kind)?;
-        expect_extension(&self.output, &["vti", "nrrd"])?;
-        writable(&self.output)?;
-        let volume = generator.sample([self.size; 3])?;
-        volume.write(&self.output)?;
-        if progress == Progress::Shown {
-            eprintln!("{}: {} of {} samples", self.output.display(), generator.name(), volume.samples().len());
         }
         Ok(())
     }

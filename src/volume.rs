@@ -384,14 +384,27 @@ impl Volume {
     /// # Errors
     /// `NotSupported` for another extension; `Io`.
     pub fn write(&self, path: impl AsRef<Path>) -> Result<()> {
+        self.write_with_notes(path, &[])
+    }
+
+    /// [`Volume::write`] with texts by name, about where the volume comes from: field data of a `.vti`, key/value pairs of
+    /// a `.nrrd`.
+    ///
+    /// # Errors
+    /// As [`Volume::write`].
+    pub fn write_with_notes(&self, path: impl AsRef<Path>, notes: &[(String, String)]) -> Result<()> {
         let path = path.as_ref();
         let extension = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
         match extension.as_str() {
-            "vti" => vti::VtiWriter::new(&self.lattice)
-                .point_data("value", 1, &self.samples)
-                .active_scalars("value")
-                .write(path),
-            "nrrd" => nrrd::write(self, path),
+            "vti" => {
+                let writer = vti::VtiWriter::new(&self.lattice).point_data("value", 1, &self.samples);
+                notes
+                    .iter()
+                    .fold(writer, |w, (name, text)| w.field_string(name, text))
+                    .active_scalars("value")
+                    .write(path)
+            }
+            "nrrd" => nrrd::write(self, path, notes),
             _ => {
                 Err(Error::not_supported(path, "volumes are written as .vti or .nrrd; give it one of these extensions"))
             }

@@ -109,6 +109,30 @@ fn generate_info_bake_render() {
 }
 
 #[test]
+fn simulations_write_one_file_per_field() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let small = ["--size", "13", "--steps", "20", "--particles", "400", "--density", "0.05"];
+    let with = |args: &[&'static str]| [args, &small[..]].concat();
+    ok(dir, &with(&["generate", "pasta", "--species", "both", "-o", "p.vti"]));
+    ok(dir, &with(&["generate", "pasta", "-o", "p.nrrd"]));
+    ok(dir, &with(&["generate", "fluid", "-o", "f.vti"]));
+    assert!(!dir.join("p.vti").exists());
+    let [protons, neutrons, all] =
+        ["p-proton.vti", "p-neutron.vti", "p.nrrd"].map(|f| Volume::open(dir.join(f)).unwrap());
+    for o in 0..all.lattice.len() {
+        assert!((protons.value(o) + neutrons.value(o) - all.value(o)).abs() < 1e-6, "sample {o}");
+    }
+    let edge = all.lattice.world_volume().cbrt();
+    assert!((edge - 20.0).abs() < 1e-9, "400 nucleons at 0.05 per fm³: {edge}");
+    assert!(Volume::open(dir.join("f.vti")).unwrap().range().unwrap().1 > 0.0);
+    assert!(text(&fs::read(dir.join("p-proton.vti")).unwrap()[..4096]).contains("generator"), "provenance");
+    refused(dir, &["generate", "pasta", "--particles", "9", "-o", "out.vti"], &["--particles 9"]);
+    refused(dir, &["generate", "fluid", "--species", "proton", "-o", "out.vti"], &["--species"]);
+    refused(dir, &["generate", "bumps", "--seed", "2", "-o", "out.vti"], &["bumps", "pasta"]);
+}
+
+#[test]
 fn bad_input_is_one_clear_line_and_leaves_nothing() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();

@@ -1,4 +1,14 @@
-//! Analytic fields on `[0,1]³` with exact value and gradient: what the tests know the answers of.
+//! Analytic fields on `[0,1]³` with exact value and gradient: what the tests know the answers of. Simulated ones stand
+//! in the modules.
+
+pub mod fluid;
+pub mod molecular_dynamics;
+pub mod neighbours;
+pub mod number_density;
+pub mod pair_potential;
+pub mod pasta;
+#[cfg(test)]
+mod simulation_tests;
 
 use crate::error::{Error, Result};
 use crate::volume::{Lattice, Samples, Volume};
@@ -24,6 +34,9 @@ const CYLINDER_POWER: i32 = 8;
 
 /// Gap of the `two-cylinders` when none is given: half a radius.
 const CYLINDER_GAP: f64 = 0.04;
+
+/// Names of the simulations, which are no [`Generator`]s: they take minutes, and go through a file.
+pub const SIMULATED: [&str; 2] = ["pasta", "fluid"];
 
 /// A field on `[0,1]³`.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -77,10 +90,14 @@ impl Generator {
             ("two-cylinders", Some([])) => Ok(Self::TwoCylinders { gap: CYLINDER_GAP }),
             // Farther apart, they would leave the cube.
             ("two-cylinders", Some(&[gap])) if (0.0..=0.6).contains(&gap) => Ok(Self::TwoCylinders { gap }),
+            _ if SIMULATED.contains(&name) => Err(Error::Invalid(format!(
+                "generator `{name}` is a simulation: run `isolume generate {name} -o FILE` and name the file"
+            ))),
             _ => Err(Error::Invalid(format!(
-                "generator `{name}`: known are {}; `linear:a,b,c` takes a gradient other than 0, `two-cylinders:gap` a \
-                 gap from 0 to 0.6",
-                Self::names().join(", ")
+                "generator `{name}`: known are {} and the simulations {}; `linear:a,b,c` takes a gradient other than 0, \
+                 `two-cylinders:gap` a gap from 0 to 0.6",
+                Self::names().join(", "),
+                SIMULATED.join(", ")
             ))),
         }
     }

@@ -42,12 +42,13 @@ pub fn read(path: &Path) -> Result<Volume> {
 }
 
 /// Writes a volume as an attached, raw, little-endian NRRD. The file's world is the lattice's, without a name.
+/// `notes` become key/value pairs.
 ///
 /// The file appears under its name only when it is complete.
 ///
 /// # Errors
 /// `Io`.
-pub fn write(volume: &Volume, path: &Path) -> Result<()> {
+pub fn write(volume: &Volume, path: &Path, notes: &[(String, String)]) -> Result<()> {
     let lattice = &volume.lattice;
     let [nx, ny, nz] = lattice.dims();
     let kind = match volume.samples().element_type() {
@@ -69,12 +70,16 @@ pub fn write(volume: &Volume, path: &Path) -> Result<()> {
             out,
             "NRRD0004\n# written by isolume\ntype: {kind}\ndimension: 3\nspace dimension: 3\nsizes: {nx} {ny} {nz}\n\
              space directions: {} {} {}\nkinds: domain domain domain\nendian: little\nencoding: raw\n\
-             space origin: {}\n\n",
+             space origin: {}\n",
             vector(axes.x_axis),
             vector(axes.y_axis),
             vector(axes.z_axis),
             vector(lattice.origin()),
         )?;
+        for (key, text) in notes {
+            writeln!(out, "{key}:={}", text.replace(['\n', '\r'], " "))?;
+        }
+        writeln!(out)?;
         each_sample_type!(volume.samples(), v => v.iter().try_for_each(|s| out.write_all(&s.to_le_bytes())))
     })
 }

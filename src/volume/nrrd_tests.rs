@@ -168,6 +168,7 @@ fn what_is_written_is_read() {
     let lattice = Lattice::new([3, 2, 2], DVec3::new(1e6, -0.1, 1e-9), axes).unwrap();
     let samples = Samples::F32((0..12).map(|i| i as f32 / 7.0).collect());
     let volume = Volume::new(path.display().to_string(), lattice, samples).unwrap();
-    write(&volume, &path).unwrap();
+    write(&volume, &path, &[("made by".into(), "a test:\nof notes".into())]).unwrap();
+    assert!(String::from_utf8_lossy(&std::fs::read(&path).unwrap()).contains("\nmade by:=a test: of notes\n"));
     assert_eq!(read(&path).unwrap(), volume);
 }
