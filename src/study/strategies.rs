@@ -5,6 +5,7 @@ use super::{Effort, Study, Subject, Table, accuracy_of, provenance};
 use crate::bake::{BakeOptions, BakeSettings, StrategyName};
 use crate::error::Result;
 use crate::illumination_grid::GridSize;
+use crate::mask::masks;
 use crate::plot::{Plot, Series};
 
 const COLUMNS: [&str; 14] = [
@@ -31,8 +32,8 @@ const STRATEGIES: [(StrategyName, &str); 4] = [
     (StrategyName::Nodes, "nodes"),
 ];
 
-/// Error of the strategies at 10⁵, 10⁶ and 10⁷ samples over the whole sweep, and Figure 6 at 10⁶. `nodes` samples a grid
-/// of at most that many points; the others interpolate onto the volume's lattice.
+/// Error of the strategies at 10⁵, 10⁶ and 10⁷ samples over the whole sweep, and Figure 6 at 10⁶. `nodes` takes its samples
+/// at the points of a grid as fine as they allow; the others interpolate onto the volume's lattice.
 ///
 /// # Errors
 /// As bakes, references and tables.
@@ -51,7 +52,7 @@ pub fn strategies(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Re
                 let mut options =
                     BakeOptions { samples: Some(count), strategy: Some(strategy), ..BakeOptions::default() };
                 if strategy == StrategyName::Nodes {
-                    options.grid = Some(GridSize::Points(dims_of(subject, count)));
+                    options.grid = Some(grid_of(subject, count)?);
                 }
                 let (bake, seconds) = study.bake(subject, &BakeSettings::new(&options.or(base))?)?;
                 for &c in &isovalues {
@@ -86,12 +87,24 @@ pub fn strategies(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Re
     summarise(study, subjects, &table, counts)
 }
 
-/// The largest grid of Ω's proportions with at most `count` points, at least 2 along each axis.
+/// The largest grid of Ω's proportions that takes at most `count` samples (two for points that neighbours stand for).
+///
+/// # Errors
+/// `Invalid` if it has too many points.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "counts")]
-fn dims_of(subject: &Subject, count: u64) -> [usize; 3] {
+fn grid_of(subject: &Subject, count: u64) -> Result<GridSize> {
+    let field = &subject.scene.field;
     let dims = subject.scene.lattice().dims();
-    let factor = (count as f64 / subject.scene.lattice().len() as f64).cbrt();
-    dims.map(|n| ((n as f64 * factor) as usize).max(2))
+    let mut factor = 1.0f64;
+    loop {
+        let grid = GridSize::Points(dims.map(|n| ((n as f64 * factor) as usize).max(2)));
+        let lattice = grid.lattice(subject.scene.lattice())?;
+        let samples: u64 = masks(field, &lattice).iter().map(|m| *m as u64).sum();
+        if samples <= count && samples as f64 > 0.9 * count as f64 || lattice.len() == 8 {
+            return Ok(grid);
+        }
+        factor *= (0.97 * count as f64 / samples.max(1) as f64).cbrt();
+    }
 }
 
 /// Whether an isovalue is among those that are read off the table rather than the plot.
