@@ -3,6 +3,7 @@
 
 pub(crate) mod ascii;
 pub mod generate;
+pub mod metaimage;
 pub mod nifti;
 pub mod nrrd;
 pub mod raw;
@@ -33,7 +34,8 @@ impl Lattice {
     pub fn new(dims: [usize; 3], origin: DVec3, axes: DMat3) -> Result<Self> {
         if dims.iter().any(|&n| n < 2) {
             return Err(Error::Invalid(format!(
-                "lattice of {}×{}×{} samples: every dimension must be at least 2 to hold a cell",
+                "lattice of {}×{}×{} samples: every dimension must be at least 2 to hold a cell (one-sample-thick \
+                 fields are for `isolume flatland`)",
                 dims[0], dims[1], dims[2]
             )));
         }
@@ -349,7 +351,7 @@ impl Volume {
         Ok(Self { name, lattice, samples })
     }
 
-    /// Reads a file by its extension, whatever its case: `.nii`, `.nii.gz`, `.nrrd`, `.nhdr` or `.vti`. Of a `.vti` it
+    /// Reads a file by its extension, whatever its case: `.nii`, `.nii.gz`, `.nrrd`, `.nhdr`, `.mha`, `.mhd` or `.vti`. Of a `.vti` it
     /// takes the scalars that [`vti::VtiFile::into_scalars`] names. Files without a header go through
     /// [`raw::RawLayout::read`].
     ///
@@ -365,6 +367,8 @@ impl Volume {
             nifti::read(path)
         } else if has(".nrrd") || has(".nhdr") {
             nrrd::read(path)
+        } else if has(".mha") || has(".mhd") {
+            metaimage::read(path)
         } else if has(".vti") {
             let (lattice, samples) = vti::VtiFile::read(path)?.into_scalars().map_err(|e| e.in_file(path))?;
             Self::new(path.display().to_string(), lattice, samples)
@@ -373,7 +377,7 @@ impl Volume {
         } else {
             Err(Error::not_supported(
                 path,
-                "unknown extension; .nii, .nii.gz, .nrrd, .nhdr and .vti are read, and .raw with its layout given",
+                "unknown extension; .nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd and .vti are read, and .raw with its layout given",
             ))
         }
     }

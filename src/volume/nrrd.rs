@@ -4,7 +4,7 @@
 //! `space origin` are taken as numbers, and a left-posterior-superior file is not turned into RAS.
 
 use crate::error::{Error, Result};
-use crate::files::{self, Section};
+use crate::files::{self, Packing, Section};
 use crate::volume::{ElementType, Endian, Lattice, Samples, Volume, ascii, each_sample_type};
 use glam::{DMat3, DVec3};
 use std::collections::HashMap;
@@ -275,9 +275,9 @@ impl<'a> Header<'a> {
             Some(name) => (self.path.parent().map_or_else(|| PathBuf::from(name), |p| p.join(name)), 0),
         };
         let encoding = self.need("encoding")?.to_ascii_lowercase();
-        let gzip = match encoding.as_str() {
-            "raw" | "ascii" | "text" | "txt" => false,
-            "gzip" | "gz" => true,
+        let packing = match encoding.as_str() {
+            "raw" | "ascii" | "text" | "txt" => Packing::Plain,
+            "gzip" | "gz" => Packing::Gzip,
             other => {
                 return Err(Error::not_supported(
                     self.path,
@@ -313,7 +313,7 @@ impl<'a> Header<'a> {
             Some(_) => return Err(self.invalid("endian", "it must be `little` or `big`")),
             None => return Err(Error::invalid(self.path, "samples of several bytes need the field `endian`")),
         };
-        let bytes = files::read_section(&path, Section { start, gzip, skip }, promised)?;
+        let bytes = files::read_section(&path, Section { start, packing, skip }, promised)?;
         Ok(Samples::from_vec(bytes, element, endian))
     }
 }
