@@ -73,7 +73,7 @@ enum Verb {
 
 #[derive(clap::Args, Debug)]
 struct Info {
-    /// Volume: .nii, .nii.gz, .nrrd, .nhdr, .vti, or a headerless file with --raw-dims
+    /// Volume: NIfTI, NRRD, MetaImage, MRC/CCP4, cube, VTK, NumPy, TIFF stack, or a headerless file with --raw-dims
     file: PathBuf,
     /// Print JSON
     #[arg(long)]

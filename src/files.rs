@@ -161,6 +161,18 @@ pub(crate) fn read_section(path: &Path, section: Section, promised: u64) -> Resu
     Ok(bytes)
 }
 
+/// Reads a section to its end, unpacked: for text, whose length no header promises.
+///
+/// # Errors
+/// `Io` with the path; `Invalid` if a packed stream breaks off or is damaged.
+pub(crate) fn read_to_end(path: &Path, section: Section) -> Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    match open_section(path, section)?.read_to_end(&mut bytes) {
+        Ok(_) => Ok(bytes.split_off(bytes.len().min(section.skip as usize))),
+        Err(e) => Err(broken(path, section, bytes.len() as u64, bytes.len() as u64, e)),
+    }
+}
+
 /// The error of a section that ends too early.
 fn short(path: &Path, section: Section, found: u64, total: u64) -> Error {
     let kind = if section.packing != Packing::Plain { "unpacked " } else { "" };

@@ -5,7 +5,9 @@
 
 use crate::error::{Error, Result};
 use crate::files::{self, Packing, Section};
-use crate::volume::{ElementType, Endian, Lattice, Samples, Volume, ascii, each_sample_type};
+use crate::volume::vti::SamplesRef;
+use crate::volume::{ElementType, Endian, Lattice, Samples, Volume, ascii};
+use flate2::{Compression, write::GzEncoder};
 use glam::{DMat3, DVec3};
 use std::collections::HashMap;
 use std::io::{BufRead, BufReader, Read, Write};
@@ -41,16 +43,25 @@ pub fn read(path: &Path) -> Result<Volume> {
     Volume::new(path.display().to_string(), lattice, samples)
 }
 
-/// Writes a volume as an attached, raw, little-endian NRRD. The file's world is the lattice's, without a name.
+/// Writes values on a lattice as an attached, gzip-packed, little-endian NRRD that 3D Slicer, ITK and pynrrd read: one component
+/// as a scalar volume, more as a vector image, whose vector axis is the first and has no direction. `notes` become `key:=value`
+/// lines.
 ///
-/// The file appears under its name only when it is complete.
+/// The lattice's numbers are those of the space left-posterior-superior, the one that ITK and Slicer mean where nothing is said.
+/// The file appears under its name only when it is complete. VTK's and ParaView's own NRRD reader does not read vectors.
 ///
 /// # Errors
-/// `Io`.
-pub fn write(volume: &Volume, path: &Path) -> Result<()> {
-    let lattice = &volume.lattice;
+/// `Invalid` if the count is not the lattice's samples × `components`; `Io`.
+pub fn write(
+    path: &Path,
+    lattice: &Lattice,
+    components: usize,
+    values: SamplesRef<'_>,
+    notes: &[(&str, &str)],
+) -> Result<()> {
+    values.check(lattice, components).map_err(|e| Error::invalid(path, e))?;
     let [nx, ny, nz] = lattice.dims();
-    let kind = match volume.samples().element_type() {
+    let kind = match values.element_type() {
         ElementType::U8 => "uint8",
         ElementType::I8 => "int8",
         ElementType::U16 => "uint16",
@@ -64,18 +75,27 @@ pub fn write(volume: &Volume, path: &Path) -> Result<()> {
     };
     let vector = |v: DVec3| format!("({},{},{})", v.x, v.y, v.z);
     let axes = lattice.axes();
+    let [x, y, z] = [axes.x_axis, axes.y_axis, axes.z_axis].map(vector);
+    let (dimension, sizes, none, kinds) = match components {
+        1 => (3, String::new(), "", "domain domain domain"),
+        n => (4, format!("{n} "), "none ", "vector domain domain domain"),
+    };
+    let origin = vector(lattice.origin());
+    let mut head = format!(
+        "NRRD0005\n# written by isolume\ntype: {kind}\ndimension: {dimension}\nspace: left-posterior-superior\n\
+         sizes: {sizes}{nx} {ny} {nz}\nspace directions: {none}{x} {y} {z}\nkinds: {kinds}\nendian: little\n\
+         encoding: gzip\nspace origin: {origin}\n"
+    );
+    for (key, value) in notes {
+        let value = value.replace('\\', "\\\\").replace('\n', "\\n");
+        head += &format!("{key}:={value}\n");
+    }
     files::write_atomically(path, |out| {
-        write!(
-            out,
-            "NRRD0004\n# written by isolume\ntype: {kind}\ndimension: 3\nspace dimension: 3\nsizes: {nx} {ny} {nz}\n\
-             space directions: {} {} {}\nkinds: domain domain domain\nendian: little\nencoding: raw\n\
-             space origin: {}\n\n",
-            vector(axes.x_axis),
-            vector(axes.y_axis),
-            vector(axes.z_axis),
-            vector(lattice.origin()),
-        )?;
-        each_sample_type!(volume.samples(), v => v.iter().try_for_each(|s| out.write_all(&s.to_le_bytes())))
+        out.write_all(head.as_bytes())?;
+        out.write_all(b"\n")?;
+        let mut packed = GzEncoder::new(out, Compression::fast());
+        values.write_le(&mut packed)?;
+        packed.finish().map(drop)
     })
 }
 

@@ -1,5 +1,4 @@
 use super::*;
-use flate2::{Compression, write::GzEncoder};
 
 /// Reads a hand-made file, with others beside it.
 fn read_with(file: &[u8], others: &[(&str, &[u8])]) -> Result<Volume> {
@@ -168,6 +167,6 @@ fn what_is_written_is_read() {
     let lattice = Lattice::new([3, 2, 2], DVec3::new(1e6, -0.1, 1e-9), axes).unwrap();
     let samples = Samples::F32((0..12).map(|i| i as f32 / 7.0).collect());
     let volume = Volume::new(path.display().to_string(), lattice, samples).unwrap();
-    write(&volume, &path).unwrap();
+    write(&path, &volume.lattice, 1, volume.samples().into(), &[("note", "a\\b\nc")]).unwrap();
     assert_eq!(read(&path).unwrap(), volume);
 }

@@ -89,6 +89,21 @@ impl SamplesRef<'_> {
         self.len() == 0
     }
 
+    /// Whether there are `components` values per sample of a lattice; says so if not.
+    pub(crate) fn check(&self, lattice: &Lattice, components: usize) -> Result<(), String> {
+        let wanted = lattice.len().checked_mul(components);
+        if wanted == Some(self.len()) && components > 0 {
+            return Ok(());
+        }
+        let ([nx, ny, nz], n) = (lattice.dims(), self.len());
+        Err(format!("{n} values for {nx}×{ny}×{nz} samples of {components} components"))
+    }
+
+    /// Writes all values, little-endian.
+    pub(crate) fn write_le(&self, out: &mut impl Write) -> std::io::Result<()> {
+        each_type!(self, v => v.iter().try_for_each(|s| out.write_all(&s.to_le_bytes())))
+    }
+
     /// VTK's name of the type.
     fn vtk_type(&self) -> &'static str {
         match self.element_type() {
