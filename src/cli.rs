@@ -1,6 +1,7 @@
 //! The command line: verbs, flags, and what they print. No physics here.
 
 mod compare;
+mod export;
 mod extract;
 mod flatland;
 mod reference;
@@ -13,7 +14,6 @@ use crate::export::bake_file::{self, BakedVolume};
 use crate::progress::{self, Progress};
 use crate::render::{Camera, Rendered, Shading, render};
 use crate::scene_file::{RawOptions, SceneOptions, load};
-use crate::volume::Volume;
 use crate::volume::generate::Generator;
 use crate::volume::statistics::VolumeStatistics;
 use clap::{Parser, Subcommand};
@@ -33,6 +33,7 @@ Examples:
   isolume bake head.nii.gz --isovalues 15 200 -o head.vti   illuminate every isosurface from 15 to 200
   isolume render head.vti --isovalue 80 -o head.png      a picture of one of them
   isolume extract head.vti --isovalue 80 -o head.ply     the same as a mesh with its light
+  isolume export head.vti --array rgb -o head.nrrd       the light as a volume for 3D Slicer; .npy for Python
   isolume generate bumps -o bumps.vti                    a volume to play with
 
 Exit codes: 0 done, 1 failed, 2 wrong usage or input, 130 interrupted."
@@ -61,6 +62,8 @@ enum Verb {
     Render(Render),
     /// Take one isosurface away as a mesh, with a bake's light on its vertices
     Extract(extract::Extract),
+    /// Write one array of a bake, or a volume, in another format: .nrrd, .npy, .exr or .vti
+    Export(export::Export),
     /// Illuminate one isosurface in ordinary 3D, per vertex with variance: what bakes are measured against
     Reference(reference::ReferenceArgs),
     /// Measure a bake against references
@@ -89,7 +92,7 @@ struct Generate {
     /// Samples along each edge
     #[arg(long, default_value_t = 101, value_name = "N")]
     size: usize,
-    /// Output: .vti or .nrrd
+    /// Output: .vti, .nrrd or .npy
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
 }
@@ -189,6 +192,7 @@ impl Cli {
             Verb::Bake(v) => v.run(progress),
             Verb::Render(v) => v.run(progress),
             Verb::Extract(v) => v.run(progress),
+            Verb::Export(v) => v.run(progress),
             Verb::Reference(v) => v.run(progress),
             Verb::Compare(v) => v.run(progress),
             Verb::Flatland(v) => v.run(progress),
@@ -223,11 +227,7 @@ fn device() -> Result<Device> {
 
 impl Info {
     fn run(self) -> Result<()> {
-        let volume = if self.raw == RawOptions::default() {
-            Volume::open(&self.file)?
-        } else {
-            self.raw.layout(&self.file)?.read(&self.file)?
-        };
+        let volume = export::open(&self.file, &self.raw)?;
         let statistics = VolumeStatistics::of(&volume);
         if self.json {
             println!("{}", serde_json::to_string_pretty(&statistics).expect("statistics are plain data"));
@@ -241,7 +241,7 @@ impl Info {
 impl Generate {
     fn run(self, progress: Progress) -> Result<()> {
         let generator = Generator::from_name(&self.kind)?;
-        expect_extension(&self.output, &["vti", "nrrd"])?;
+        expect_extension(&self.output, &["vti", "nrrd", "npy"])?;
         writable(&self.output)?;
         let volume = generator.sample([self.size; 3])?;
         volume.write(&self.output)?;
@@ -255,6 +255,13 @@ impl Generate {
 impl Bake {
     fn run(self, progress: Progress) -> Result<()> {
         let begun = Instant::now();
+        let found = self.output.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        if ["nrrd", "npy", "exr"].contains(&found.as_str()) {
+            return Err(Error::invalid(
+                &self.output,
+                "cannot hold a bake with its walls and settings; bake to a .vti, and `isolume export` writes its arrays",
+            ));
+        }
         expect_extension(&self.output, &["vti"])?;
         writable(&self.output)?;
         if let Some(report) = &self.report {

@@ -10,6 +10,7 @@ pub mod mrc;
 pub mod nifti;
 pub mod npy;
 pub mod nrrd;
+pub mod plane;
 pub mod raw;
 pub mod statistics;
 pub mod tiff;
@@ -43,8 +44,8 @@ impl Lattice {
     pub fn new(dims: [usize; 3], origin: DVec3, axes: DMat3) -> Result<Self> {
         if dims.iter().any(|&n| n < 2) {
             return Err(Error::Invalid(format!(
-                "lattice of {}×{}×{} samples: every dimension must be at least 2 to hold a cell (one-sample-thick \
-                 fields are for `isolume flatland`)",
+                "lattice of {}×{}×{} samples: every dimension must be at least 2 to hold a cell (a flat \
+                 field goes to `isolume flatland`, as .png, .nrrd or .vti)",
                 dims[0], dims[1], dims[2]
             )));
         }
@@ -332,11 +333,47 @@ impl Samples {
     }
 }
 
+/// Where a patient's directions lie in the world: the first letter names what x grows towards, and so on. Coordinates are never
+/// turned from one to the other; formats that hold the name pass it on.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Space {
+    /// Left, posterior, superior: that of DICOM and ITK, which is meant where nothing is said.
+    #[default]
+    LeftPosteriorSuperior,
+    /// Right, anterior, superior: that of NIfTI.
+    RightAnteriorSuperior,
+    /// Left, anterior, superior.
+    LeftAnteriorSuperior,
+}
+
+impl Space {
+    /// NRRD's name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Space::LeftPosteriorSuperior => "left-posterior-superior",
+            Space::RightAnteriorSuperior => "right-anterior-superior",
+            Space::LeftAnteriorSuperior => "left-anterior-superior",
+        }
+    }
+
+    /// The space of a [`Space::name`] or its initials.
+    pub fn from_name(name: &str) -> Option<Self> {
+        match name.to_ascii_lowercase().as_str() {
+            "left-posterior-superior" | "lps" => Some(Space::LeftPosteriorSuperior),
+            "right-anterior-superior" | "ras" => Some(Space::RightAnteriorSuperior),
+            "left-anterior-superior" | "las" => Some(Space::LeftAnteriorSuperior),
+            _ => None,
+        }
+    }
+}
+
 /// A scalar volume: samples on a lattice.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Volume {
     /// What to call it in messages: the file's path or the generator's name.
     pub name: String,
+    /// What the world's axes mean.
+    pub space: Space,
     /// Where the samples stand.
     pub lattice: Lattice,
     samples: Samples,
@@ -357,7 +394,7 @@ impl Volume {
                 samples.len()
             )));
         }
-        Ok(Self { name, lattice, samples })
+        Ok(Self { name, space: Space::default(), lattice, samples })
     }
 
     /// Reads a file by its extension, whatever its case: [`READ`] names them. Of a `.vti` it takes the scalars that
@@ -413,7 +450,7 @@ impl Volume {
                 .point_data("value", 1, &self.samples)
                 .active_scalars("value")
                 .write(path),
-            "nrrd" => nrrd::write(path, &self.lattice, 1, (&self.samples).into(), &[]),
+            "nrrd" => nrrd::write(path, &self.lattice, self.space, 1, (&self.samples).into(), &[]),
             "npy" => npy::write(path, &self.lattice, 1, (&self.samples).into()),
             _ => Err(Error::not_supported(
                 path,
@@ -425,6 +462,11 @@ impl Volume {
     /// The samples, x fastest.
     pub fn samples(&self) -> &Samples {
         &self.samples
+    }
+
+    /// The samples, without the rest.
+    pub fn into_samples(self) -> Samples {
+        self.samples
     }
 
     /// Sample at a position in memory, in source units.

@@ -114,7 +114,9 @@ impl<'a> Header<'a> {
             Some([n]) => {
                 return Err(Error::not_supported(
                     self.path,
-                    format!("NDims = {n}: only 3D scalar volumes are read; a 2D field is for `isolume flatland`"),
+                    format!(
+                        "NDims = {n}: only 3D scalar volumes are read; a 2D field goes to `isolume flatland`, as .png, .nrrd or .vti"
+                    ),
                 ));
             }
             _ => return Err(Error::invalid(self.path, "the header has no field `NDims`, so it is no MetaImage")),

@@ -5,7 +5,7 @@
 
 use crate::error::{Error, Result};
 use crate::files::{self, Section};
-use crate::volume::{ElementType, Endian, Lattice, Samples, Volume, each_sample_type};
+use crate::volume::{ElementType, Endian, Lattice, Samples, Space, Volume, each_sample_type};
 use glam::{DMat3, DQuat, DVec3, Vec4};
 use nifti::{Endianness, NiftiHeader, NiftiType};
 use rayon::prelude::*;
@@ -58,7 +58,8 @@ pub fn read(path: &Path) -> Result<Volume> {
         Endianness::Big => Endian::Big,
     };
     let samples = scaled(path, Samples::from_vec(bytes, element, endian), header.scl_slope, header.scl_inter)?;
-    Volume::new(path.display().to_string(), lattice, samples)
+    let volume = Volume::new(path.display().to_string(), lattice, samples)?;
+    Ok(Volume { space: Space::RightAnteriorSuperior, ..volume })
 }
 
 /// The three dimensions; further ones must be 1.

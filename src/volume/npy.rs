@@ -58,8 +58,8 @@ pub fn read(path: &Path) -> Result<Volume> {
         Error::not_supported(
             path,
             format!(
-                "shape {:?}: one value per point of three axes is read; save one component, and 2D fields are for \
-                 `isolume flatland`",
+                "shape {:?}: one value per point of three axes is read; save one component, and give 2D fields to \
+                 `isolume flatland` as .png, .nrrd or .vti",
                 header.shape
             ),
         )
