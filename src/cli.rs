@@ -1,6 +1,7 @@
 //! The command line: verbs, flags, and what they print. No physics here.
 
 mod compare;
+mod export;
 mod extract;
 mod flatland;
 mod generate;
@@ -14,7 +15,11 @@ use crate::export::bake_file::{self, BakedVolume};
 use crate::progress::{self, Progress};
 use crate::render::{Camera, Rendered, Shading, render};
 use crate::scene_file::{RawOptions, SceneOptions, load};
+<<<<<<< HEAD
 use crate::volume::Volume;
+=======
+use crate::volume::generate::Generator;
+>>>>>>> 2191a4f46f9ce2017ad59a933d5b736e1b4574ae
 use crate::volume::statistics::VolumeStatistics;
 use clap::{Parser, Subcommand};
 use glam::DVec3;
@@ -33,6 +38,7 @@ Examples:
   isolume bake head.nii.gz --isovalues 15 200 -o head.vti   illuminate every isosurface from 15 to 200
   isolume render head.vti --isovalue 80 -o head.png      a picture of one of them
   isolume extract head.vti --isovalue 80 -o head.ply     the same as a mesh with its light
+  isolume export head.vti --array rgb -o head.nrrd       the light as a volume for 3D Slicer; .npy for Python
   isolume generate bumps -o bumps.vti                    a volume to play with
 
 Exit codes: 0 done, 1 failed, 2 wrong usage or input, 130 interrupted."
@@ -61,6 +67,8 @@ enum Verb {
     Render(Render),
     /// Take one isosurface away as a mesh, with a bake's light on its vertices
     Extract(extract::Extract),
+    /// Write one array of a bake, or a volume, in another format: .nrrd, .npy, .exr or .vti
+    Export(export::Export),
     /// Illuminate one isosurface in ordinary 3D, per vertex with variance: what bakes are measured against
     Reference(reference::ReferenceArgs),
     /// Measure a bake against references
@@ -73,7 +81,7 @@ enum Verb {
 
 #[derive(clap::Args, Debug)]
 struct Info {
-    /// Volume: .nii, .nii.gz, .nrrd, .nhdr, .vti, or a headerless file with --raw-dims
+    /// Volume: NIfTI, NRRD, MetaImage, MRC/CCP4, cube, VTK, NumPy, TIFF stack, or a headerless file with --raw-dims
     file: PathBuf,
     /// Print JSON
     #[arg(long)]
@@ -83,6 +91,21 @@ struct Info {
 }
 
 #[derive(clap::Args, Debug)]
+<<<<<<< HEAD
+=======
+struct Generate {
+    /// bumps, sphere, linear[:a,b,c], xyz, or two-cylinders[:gap]
+    kind: String,
+    /// Samples along each edge
+    #[arg(long, default_value_t = 101, value_name = "N")]
+    size: usize,
+    /// Output: .vti, .nrrd or .npy
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+}
+
+#[derive(clap::Args, Debug)]
+>>>>>>> 2191a4f46f9ce2017ad59a933d5b736e1b4574ae
 #[command(after_help = "\
 The result holds point data `value` (contour on it), `rgb` (colour by it, without lighting and without a colour map),
 `radiance` (linear), `std_error` and `mask`, the walls' light as field data, and every setting.
@@ -177,6 +200,7 @@ impl Cli {
             Verb::Bake(v) => v.run(progress),
             Verb::Render(v) => v.run(progress),
             Verb::Extract(v) => v.run(progress),
+            Verb::Export(v) => v.run(progress),
             Verb::Reference(v) => v.run(progress),
             Verb::Compare(v) => v.run(progress),
             Verb::Flatland(v) => v.run(progress),
@@ -211,11 +235,7 @@ fn device() -> Result<Device> {
 
 impl Info {
     fn run(self) -> Result<()> {
-        let volume = if self.raw == RawOptions::default() {
-            Volume::open(&self.file)?
-        } else {
-            self.raw.layout(&self.file)?.read(&self.file)?
-        };
+        let volume = export::open(&self.file, &self.raw)?;
         let statistics = VolumeStatistics::of(&volume);
         if self.json {
             println!("{}", serde_json::to_string_pretty(&statistics).expect("statistics are plain data"));
@@ -226,9 +246,33 @@ impl Info {
     }
 }
 
+<<<<<<< HEAD
+=======
+impl Generate {
+    fn run(self, progress: Progress) -> Result<()> {
+        let generator = Generator::from_name(&self.kind)?;
+        expect_extension(&self.output, &["vti", "nrrd", "npy"])?;
+        writable(&self.output)?;
+        let volume = generator.sample([self.size; 3])?;
+        volume.write(&self.output)?;
+        if progress == Progress::Shown {
+            eprintln!("{}: {} of {} samples", self.output.display(), generator.name(), volume.samples().len());
+        }
+        Ok(())
+    }
+}
+
+>>>>>>> 2191a4f46f9ce2017ad59a933d5b736e1b4574ae
 impl Bake {
     fn run(self, progress: Progress) -> Result<()> {
         let begun = Instant::now();
+        let found = self.output.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        if ["nrrd", "npy", "exr"].contains(&found.as_str()) {
+            return Err(Error::invalid(
+                &self.output,
+                "cannot hold a bake with its walls and settings; bake to a .vti, and `isolume export` writes its arrays",
+            ));
+        }
         expect_extension(&self.output, &["vti"])?;
         writable(&self.output)?;
         if let Some(report) = &self.report {

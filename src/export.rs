@@ -1,14 +1,23 @@
-//! Writers of what users take away: textured meshes and pictures. Every file appears under its name only when it is
+//! Writers of what users take away: textured meshes, pictures and stacks of slices. Every file appears under its name only when it is
 //! complete.
 
 pub mod bake_file;
+pub mod glb;
 pub mod obj;
 pub mod picture;
 pub mod ply;
+pub mod slices;
+pub mod vtp;
 
 use crate::error::{Error, Result};
 use glam::{DVec3, Vec3};
 use std::path::Path;
+
+/// A display colour as bytes: rounded to nearest, clamped.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to a byte")]
+fn colour_bytes(colour: [f32; 3]) -> [u8; 3] {
+    colour.map(|v| (v * 255.0).round() as u8)
+}
 
 /// A mesh to be written, in world units. All vertex arrays are in the order of `positions`.
 #[derive(Clone, Copy, Debug, Default)]
@@ -19,13 +28,27 @@ pub struct Mesh<'a> {
     pub triangles: &'a [[u32; 3]],
     /// Unit normals at the vertices, pointing outside. Written as they are.
     pub normals: Option<&'a [Vec3]>,
-    /// Display colours at the vertices, sRGB-encoded.
-    pub colours: Option<&'a [[u8; 3]]>,
+    /// Display colours at the vertices, sRGB-encoded, in [0, 1].
+    pub colours: Option<&'a [[f32; 3]]>,
     /// Named values at the vertices, such as `radiance_r`. Formats that cannot hold them leave them out.
     pub properties: &'a [(&'a str, &'a [f32])],
 }
 
 impl Mesh<'_> {
+    /// Writes the mesh in the format of the extension, `.ply`, `.obj`, `.glb` or `.vtp`.
+    ///
+    /// # Errors
+    /// `NotSupported` for another extension, or what the format's writer returns.
+    pub fn write(&self, path: &Path) -> Result<()> {
+        match path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase().as_str() {
+            "ply" => ply::write(path, self),
+            "obj" => obj::write(path, self),
+            "glb" => glb::write(path, self),
+            "vtp" => vtp::write(path, self),
+            _ => Err(Error::not_supported(path, "meshes are written as .ply, .obj, .glb or .vtp")),
+        }
+    }
+
     /// Whether the arrays fit each other, before anything is written.
     fn check(&self, path: &Path) -> Result<()> {
         let n = self.positions.len();

@@ -3,7 +3,7 @@
 
 use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
-use flate2::read::MultiGzDecoder;
+use flate2::read::{MultiGzDecoder, ZlibDecoder};
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
@@ -14,13 +14,35 @@ const TRUSTED: u64 = 64 << 20;
 /// DEFLATE cannot expand further than this (RFC 1951: 258 bytes from 2 bits).
 const DEFLATE_LIMIT: u64 = 1032;
 
+/// How a section is packed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Packing {
+    /// Not at all.
+    Plain,
+    /// One or several gzip members.
+    Gzip,
+    /// One zlib stream.
+    Zlib,
+}
+
+impl Packing {
+    /// What to call it in messages.
+    fn name(self) -> &'static str {
+        match self {
+            Packing::Plain => "plain",
+            Packing::Gzip => "gzip",
+            Packing::Zlib => "zlib",
+        }
+    }
+}
+
 /// Where the samples of a file begin, and how they are packed.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Section {
     /// Stored bytes before the section.
     pub(crate) start: u64,
-    /// Whether the section is a gzip stream.
-    pub(crate) gzip: bool,
+    /// How the section is packed.
+    pub(crate) packing: Packing,
     /// Bytes to pass over, after unpacking.
     pub(crate) skip: u64,
 }
@@ -49,27 +71,30 @@ pub(crate) fn length(path: &Path) -> Result<u64> {
     Ok(open(path)?.metadata().map_err(|e| Error::io(path, e))?.len())
 }
 
-/// Whether a file begins like a gzip stream.
+/// Gzip if a file begins like one from byte `start` on, else plain.
 ///
 /// # Errors
 /// `Io` with the path.
-pub(crate) fn is_gzip(path: &Path) -> Result<bool> {
-    let mut head = Vec::new();
-    open(path)?.take(2).read_to_end(&mut head).map_err(|e| Error::io(path, e))?;
-    Ok(head == [0x1f, 0x8b])
+pub(crate) fn gzip_or_plain(path: &Path, start: u64) -> Result<Packing> {
+    let head = read_head(path, Section { start, packing: Packing::Plain, skip: 0 }, 2)?;
+    Ok(if head == [0x1f, 0x8b] { Packing::Gzip } else { Packing::Plain })
 }
 
 /// Opens a section of a file, unpacked.
 fn open_section(path: &Path, section: Section) -> Result<Box<dyn Read>> {
     let mut file = open(path)?;
     file.seek(SeekFrom::Start(section.start)).map_err(|e| Error::io(path, e))?;
-    Ok(if section.gzip { Box::new(MultiGzDecoder::new(BufReader::new(file))) } else { Box::new(file) })
+    Ok(match section.packing {
+        Packing::Plain => Box::new(file),
+        Packing::Gzip => Box::new(MultiGzDecoder::new(BufReader::new(file))),
+        Packing::Zlib => Box::new(ZlibDecoder::new(BufReader::new(file))),
+    })
 }
 
 /// Reads at most the first `n` bytes of a section.
 ///
 /// # Errors
-/// `Io` with the path; `Invalid` if a gzip stream is damaged within them.
+/// `Io` with the path; `Invalid` if a packed stream is damaged within them.
 pub(crate) fn read_head(path: &Path, section: Section, n: u64) -> Result<Vec<u8>> {
     let mut head = Vec::new();
     match open_section(path, section)?.take(section.skip + n).read_to_end(&mut head) {
@@ -81,16 +106,17 @@ pub(crate) fn read_head(path: &Path, section: Section, n: u64) -> Result<Vec<u8>
 /// Reads exactly the `promised` bytes of a section.
 ///
 /// Before it is known that they exist, at most twice the file's size + 64 MB are held: a plain section is compared
-/// with the file's length, a packed one is unpacked once without keeping it. A gzip stream is read to its end, so
+/// with the file's length, a packed one is unpacked once without keeping it. A packed stream is read to its end, so
 /// that its checksum is checked. Further bytes behind the promised ones are let pass.
 ///
 /// # Errors
-/// `Io` with the path; `Invalid` if the section holds less, or its gzip stream breaks off or is damaged.
+/// `Io` with the path; `Invalid` if the section holds less, or its packed stream breaks off or is damaged.
 pub(crate) fn read_section(path: &Path, section: Section, promised: u64) -> Result<Vec<u8>> {
     let length = length(path)?;
     let stored = length.saturating_sub(section.start);
     let total = promised.saturating_add(section.skip);
-    let most = if section.gzip { stored.saturating_mul(DEFLATE_LIMIT) } else { stored };
+    let packed = section.packing != Packing::Plain;
+    let most = if packed { stored.saturating_mul(DEFLATE_LIMIT) } else { stored };
     if total > most {
         return Err(Error::invalid(
             path,
@@ -102,7 +128,7 @@ pub(crate) fn read_section(path: &Path, section: Section, promised: u64) -> Resu
             ),
         ));
     }
-    if section.gzip && total > length.saturating_mul(2).saturating_add(TRUSTED) {
+    if section.packing != Packing::Plain && total > length.saturating_mul(2).saturating_add(TRUSTED) {
         let mut reader = open_section(path, section)?.take(total);
         let mut counted = 0;
         let mut buffer = vec![0; 1 << 16];
@@ -129,25 +155,40 @@ pub(crate) fn read_section(path: &Path, section: Section, promised: u64) -> Resu
     if (bytes.len() as u64) < promised {
         return Err(short(path, section, skipped + bytes.len() as u64, total));
     }
-    if section.gzip {
+    if section.packing != Packing::Plain {
         std::io::copy(&mut reader, &mut std::io::sink()).map_err(|e| broken(path, section, total, total, e))?;
     }
     Ok(bytes)
 }
 
+/// Reads a section to its end, unpacked: for text, whose length no header promises.
+///
+/// # Errors
+/// `Io` with the path; `Invalid` if a packed stream breaks off or is damaged.
+pub(crate) fn read_to_end(path: &Path, section: Section) -> Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    match open_section(path, section)?.read_to_end(&mut bytes) {
+        Ok(_) => Ok(bytes.split_off(bytes.len().min(section.skip as usize))),
+        Err(e) => Err(broken(path, section, bytes.len() as u64, bytes.len() as u64, e)),
+    }
+}
+
 /// The error of a section that ends too early.
 fn short(path: &Path, section: Section, found: u64, total: u64) -> Error {
-    let kind = if section.gzip { "unpacked " } else { "" };
+    let kind = if section.packing != Packing::Plain { "unpacked " } else { "" };
     Error::invalid(path, format!("{total} {kind}bytes promised, {found} found; it is cut short or its header is wrong"))
 }
 
-/// The error of a reader that failed: the gzip stream's fault, or the system's.
+/// The error of a reader that failed: the packed stream's fault, or the system's.
 fn broken(path: &Path, section: Section, found: u64, total: u64, source: std::io::Error) -> Error {
     use std::io::ErrorKind as K;
     match source.kind() {
-        K::UnexpectedEof | K::InvalidData | K::InvalidInput if section.gzip => Error::invalid(
+        K::UnexpectedEof | K::InvalidData | K::InvalidInput if section.packing != Packing::Plain => Error::invalid(
             path,
-            format!("the gzip stream is cut short or damaged ({source}) after {found} of {total} unpacked bytes"),
+            format!(
+                "the {} stream is cut short or damaged ({source}) after {found} of {total} unpacked bytes",
+                section.packing.name()
+            ),
         ),
         _ => Error::io(path, source),
     }
@@ -181,7 +222,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a");
         std::fs::write(&path, [9, 9, 1, 2, 3, 4]).unwrap();
-        let plain = Section { start: 2, gzip: false, skip: 1 };
+        let plain = Section { start: 2, packing: Packing::Plain, skip: 1 };
         assert_eq!(read_section(&path, plain, 3).unwrap(), [2, 3, 4]);
         assert_eq!(read_section(&path, plain, 2).unwrap(), [2, 3]);
         assert!(matches!(read_section(&path, plain, 4), Err(Error::Invalid(_))));
@@ -189,7 +230,7 @@ mod tests {
         let mut stored = vec![7];
         stored.extend(gz(&[1, 2, 3, 4]));
         std::fs::write(&path, &stored).unwrap();
-        let packed = Section { start: 1, gzip: true, skip: 1 };
+        let packed = Section { start: 1, packing: Packing::Gzip, skip: 1 };
         assert_eq!(read_section(&path, packed, 3).unwrap(), [2, 3, 4]);
         assert_eq!(read_head(&path, packed, 2).unwrap(), [2, 3]);
         assert!(matches!(read_section(&path, packed, 4), Err(Error::Invalid(_))));
@@ -204,7 +245,7 @@ mod tests {
         let path = folder.path().join("a");
         // 100 MB of zeros pack into 0.4 MB, so a promise of 300 MB passes DEFLATE's own limit and needs the count.
         std::fs::write(&path, gz(&vec![0; 100 << 20])).unwrap();
-        let section = Section { start: 0, gzip: true, skip: 0 };
+        let section = Section { start: 0, packing: Packing::Gzip, skip: 0 };
         let message = read_section(&path, section, 300 << 20).unwrap_err().to_string();
         assert!(message.contains("104857600 found"), "{message}");
         assert_eq!(read_section(&path, section, 100 << 20).unwrap().len(), 100 << 20);

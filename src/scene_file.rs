@@ -105,7 +105,8 @@ impl RawOptions {
         Ok(layout)
     }
 
-    fn given(&self) -> bool {
+    /// Whether anything of it is set.
+    pub fn given(&self) -> bool {
         *self != Self::default()
     }
 }

@@ -97,11 +97,10 @@ pub fn channel(rgb: &[DVec3], channel: usize) -> Vec<f32> {
     rgb.iter().map(|c| c[channel] as f32).collect()
 }
 
-/// Linear radiance as display colours: × exposure, clamped, sRGB-encoded, 8 bits.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to a byte")]
-pub fn display_colours(radiance: &[DVec3], exposure: f64) -> Vec<[u8; 3]> {
-    let byte = |x: f64| (srgb_encode((x * exposure) as f32) * 255.0).round() as u8;
-    radiance.iter().map(|c| [byte(c.x), byte(c.y), byte(c.z)]).collect()
+/// Linear radiance as display colours: × exposure, clamped, sRGB-encoded, in [0, 1].
+#[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+pub fn display_colours(radiance: &[DVec3], exposure: f64) -> Vec<[f32; 3]> {
+    radiance.iter().map(|c| c.to_array().map(|x| srgb_encode((x * exposure) as f32))).collect()
 }
 
 /// The radiance of a bake's outside at world positions, as a 3D texture would give it.

@@ -2,16 +2,27 @@
 //! Readers live below, one per format; generators make volumes with exact value and gradient.
 
 pub(crate) mod ascii;
+pub mod cube;
 pub mod generate;
+pub mod legacy_vtk;
+pub mod metaimage;
+pub mod mrc;
 pub mod nifti;
+pub mod npy;
 pub mod nrrd;
+pub mod plane;
 pub mod raw;
 pub mod statistics;
+pub mod tiff;
 pub mod vti;
 
 use crate::error::{Error, Result};
 use glam::{DMat3, DVec3};
 use std::path::Path;
+
+/// The extensions that [`Volume::open`] reads.
+pub const READ: &str = ".nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd, .mrc, .map, .ccp4, .rec (also .gz), .cube, .cube.gz, .vti, .vtk, \
+                        .npy, .tif, .tiff and .tif.zip";
 
 /// A regular lattice of `dims` samples, vertex-centred: sample (i, j, k) stands at `origin + axes · (i, j, k)`.
 ///
@@ -33,7 +44,8 @@ impl Lattice {
     pub fn new(dims: [usize; 3], origin: DVec3, axes: DMat3) -> Result<Self> {
         if dims.iter().any(|&n| n < 2) {
             return Err(Error::Invalid(format!(
-                "lattice of {}×{}×{} samples: every dimension must be at least 2 to hold a cell",
+                "lattice of {}×{}×{} samples: every dimension must be at least 2 to hold a cell (a flat \
+                 field goes to `isolume flatland`, as .png, .nrrd or .vti)",
                 dims[0], dims[1], dims[2]
             )));
         }
@@ -321,11 +333,47 @@ impl Samples {
     }
 }
 
+/// Where a patient's directions lie in the world: the first letter names what x grows towards, and so on. Coordinates are never
+/// turned from one to the other; formats that hold the name pass it on.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Space {
+    /// Left, posterior, superior: that of DICOM and ITK, which is meant where nothing is said.
+    #[default]
+    LeftPosteriorSuperior,
+    /// Right, anterior, superior: that of NIfTI.
+    RightAnteriorSuperior,
+    /// Left, anterior, superior.
+    LeftAnteriorSuperior,
+}
+
+impl Space {
+    /// NRRD's name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Space::LeftPosteriorSuperior => "left-posterior-superior",
+            Space::RightAnteriorSuperior => "right-anterior-superior",
+            Space::LeftAnteriorSuperior => "left-anterior-superior",
+        }
+    }
+
+    /// The space of a [`Space::name`] or its initials.
+    pub fn from_name(name: &str) -> Option<Self> {
+        match name.to_ascii_lowercase().as_str() {
+            "left-posterior-superior" | "lps" => Some(Space::LeftPosteriorSuperior),
+            "right-anterior-superior" | "ras" => Some(Space::RightAnteriorSuperior),
+            "left-anterior-superior" | "las" => Some(Space::LeftAnteriorSuperior),
+            _ => None,
+        }
+    }
+}
+
 /// A scalar volume: samples on a lattice.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Volume {
     /// What to call it in messages: the file's path or the generator's name.
     pub name: String,
+    /// What the world's axes mean.
+    pub space: Space,
     /// Where the samples stand.
     pub lattice: Lattice,
     samples: Samples,
@@ -346,40 +394,51 @@ impl Volume {
                 samples.len()
             )));
         }
-        Ok(Self { name, lattice, samples })
+        Ok(Self { name, space: Space::default(), lattice, samples })
     }
 
-    /// Reads a file by its extension, whatever its case: `.nii`, `.nii.gz`, `.nrrd`, `.nhdr` or `.vti`. Of a `.vti` it
-    /// takes the scalars that [`vti::VtiFile::into_scalars`] names. Files without a header go through
-    /// [`raw::RawLayout::read`].
+    /// Reads a file by its extension, whatever its case: [`READ`] names them. Of a `.vti` it takes the scalars that
+    /// [`vti::VtiFile::into_scalars`] names. Files without a header go through [`raw::RawLayout::read`].
     ///
     /// # Errors
     /// `Io` for a missing file, `NotSupported` with the list of extensions, or what the format's reader returns.
     pub fn open(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
         let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
-        let has = |extension: &str| name.ends_with(extension);
         // A missing file is the better complaint, whatever its extension.
         std::fs::metadata(path).map_err(|e| Error::io(path, e))?;
-        if has(".nii") || has(".nii.gz") {
-            nifti::read(path)
-        } else if has(".nrrd") || has(".nhdr") {
-            nrrd::read(path)
-        } else if has(".vti") {
-            let (lattice, samples) = vti::VtiFile::read(path)?.into_scalars().map_err(|e| e.in_file(path))?;
-            Self::new(path.display().to_string(), lattice, samples)
-        } else if has(".raw") {
-            Err(Error::invalid(path, "has no header: give its dimensions, sample type, byte order and spacing too"))
-        } else {
-            Err(Error::not_supported(
+        // What stands before `.gz` or `.zip` is the format's.
+        let mut words = name.rsplit('.');
+        let last = words.next().unwrap_or("");
+        let (extension, packed) = match last {
+            "gz" | "zip" => (words.next().unwrap_or(""), last),
+            _ => (last, ""),
+        };
+        match (extension, packed) {
+            ("nii", "" | "gz") => nifti::read(path),
+            ("nrrd" | "nhdr", "") => nrrd::read(path),
+            ("mha" | "mhd", "") => metaimage::read(path),
+            ("mrc" | "map" | "ccp4" | "rec", "" | "gz") => mrc::read(path),
+            ("cube" | "cub", "" | "gz") => cube::read(path),
+            ("vti", "") => {
+                let (lattice, samples) = vti::VtiFile::read(path)?.into_scalars().map_err(|e| e.in_file(path))?;
+                Self::new(path.display().to_string(), lattice, samples)
+            }
+            ("vtk", "") => legacy_vtk::read(path),
+            ("npy", "") => npy::read(path),
+            ("tif" | "tiff", "" | "zip") => tiff::read(path),
+            ("raw", "") => {
+                Err(Error::invalid(path, "has no header: give its dimensions, sample type, byte order and spacing too"))
+            }
+            _ => Err(Error::not_supported(
                 path,
-                "unknown extension; .nii, .nii.gz, .nrrd, .nhdr and .vti are read, and .raw with its layout given",
-            ))
+                format!("unknown extension; {READ} are read, and .raw with its layout given"),
+            )),
         }
     }
 
-    /// Writes a `.vti` (one point array `value`, active) or a `.nrrd`, by the extension. The file appears under its
-    /// name only when it is complete.
+    /// Writes a `.vti` (one point array `value`, active), a `.nrrd` or a `.npy` (without its place in the world), by the
+    /// extension. The file appears under its name only when it is complete.
     ///
     /// # Errors
     /// `NotSupported` for another extension; `Io`.
@@ -396,6 +455,7 @@ impl Volume {
         let path = path.as_ref();
         let extension = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
         match extension.as_str() {
+<<<<<<< HEAD
             "vti" => {
                 let writer = vti::VtiWriter::new(&self.lattice).point_data("value", 1, &self.samples);
                 notes
@@ -408,12 +468,29 @@ impl Volume {
             _ => {
                 Err(Error::not_supported(path, "volumes are written as .vti or .nrrd; give it one of these extensions"))
             }
+=======
+            "vti" => vti::VtiWriter::new(&self.lattice)
+                .point_data("value", 1, &self.samples)
+                .active_scalars("value")
+                .write(path),
+            "nrrd" => nrrd::write(path, &self.lattice, self.space, 1, (&self.samples).into(), &[]),
+            "npy" => npy::write(path, &self.lattice, 1, (&self.samples).into()),
+            _ => Err(Error::not_supported(
+                path,
+                "volumes are written as .vti, .nrrd or .npy; give it one of these extensions",
+            )),
+>>>>>>> 2191a4f46f9ce2017ad59a933d5b736e1b4574ae
         }
     }
 
     /// The samples, x fastest.
     pub fn samples(&self) -> &Samples {
         &self.samples
+    }
+
+    /// The samples, without the rest.
+    pub fn into_samples(self) -> Samples {
+        self.samples
     }
 
     /// Sample at a position in memory, in source units.
@@ -441,32 +518,5 @@ impl Volume {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn files_are_told_apart_by_their_extension() {
-        let folder = tempfile::tempdir().unwrap();
-        let at = |name: &str| folder.path().join(name);
-        let lattice = Lattice::aligned([2, 3, 2], DVec3::new(1.0, 2.0, 3.0), DVec3::new(0.5, 1.0, 4.0)).unwrap();
-        let volume = Volume::new("made", lattice, Samples::I16((0..12).map(|i| i * 100 - 500).collect())).unwrap();
-        for name in ["a.VTI", "b.nrrd"] {
-            volume.write(at(name)).unwrap();
-            let read = Volume::open(at(name)).unwrap();
-            assert_eq!((&read.lattice, read.samples()), (&volume.lattice, volume.samples()));
-        }
-        assert!(matches!(volume.write(at("c.png")), Err(Error::NotSupported(_))));
-        assert!(!at("c.png").exists());
-        std::fs::write(at("d.xyz"), []).unwrap();
-        let message = Volume::open(at("d.xyz")).unwrap_err().to_string();
-        assert!(message.contains("d.xyz") && message.contains(".nii.gz"), "{message}");
-        assert!(matches!(Volume::open(at("none.vti")), Err(Error::Io { .. })));
-        std::fs::write(at("e.raw"), []).unwrap();
-        assert!(Volume::open(at("e.raw")).unwrap_err().to_string().contains("no header"));
-        for name in ["f.nii", "f.nii.gz", "f.nhdr", "f.vti"] {
-            std::fs::write(at(name), []).unwrap();
-            let message = Volume::open(at(name)).unwrap_err().to_string();
-            assert!(message.contains(name), "{message}");
-        }
-    }
-}
+#[path = "volume/tests.rs"]
+mod tests;

@@ -98,6 +98,21 @@ fn generate_info_bake_render() {
         assert!(fs::metadata(dir.join(name)).unwrap().len() > 500, "{name}");
     }
     assert_ne!(fs::read(dir.join("a.png")).unwrap(), fs::read(dir.join("l.png")).unwrap());
+    // What leaves the bake: its arrays, and surfaces with their light.
+    for name in ["a.nrrd", "a.npy", "slices.exr", "copy.vti"] {
+        ok(dir, &["export", "out.vti", "--array", "rgb", "-o", name, "-q"]);
+    }
+    let values = ok(dir, &["export", "out.vti", "--array", "value", "-o", "v.npy"]).stderr;
+    assert!(text(&values).contains("21×21×21 × 1 f32"), "{}", text(&values));
+    assert_eq!(Volume::open(dir.join("v.npy")).unwrap().samples(), &file.point_data[0].samples);
+    for name in ["m.ply", "m.obj", "m.glb", "m.vtp"] {
+        ok(dir, &["extract", "out.vti", "--isovalue", "47", "-o", name, "-q"]);
+        assert!(fs::metadata(dir.join(name)).unwrap().len() > 5000, "{name}");
+    }
+    let output = isolume(dir, &["export", "b.nrrd", "--array", "rgb", "-o", "x.npy"]);
+    assert_eq!(output.status.code(), Some(2), "a volume has no rgb");
+    let output = isolume(dir, &["export", "out.vti", "--array", "rbg", "-o", "x.npy"]);
+    assert!(text(&output.stderr).contains("`rbg`") && text(&output.stderr).contains("`rgb`"));
     for file in ["b.nrrd", "r.json"] {
         let output = isolume(dir, &["render", file, "--isovalue", "47", "-o", "x.png"]);
         assert_eq!(output.status.code(), Some(2), "{file} is no bake");
@@ -172,6 +187,7 @@ fn bad_input_is_one_clear_line_and_leaves_nothing() {
     refused(dir, &with(&["--gather", "9999999"]), &["gather"]);
     refused(dir, &["bake", "ramp.nrrd", "-o", "missing/folder/out.vti"], &["missing"]);
     refused(dir, &["bake", "ramp.nrrd", "-o", "out.png"], &["out.png", ".vti"]);
+    refused(dir, &["bake", "ramp.nrrd", "-o", "out.nrrd"], &["out.nrrd", "isolume export"]);
 
     // A luminaire without area, and a scene with an unknown key.
     fs::write(dir.join("l.mtl"), "newmtl lamp\nKe 1 1 1\n").unwrap();

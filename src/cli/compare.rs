@@ -85,15 +85,15 @@ fn text(a: &Accuracy) -> String {
     )
 }
 
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to a byte")]
+#[allow(clippy::cast_possible_truncation, reason = "files hold f32")]
 fn write_errors(path: &std::path::Path, mesh: &ReferenceMesh, errors: &[f64]) -> Result<()> {
     let values: Vec<f32> = errors.iter().map(|&e| e as f32).collect();
     // Black, red, yellow, white at 0, ⅓, ⅔ and 1 of 10 %; unsampled vertices grey.
-    let ramp = |e: f64, k: f64| ((30.0 * e - k).clamp(0.0, 1.0) * 255.0).round() as u8;
-    let colours: Vec<[u8; 3]> = errors
+    let ramp = |e: f64, k: f64| (30.0 * e - k).clamp(0.0, 1.0) as f32;
+    let colours: Vec<[f32; 3]> = errors
         .iter()
         .zip(&mesh.sampled)
-        .map(|(&e, &s)| if s { [ramp(e, 0.0), ramp(e, 1.0), ramp(e, 2.0)] } else { [96; 3] })
+        .map(|(&e, &s)| if s { [ramp(e, 0.0), ramp(e, 1.0), ramp(e, 2.0)] } else { [0.375; 3] })
         .collect();
     let properties = [("error", &values[..])];
     let mesh = Mesh {

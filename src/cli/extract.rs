@@ -2,8 +2,8 @@
 
 use super::{expect_extension, writable};
 use crate::error::Result;
+use crate::export::Mesh;
 use crate::export::bake_file::BakedVolume;
-use crate::export::{Mesh, obj, ply};
 use crate::progress::Progress;
 use crate::scene_file::{SceneOptions, load};
 use crate::surface_mesh::{SurfaceMesh, channel, display_colours, texture};
@@ -12,19 +12,20 @@ use std::time::Instant;
 
 #[derive(clap::Args, Debug)]
 #[command(after_help = "\
-From a bake, the PLY also holds its light: linear `radiance_r`, `radiance_g`, `radiance_b`, and exposed, sRGB-encoded
-`red green blue` for the eye.
+From a bake, vertices also hold its light, as colours for the eye (exposed; sRGB-encoded but in .glb, whose colours are linear)
+and, in .ply as `radiance_r`, `radiance_g`, `radiance_b` and in .vtp as `radiance`, linear and not exposed.
 
 Examples:
   isolume extract head.nii.gz --isovalue 80 -o head.ply
-  isolume extract baked.vti --isovalue 80 -o textured.ply --refine 2")]
+  isolume extract baked.vti --isovalue 80 -o textured.ply --refine 2
+  isolume extract baked.vti --isovalue 80 -o textured.glb     for browsers, Blender, ChimeraX, PowerPoint")]
 pub(super) struct Extract {
     /// Volume, scene file (.toml), or bake (.vti)
     input: PathBuf,
     /// The isosurface, in the volume's units
     #[arg(long, value_name = "C", allow_negative_numbers = true)]
     isovalue: f64,
-    /// Output: .ply or .obj
+    /// Output: .ply, .obj, .glb or .vtp
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// Cut every cell into R³ by trilinear interpolation first, so that the triangles follow the surface more closely
@@ -36,7 +37,7 @@ pub(super) struct Extract {
 
 impl Extract {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
-        expect_extension(&self.output, &["ply", "obj"])?;
+        expect_extension(&self.output, &["ply", "obj", "glb", "vtp"])?;
         writable(&self.output)?;
         let begun = Instant::now();
         let baked = open_bake(&self.input)?;
@@ -56,7 +57,7 @@ impl Extract {
             Some([r, g, b]) => vec![("radiance_r", r), ("radiance_g", g), ("radiance_b", b)],
             None => Vec::new(),
         };
-        write_mesh(&self.output, &Mesh { colours: colours.as_deref(), ..mesh.export(&properties) })?;
+        Mesh { colours: colours.as_deref(), ..mesh.export(&properties) }.write(&self.output)?;
         if progress == Progress::Shown {
             eprintln!(
                 "{}: {} vertices, {} triangles in {:.2} s",
@@ -73,13 +74,4 @@ impl Extract {
 /// The bake in a `.vti`, if it is one.
 pub(super) fn open_bake(path: &Path) -> Result<Option<BakedVolume>> {
     if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("vti")) { BakedVolume::try_read(path) } else { Ok(None) }
-}
-
-/// Writes a mesh as its extension says.
-pub(super) fn write_mesh(path: &Path, mesh: &Mesh<'_>) -> Result<()> {
-    if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("obj")) {
-        obj::write(path, mesh)
-    } else {
-        ply::write(path, mesh)
-    }
 }

@@ -21,6 +21,9 @@ use std::path::Path;
 /// Name of the field string that holds scene and report as JSON.
 const DESCRIPTION: &str = "isolume";
 
+/// Name of the field string that holds the volume's [`crate::volume::Space`].
+pub const SPACE: &str = "space";
+
 /// A scene without its samples: enough to draw the box and to trace the stored volume again.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 struct Description {
@@ -137,7 +140,7 @@ pub fn write(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
     for (name, samples) in &constants {
         writer = writer.field_data(name, 1, samples);
     }
-    writer.field_string(DESCRIPTION, &json).write(path)
+    writer.field_string(SPACE, volume.space.name()).field_string(DESCRIPTION, &json).write(path)
 }
 
 /// Every number of a JSON tree by its dotted path.

@@ -6,7 +6,7 @@ use crate::error::Result;
 use std::io::{self, Write};
 use std::path::Path;
 
-/// Writes `mesh` as `v x y z [r g b]`, `vn` and `f`. Colours are the display colours as fractions of 1, the convention of
+/// Writes `mesh` as `v x y z [r g b]`, `vn` and `f`. Colours are the display colours, the convention of
 /// MeshLab, Blender and ParaView. The named properties are left out: OBJ has no place for them.
 ///
 /// # Errors
@@ -24,7 +24,7 @@ fn write_to(out: &mut impl Write, mesh: &Mesh) -> io::Result<()> {
     for (i, p) in mesh.positions.iter().enumerate() {
         write!(out, "v {} {} {}", p.x, p.y, p.z)?;
         if let Some(colours) = mesh.colours {
-            let [r, g, b] = colours[i].map(|c| f32::from(c) / 255.0);
+            let [r, g, b] = colours[i];
             write!(out, " {r} {g} {b}")?;
         }
         writeln!(out)?;
@@ -54,7 +54,7 @@ mod tests {
             positions: &positions,
             triangles: &[[0, 1, 2], [2, 1, 3]],
             normals: Some(&[Vec3::X, Vec3::Y, Vec3::Z, Vec3::NEG_X]),
-            colours: Some(&[[255, 0, 51], [1, 2, 3], [4, 5, 6], [7, 8, 9]]),
+            colours: Some(&[[1.0, 0.0, 0.2]; 4]),
             properties: &[],
         };
         let folder = tempfile::tempdir().unwrap();

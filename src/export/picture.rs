@@ -26,6 +26,13 @@ pub fn srgb_encode(linear: f32) -> f32 {
     encoded as f32
 }
 
+/// The linear light of an sRGB-encoded value in [0, 1]: the inverse of [`srgb_encode`].
+pub fn srgb_decode(encoded: f32) -> f32 {
+    let v = f64::from(encoded);
+    let linear = if v <= 0.040_45 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) };
+    linear as f32
+}
+
 /// Attributes that say how an EXR file is laid out, or that the writer sets.
 const RESERVED: [&str; 17] = [
     "channels",

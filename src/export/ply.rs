@@ -3,7 +3,7 @@
 //! What is written is read by ParaView/VTK, MeshLab, Blender and Mitsuba. So there is no `obj_info` line (Mitsuba refuses
 //! it), the face list is `uchar int`, and positions are `float`: with coordinates of 1e6 their steps are 0.06.
 
-use super::Mesh;
+use super::{Mesh, colour_bytes};
 use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
 use std::io::{self, Write};
@@ -56,7 +56,7 @@ fn write_to(out: &mut impl Write, mesh: &Mesh) -> io::Result<()> {
         }
         mesh.properties.iter().for_each(|(_, values)| float(values[i]));
         if let Some(colours) = mesh.colours {
-            record.extend_from_slice(&colours[i]);
+            record.extend_from_slice(&colour_bytes(colours[i]));
         }
         out.write_all(&record)?;
     }
@@ -287,6 +287,7 @@ mod tests {
     use super::*;
     use glam::{DVec3, Vec3};
 
+    const COLOURS: [[f32; 3]; 4] = [[1.0, 0.0, 7.0 / 255.0], [0.0; 3], [0.5; 3], [1.0; 3]];
     const POSITIONS: [DVec3; 4] = [DVec3::new(0.1, -2.5, 1e20), DVec3::X, DVec3::Y, DVec3::Z];
 
     fn example<'a>(radiance: &'a [(&'a str, &'a [f32])]) -> Mesh<'a> {
@@ -294,7 +295,7 @@ mod tests {
             positions: &POSITIONS,
             triangles: &[[0, 1, 2], [3, 2, 1]],
             normals: Some(&[Vec3::X, Vec3::NEG_Y, Vec3::Z, Vec3::X]),
-            colours: Some(&[[255, 0, 7], [1, 2, 3], [4, 5, 6], [7, 8, 9]]),
+            colours: Some(&COLOURS),
             properties: radiance,
         }
     }

@@ -3,6 +3,7 @@
 use crate::error::{Error, Result};
 use crate::field::Sweep;
 use crate::volume::Volume;
+use crate::volume::plane::Plane;
 use glam::DVec2;
 use std::fs::File;
 use std::io::BufReader;
@@ -86,8 +87,8 @@ impl HeightField {
         }
     }
 
-    /// Reads a grey PNG (8 or 16 bits, values as stored, the longer edge of length 1, the top row at the largest y), or
-    /// one slice of a volume that is a single cell thick along some axis (its first two samples deep; in world units).
+    /// Reads a grey PNG (8 or 16 bits, values as stored, the longer edge of length 1, the top row at the largest y), a flat
+    /// field as [`Plane::open`] finds it (its axes are x and y, with its spacing, from 0 on), or one slice of a volume that is a single cell thick along some axis (its first two samples deep; in world units).
     ///
     /// `sweep` of `None` takes the least and greatest value.
     ///
@@ -96,6 +97,9 @@ impl HeightField {
     pub fn open(path: &Path, sweep: Option<Sweep>) -> Result<Self> {
         let (dims, origin, spacing, values) = if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("png")) {
             read_png(path)?
+        } else if let Some(plane) = Plane::open(path)? {
+            let values = (0..plane.samples.len()).map(|o| plane.samples.get(o)).collect();
+            (plane.dims, DVec2::ZERO, DVec2::from_array(plane.spacing), values)
         } else {
             thin_slice(&Volume::open(path)?)?
         };
@@ -310,6 +314,39 @@ mod tests {
         assert!((f.sweep().from_unit(f.value(DVec2::ZERO)) - 40.0).abs() < 1e-4, "the bottom left");
         let wrong = HeightField::open(&path, Some(Sweep::new(100.0, 200.0).unwrap())).unwrap_err().to_string();
         assert!(wrong.contains("p.png") && wrong.contains("outside"), "{wrong}");
+    }
+
+    #[test]
+    fn flat_nrrd_and_vti_are_fields() {
+        let folder = tempfile::tempdir().unwrap();
+        let check = |name: &str, file: &[u8]| {
+            let path = folder.path().join(name);
+            std::fs::write(&path, file).unwrap();
+            let f = HeightField::open(&path, None).unwrap();
+            assert_eq!((f.dims(), f.spacing()), ([3, 2], DVec2::new(0.5, 2.0)), "{name}");
+            assert!((f.sweep().from_unit(f.value(DVec2::new(1.0, 1.0))) - 4.0).abs() < 1e-5, "{name}");
+        };
+        let nrrd = |place: &str| format!("NRRD0004\ntype: uchar\nencoding: ascii\n{place}\n\n0 1 2\n3 4 5\n");
+        check("a.nrrd", nrrd("dimension: 2\nsizes: 3 2\nspacings: 0.5 2").as_bytes());
+        let oblique = "dimension: 2\nsizes: 3 2\nspace dimension: 2\nspace directions: (0.3,-0.4) (2,0)";
+        check("b.nrrd", nrrd(oblique).as_bytes());
+        check("c.nrrd", nrrd("dimension: 3\nsizes: 3 2 1\nspace directions: (0.5,0,0) (0,2,0) (0,0,1)").as_bytes());
+        let vti = |extent: &str, spacing: &str| {
+            format!(
+                "<VTKFile type=\"ImageData\"><ImageData WholeExtent=\"{extent}\" Spacing=\"{spacing}\"><Piece \
+                 Extent=\"{extent}\"><PointData><DataArray type=\"Int16\" Name=\"h\" format=\"ascii\">0 1 2 3 4 5\
+                 </DataArray></PointData></Piece></ImageData></VTKFile>"
+            )
+        };
+        check("a.vti", vti("0 2 0 1 7 7", "0.5 2 1").as_bytes());
+        check("b.vti", vti("0 0 1 3 0 1", "9 0.5 2").as_bytes());
+        for (name, file) in [("thin.nrrd", nrrd("dimension: 2\nsizes: 6 1")), ("thin.vti", vti("0 5 0 0 0 0", "1 1 1"))]
+        {
+            let path = folder.path().join(name);
+            std::fs::write(&path, file).unwrap();
+            let message = HeightField::open(&path, None).unwrap_err().to_string();
+            assert!(message.contains(name) && message.contains("no rectangle"), "{message}");
+        }
     }
 
     #[test]

@@ -5,7 +5,7 @@
 
 use crate::error::{Error, Result};
 use crate::files::{self, Section};
-use crate::volume::{ElementType, Endian, Lattice, Samples, Volume, each_sample_type};
+use crate::volume::{ElementType, Endian, Lattice, Samples, Space, Volume, each_sample_type};
 use glam::{DMat3, DQuat, DVec3, Vec4};
 use nifti::{Endianness, NiftiHeader, NiftiType};
 use rayon::prelude::*;
@@ -24,8 +24,8 @@ const DATA: f32 = 352.0;
 /// `Io`; `Invalid` for a broken header, too few bytes (known before they are allocated) or a damaged gzip stream;
 /// `NotSupported` for NIfTI-2, header/image pairs, colours, complex numbers and more than three dimensions.
 pub fn read(path: &Path) -> Result<Volume> {
-    let gzip = files::is_gzip(path)?;
-    let head = files::read_head(path, Section { start: 0, gzip, skip: 0 }, HEADER as u64)?;
+    let packing = files::gzip_or_plain(path, 0)?;
+    let head = files::read_head(path, Section { start: 0, packing, skip: 0 }, HEADER as u64)?;
     if head.len() < HEADER {
         return Err(Error::invalid(path, format!("{} bytes, but a NIfTI-1 header has {HEADER}", head.len())));
     }
@@ -52,13 +52,14 @@ pub fn read(path: &Path) -> Result<Volume> {
         }
     };
     let promised = (lattice.len() as u64).saturating_mul(element.size() as u64);
-    let bytes = files::read_section(path, Section { start: 0, gzip, skip: skip as u64 }, promised)?;
+    let bytes = files::read_section(path, Section { start: 0, packing, skip: skip as u64 }, promised)?;
     let endian = match header.endianness {
         Endianness::Little => Endian::Little,
         Endianness::Big => Endian::Big,
     };
     let samples = scaled(path, Samples::from_vec(bytes, element, endian), header.scl_slope, header.scl_inter)?;
-    Volume::new(path.display().to_string(), lattice, samples)
+    let volume = Volume::new(path.display().to_string(), lattice, samples)?;
+    Ok(Volume { space: Space::RightAnteriorSuperior, ..volume })
 }
 
 /// The three dimensions; further ones must be 1.

@@ -4,8 +4,11 @@
 //! `space origin` are taken as numbers, and a left-posterior-superior file is not turned into RAS.
 
 use crate::error::{Error, Result};
-use crate::files::{self, Section};
-use crate::volume::{ElementType, Endian, Lattice, Samples, Volume, ascii, each_sample_type};
+use crate::files::{self, Packing, Section};
+use crate::volume::plane::Plane;
+use crate::volume::vti::SamplesRef;
+use crate::volume::{ElementType, Endian, Lattice, Samples, Space, Volume, ascii};
+use flate2::{Compression, write::GzEncoder};
 use glam::{DMat3, DVec3};
 use std::collections::HashMap;
 use std::io::{BufRead, BufReader, Read, Write};
@@ -38,9 +41,11 @@ pub fn read(path: &Path) -> Result<Volume> {
     let lattice = header.lattice(dims, keep).map_err(|e| e.in_file(path))?;
     let element = header.element()?;
     let samples = header.samples(lattice.len(), element)?;
-    Volume::new(path.display().to_string(), lattice, samples)
+    let space = header.get("space").and_then(Space::from_name).unwrap_or_default();
+    Ok(Volume { space, ..Volume::new(path.display().to_string(), lattice, samples)? })
 }
 
+<<<<<<< HEAD
 /// Writes a volume as an attached, raw, little-endian NRRD. The file's world is the lattice's, without a name.
 /// `notes` become key/value pairs.
 ///
@@ -50,8 +55,52 @@ pub fn read(path: &Path) -> Result<Volume> {
 /// `Io`.
 pub fn write(volume: &Volume, path: &Path, notes: &[(String, String)]) -> Result<()> {
     let lattice = &volume.lattice;
+=======
+/// Reads a field of two axes (others must hold a single sample); `None` if the file holds a volume. The steps along the axes are
+/// the lengths of their `space directions`, or `spacings`, or 1.
+///
+/// # Errors
+/// As [`read`].
+pub fn read_plane(path: &Path) -> Result<Option<Plane>> {
+    let header = Header::read(path)?;
+    let sizes: Vec<usize> = header.list("sizes")?;
+    let Some(axes) = Plane::long_axes(&sizes).map_err(|e| e.in_file(path))? else { return Ok(None) };
+    let spacing = if header.get("spacedirections").is_some() {
+        let vectors = header.vectors("spacedirections")?;
+        axes.map(|a| {
+            vectors.get(a).and_then(Option::as_ref).map_or(1.0, |v| v.iter().map(|x| x * x).sum::<f64>().sqrt())
+        })
+    } else if header.get("spacings").is_some() {
+        let steps: Vec<f64> = header.list("spacings")?;
+        axes.map(|a| if steps[a].is_nan() { 1.0 } else { steps[a].abs() })
+    } else {
+        [1.0; 2]
+    };
+    let dims = axes.map(|a| sizes[a]);
+    let count = dims[0].checked_mul(dims[1]).ok_or_else(|| header.invalid("sizes", "that is too large"))?;
+    Ok(Some(Plane { dims, spacing, samples: header.samples(count, header.element()?)? }))
+}
+
+/// Writes values on a lattice as an attached, gzip-packed, little-endian NRRD that 3D Slicer, ITK and pynrrd read: one component
+/// as a scalar volume, more as a vector image, whose vector axis is the first and has no direction. `notes` become `key:=value`
+/// lines.
+///
+/// The file appears under its name only when it is complete. VTK's and ParaView's own NRRD reader does not read vectors.
+///
+/// # Errors
+/// `Invalid` if the count is not the lattice's samples × `components`; `Io`.
+pub fn write(
+    path: &Path,
+    lattice: &Lattice,
+    space: Space,
+    components: usize,
+    values: SamplesRef<'_>,
+    notes: &[(&str, &str)],
+) -> Result<()> {
+    values.check(lattice, components).map_err(|e| Error::invalid(path, e))?;
+>>>>>>> 2191a4f46f9ce2017ad59a933d5b736e1b4574ae
     let [nx, ny, nz] = lattice.dims();
-    let kind = match volume.samples().element_type() {
+    let kind = match values.element_type() {
         ElementType::U8 => "uint8",
         ElementType::I8 => "int8",
         ElementType::U16 => "uint16",
@@ -65,7 +114,24 @@ pub fn write(volume: &Volume, path: &Path, notes: &[(String, String)]) -> Result
     };
     let vector = |v: DVec3| format!("({},{},{})", v.x, v.y, v.z);
     let axes = lattice.axes();
+    let [x, y, z] = [axes.x_axis, axes.y_axis, axes.z_axis].map(vector);
+    let (dimension, sizes, none, kinds) = match components {
+        1 => (3, String::new(), "", "domain domain domain"),
+        n => (4, format!("{n} "), "none ", "vector domain domain domain"),
+    };
+    let origin = vector(lattice.origin());
+    let mut head = format!(
+        "NRRD0005\n# written by isolume\ntype: {kind}\ndimension: {dimension}\nspace: {}\n\
+         sizes: {sizes}{nx} {ny} {nz}\nspace directions: {none}{x} {y} {z}\nkinds: {kinds}\nendian: little\n\
+         encoding: gzip\nspace origin: {origin}\n",
+        space.name()
+    );
+    for (key, value) in notes {
+        let value = value.replace('\\', "\\\\").replace('\n', "\\n");
+        head += &format!("{key}:={value}\n");
+    }
     files::write_atomically(path, |out| {
+<<<<<<< HEAD
         write!(
             out,
             "NRRD0004\n# written by isolume\ntype: {kind}\ndimension: 3\nspace dimension: 3\nsizes: {nx} {ny} {nz}\n\
@@ -81,6 +147,13 @@ pub fn write(volume: &Volume, path: &Path, notes: &[(String, String)]) -> Result
         }
         writeln!(out)?;
         each_sample_type!(volume.samples(), v => v.iter().try_for_each(|s| out.write_all(&s.to_le_bytes())))
+=======
+        out.write_all(head.as_bytes())?;
+        out.write_all(b"\n")?;
+        let mut packed = GzEncoder::new(out, Compression::fast());
+        values.write_le(&mut packed)?;
+        packed.finish().map(drop)
+>>>>>>> 2191a4f46f9ce2017ad59a933d5b736e1b4574ae
     })
 }
 
@@ -151,9 +224,9 @@ impl<'a> Header<'a> {
             .ok_or_else(|| self.invalid(key, &format!("it must hold {n} numbers, one per axis")))
     }
 
-    /// One world vector per axis (`None` for `none`), by the parentheses.
-    fn vectors(&self, key: &str) -> Result<Vec<Option<DVec3>>> {
-        let wanted = "it must hold vectors like `(1,0,0)` of three numbers, or `none`";
+    /// One vector per axis (`None` for `none`), by the parentheses.
+    fn vectors(&self, key: &str) -> Result<Vec<Option<Vec<f64>>>> {
+        let wanted = "it must hold vectors like `(1,0,0)`, or `none`";
         let mut vectors = Vec::new();
         let mut rest = self.need(key)?.trim();
         while !rest.is_empty() {
@@ -165,8 +238,7 @@ impl<'a> Header<'a> {
             let (inside, tail) =
                 rest.strip_prefix('(').and_then(|r| r.split_once(')')).ok_or_else(|| self.invalid(key, wanted))?;
             let numbers: Option<Vec<f64>> = inside.split(',').map(|w| w.trim().parse().ok()).collect();
-            let numbers: [f64; 3] = numbers.and_then(|n| n.try_into().ok()).ok_or_else(|| self.invalid(key, wanted))?;
-            vectors.push(Some(DVec3::from_array(numbers)));
+            vectors.push(Some(numbers.ok_or_else(|| self.invalid(key, wanted))?));
             rest = tail.trim_start();
         }
         Ok(vectors)
@@ -193,24 +265,26 @@ impl<'a> Header<'a> {
                 let kept: Vec<usize> = (0..4).filter(|&a| a != drop).collect();
                 Ok([kept[0], kept[1], kept[2]])
             }
-            n => Err(Error::not_supported(self.path, format!("dimension {n}: only 3D scalar volumes are read"))),
+            n => Err(Error::not_supported(
+                self.path,
+                format!("dimension {n}: only 3D scalar volumes are read (a 2D field goes to `isolume flatland`)"),
+            )),
         }
     }
 
     fn lattice(&self, dims: [usize; 3], keep: [usize; 3]) -> Result<Lattice> {
         if self.get("spacedirections").is_some() {
             let vectors = self.vectors("spacedirections")?;
+            let world =
+                |v: Option<&Option<Vec<f64>>>| -> Option<DVec3> { v?.clone()?.try_into().ok().map(DVec3::from_array) };
             let column = |a: usize| {
-                vectors.get(keep[a]).copied().flatten().ok_or_else(|| {
+                world(vectors.get(keep[a])).ok_or_else(|| {
                     self.invalid("spacedirections", "every axis of the volume needs its vector `(x,y,z)`")
                 })
             };
             let axes = DMat3::from_cols(column(0)?, column(1)?, column(2)?);
             let origin = match self.get("spaceorigin") {
-                Some(_) => self.vectors("spaceorigin")?[..]
-                    .first()
-                    .copied()
-                    .flatten()
+                Some(_) => world(self.vectors("spaceorigin")?.first())
                     .ok_or_else(|| self.invalid("spaceorigin", "it must be one vector `(x,y,z)`"))?,
                 None => DVec3::ZERO,
             };
@@ -280,9 +354,9 @@ impl<'a> Header<'a> {
             Some(name) => (self.path.parent().map_or_else(|| PathBuf::from(name), |p| p.join(name)), 0),
         };
         let encoding = self.need("encoding")?.to_ascii_lowercase();
-        let gzip = match encoding.as_str() {
-            "raw" | "ascii" | "text" | "txt" => false,
-            "gzip" | "gz" => true,
+        let packing = match encoding.as_str() {
+            "raw" | "ascii" | "text" | "txt" => Packing::Plain,
+            "gzip" | "gz" => Packing::Gzip,
             other => {
                 return Err(Error::not_supported(
                     self.path,
@@ -318,7 +392,7 @@ impl<'a> Header<'a> {
             Some(_) => return Err(self.invalid("endian", "it must be `little` or `big`")),
             None => return Err(Error::invalid(self.path, "samples of several bytes need the field `endian`")),
         };
-        let bytes = files::read_section(&path, Section { start, gzip, skip }, promised)?;
+        let bytes = files::read_section(&path, Section { start, packing, skip }, promised)?;
         Ok(Samples::from_vec(bytes, element, endian))
     }
 }

@@ -1,7 +1,7 @@
 //! Samples without a header: dimensions, type, byte order and placement come from the user.
 
 use crate::error::{Error, Result};
-use crate::files::{self, Section};
+use crate::files::{self, Packing, Section};
 use crate::volume::{ElementType, Endian, Lattice, Samples, Volume};
 use glam::DVec3;
 use std::path::Path;
@@ -49,7 +49,7 @@ impl RawLayout {
                 ),
             ));
         }
-        let section = Section { start: self.header_bytes, gzip: false, skip: 0 };
+        let section = Section { start: self.header_bytes, packing: Packing::Plain, skip: 0 };
         let samples = Samples::from_vec(files::read_section(path, section, bytes)?, self.element, self.endian);
         Volume::new(path.display().to_string(), lattice, samples)
     }

@@ -4,12 +4,15 @@
 //! stands, wherever the extent starts.
 
 mod codec;
+mod document;
 mod writer;
 
+pub(crate) use document::Document as XmlDocument;
 pub use writer::{SamplesRef, VtiWriter};
 
 use crate::error::{Error, Result};
 use crate::files;
+use crate::volume::plane::Plane;
 use crate::volume::{ElementType, Lattice, Samples, ascii};
 use codec::Encoding;
 use glam::{DMat3, DVec3};
@@ -57,23 +60,8 @@ impl VtiFile {
     /// # Errors
     /// `Invalid` with the list of arrays.
     pub fn into_scalars(self) -> Result<(Lattice, Samples)> {
-        let scalar = |a: &&VtiArray| a.components == 1;
-        let named = |name: &str| self.point_data.iter().filter(scalar).position(|a| a.name == name);
-        let scalars = self.point_data.iter().filter(scalar).count();
-        let chosen = (self.active_scalars.as_deref().and_then(named))
-            .or_else(|| named("value"))
-            .or_else(|| (scalars == 1).then_some(0));
-        let Some(chosen) = chosen else {
-            let list: Vec<String> =
-                self.point_data.iter().map(|a| format!("`{}` ({} components)", a.name, a.components)).collect();
-            return Err(Error::Invalid(format!(
-                "cannot tell which point data to use: {}. Mark a 1-component array as Scalars, or name it `value` \
-                 (cell data are not read: convert them to point data)",
-                if list.is_empty() { "there are none".to_string() } else { list.join(", ") }
-            )));
-        };
-        let array = self.point_data.into_iter().filter(|a| a.components == 1).nth(chosen).expect("found above");
-        Ok((self.lattice, array.samples))
+        let Self { lattice, point_data, active_scalars, .. } = self;
+        Ok((lattice, scalars(point_data, active_scalars.as_deref())?))
     }
 
     /// Reads the bytes of a file.
@@ -81,6 +69,77 @@ impl VtiFile {
     /// # Errors
     /// As [`VtiFile::read`], without the file's name.
     pub fn parse(bytes: &[u8]) -> Result<Self> {
+        let place = |p: Placement| {
+            let lattice = Lattice::new(p.dims, p.origin, p.axes)?;
+            let points = lattice.len();
+            Ok((lattice, points))
+        };
+        let (lattice, arrays) = Arrays::parse(bytes, place)?;
+        let Arrays { point_data, field_data, field_strings, active_scalars } = arrays;
+        Ok(Self { lattice, point_data, field_data, field_strings, active_scalars })
+    }
+}
+
+/// Reads an image of one sample along one axis; `None` if it is a volume.
+///
+/// # Errors
+/// As [`VtiFile::read`] and [`VtiFile::into_scalars`].
+pub fn read_plane(path: &Path) -> Result<Option<Plane>> {
+    // A volume is left unread.
+    let flat = |p: Placement| match Plane::long_axes(&p.dims)? {
+        Some(axes) => {
+            let dims = axes.map(|a| p.dims[a]);
+            let points = dims[0].checked_mul(dims[1]);
+            let points = points.ok_or_else(|| Error::Invalid(format!("{dims:?} samples are too many")))?;
+            Ok((Some((dims, axes.map(|a| p.axes.col(a).length()))), points))
+        }
+        None => Ok((None, 0)),
+    };
+    let read = || -> Result<Option<Plane>> {
+        let (place, arrays) = Arrays::parse(&files::read(path)?, flat)?;
+        let Some((dims, spacing)) = place else { return Ok(None) };
+        Ok(Some(Plane { dims, spacing, samples: scalars(arrays.point_data, arrays.active_scalars.as_deref())? }))
+    };
+    read().map_err(|e| e.in_file(path))
+}
+
+/// The scalars to render, see [`VtiFile::into_scalars`].
+fn scalars(point_data: Vec<VtiArray>, active: Option<&str>) -> Result<Samples> {
+    let scalar = |a: &&VtiArray| a.components == 1;
+    let named = |name: &str| point_data.iter().filter(scalar).position(|a| a.name == name);
+    let count = point_data.iter().filter(scalar).count();
+    let chosen = active.and_then(named).or_else(|| named("value")).or_else(|| (count == 1).then_some(0));
+    let Some(chosen) = chosen else {
+        let list: Vec<String> =
+            point_data.iter().map(|a| format!("`{}` ({} components)", a.name, a.components)).collect();
+        return Err(Error::Invalid(format!(
+            "cannot tell which point data to use: {}. Mark a 1-component array as Scalars, or name it `value` \
+             (cell data are not read: convert them to point data)",
+            if list.is_empty() { "there are none".to_string() } else { list.join(", ") }
+        )));
+    };
+    Ok(point_data.into_iter().filter(|a| a.components == 1).nth(chosen).expect("found above").samples)
+}
+
+/// Where an image's samples stand.
+struct Placement {
+    dims: [usize; 3],
+    origin: DVec3,
+    axes: DMat3,
+}
+
+/// What a file holds besides its placement.
+struct Arrays {
+    point_data: Vec<VtiArray>,
+    field_data: Vec<VtiArray>,
+    field_strings: Vec<(String, String)>,
+    active_scalars: Option<String>,
+}
+
+impl Arrays {
+    /// Reads the bytes of a file. `place` makes what it needs of the placement and says how many points there are; of none, the
+    /// arrays are left unread.
+    fn parse<T>(bytes: &[u8], place: impl FnOnce(Placement) -> Result<(T, usize)>) -> Result<(T, Self)> {
         let (text, appended) = split_appended(bytes)?;
         let document = Document::parse(&text).map_err(|e| Error::Invalid(format!("is no well-formed XML: {e}")))?;
         let root = document.root_element();
@@ -106,14 +165,16 @@ impl VtiFile {
         if extent != whole {
             return Err(Error::NotSupported(format!("the piece {extent:?} covers only part of the image {whole:?}")));
         }
-        let lattice = lattice(image, extent)?;
+        let (place, count) = place(placement(image, extent)?)?;
 
-        let mut file =
-            Self { lattice, point_data: vec![], field_data: vec![], field_strings: vec![], active_scalars: None };
+        let mut file = Self { point_data: vec![], field_data: vec![], field_strings: vec![], active_scalars: None };
+        if count == 0 {
+            return Ok((place, file));
+        }
         if let Some(points) = piece.children().find(|n| n.has_tag_name("PointData")) {
             file.active_scalars = points.attribute("Scalars").filter(|s| !s.is_empty()).map(str::to_string);
             for node in points.children().filter(|n| n.has_tag_name("DataArray")) {
-                file.point_data.push(reader.array(node, file.lattice.len())?);
+                file.point_data.push(reader.array(node, count)?);
             }
         }
         let fields = root.descendants().filter(|n| n.has_tag_name("FieldData")).flat_map(|n| n.children());
@@ -128,7 +189,7 @@ impl VtiFile {
                 file.field_data.push(reader.array(node, tuples)?);
             }
         }
-        Ok(file)
+        Ok((place, file))
     }
 }
 
@@ -170,8 +231,8 @@ fn numbers<T: std::str::FromStr, const N: usize>(node: Node, key: &str) -> Resul
     })
 }
 
-/// The lattice of an image's extent.
-fn lattice(image: Node, extent: [i64; 6]) -> Result<Lattice> {
+/// Where the samples of an image's extent stand.
+fn placement(image: Node, extent: [i64; 6]) -> Result<Placement> {
     let vector = |key: &str, missing: DVec3| {
         if image.has_attribute(key) { numbers(image, key).map(DVec3::from_array) } else { Ok(missing) }
     };
@@ -189,7 +250,7 @@ fn lattice(image: Node, extent: [i64; 6]) -> Result<Lattice> {
             .and_then(|n| usize::try_from(n.checked_add(1)?).ok())
             .ok_or_else(|| Error::Invalid(format!("Extent {extent:?}: a last index stands before its first")))?;
     }
-    Lattice::new(dims, vector("Origin", DVec3::ZERO)? + axes * first, axes)
+    Ok(Placement { dims, origin: vector("Origin", DVec3::ZERO)? + axes * first, axes })
 }
 
 /// What all arrays of a file need.

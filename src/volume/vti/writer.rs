@@ -1,19 +1,11 @@
-//! Writes `.vti`: appended raw, 64-bit headers, zlib blocks. The arrays are borrowed and never copied whole.
+//! Writes `.vti`, with appended zlib blocks.
 
+use super::document::{BLOCK, Document, escape};
 use crate::error::{Error, Result};
-use crate::files;
 use crate::volume::{ElementType, Lattice, Samples};
 use flate2::{Compression, write::ZlibEncoder};
-use rayon::prelude::*;
-use std::fmt::Write as _;
-use std::io::{Seek, SeekFrom, Write};
+use std::io::Write;
 use std::path::Path;
-
-/// Unpacked bytes of a block.
-const BLOCK: usize = 1 << 20;
-
-/// Blocks packed at once: the memory a writer needs.
-const BATCH: usize = 64;
 
 /// Borrowed values of one of the types VTK knows.
 #[derive(Clone, Copy, Debug)]
@@ -89,24 +81,30 @@ impl SamplesRef<'_> {
         self.len() == 0
     }
 
-    /// VTK's name of the type.
-    fn vtk_type(&self) -> &'static str {
-        match self.element_type() {
-            ElementType::U8 => "UInt8",
-            ElementType::I8 => "Int8",
-            ElementType::U16 => "UInt16",
-            ElementType::I16 => "Int16",
-            ElementType::U32 => "UInt32",
-            ElementType::I32 => "Int32",
-            ElementType::U64 => "UInt64",
-            ElementType::I64 => "Int64",
-            ElementType::F32 => "Float32",
-            ElementType::F64 => "Float64",
+    /// Value `i` as f32.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss, reason = "that is what is asked for")]
+    #[allow(clippy::unnecessary_cast, reason = "the macro's f32 arm casts to itself")]
+    pub(crate) fn get_f32(&self, i: usize) -> f32 {
+        each_type!(self, v => v[i] as f32)
+    }
+
+    /// Whether there are `components` values per sample of a lattice; says so if not.
+    pub(crate) fn check(&self, lattice: &Lattice, components: usize) -> Result<(), String> {
+        let wanted = lattice.len().checked_mul(components);
+        if wanted == Some(self.len()) && components > 0 {
+            return Ok(());
         }
+        let ([nx, ny, nz], n) = (lattice.dims(), self.len());
+        Err(format!("{n} values for {nx}×{ny}×{nz} samples of {components} components"))
+    }
+
+    /// Writes all values, little-endian.
+    pub(crate) fn write_le(&self, out: &mut impl Write) -> std::io::Result<()> {
+        each_type!(self, v => v.iter().try_for_each(|s| out.write_all(&s.to_le_bytes())))
     }
 
     /// Block `b`, little-endian and packed.
-    fn pack(&self, b: usize) -> std::io::Result<Vec<u8>> {
+    pub(super) fn pack(&self, b: usize) -> std::io::Result<Vec<u8>> {
         let per = BLOCK / self.element_type().size();
         let raw: Vec<u8> = each_type!(self, v => {
             v[b * per..v.len().min((b + 1) * per)].iter().flat_map(|s| s.to_le_bytes()).collect()
@@ -177,41 +175,8 @@ impl<'a> VtiWriter<'a> {
     /// character; `Io`.
     pub fn write(&self, path: &Path) -> Result<()> {
         self.check().map_err(|message| Error::invalid(path, message))?;
-        let (text, slots) = self.document();
-        files::write_atomically(path, |out| {
-            out.write_all(text.as_bytes())?;
-            let data = text.len() as u64;
-            let mut offsets = Vec::with_capacity(slots.len());
-            let mut end = data;
-            for array in self.field_data.iter().chain(&self.point_data) {
-                offsets.push(end - data);
-                // The sizes of the packed blocks stand before them, but are known after.
-                let length = array.samples.len() * array.samples.element_type().size();
-                let blocks = length.div_ceil(BLOCK);
-                let mut header = vec![blocks as u64, BLOCK as u64, (length % BLOCK) as u64];
-                let start = end;
-                end += 8 * (header.len() + blocks) as u64;
-                out.seek(SeekFrom::Start(end))?;
-                for first in (0..blocks).step_by(BATCH) {
-                    let packed: std::io::Result<Vec<_>> =
-                        (first..blocks.min(first + BATCH)).into_par_iter().map(|b| array.samples.pack(b)).collect();
-                    for block in packed? {
-                        out.write_all(&block)?;
-                        header.push(block.len() as u64);
-                        end += block.len() as u64;
-                    }
-                }
-                out.seek(SeekFrom::Start(start))?;
-                out.write_all(&header.iter().flat_map(|w| w.to_le_bytes()).collect::<Vec<_>>())?;
-                out.seek(SeekFrom::Start(end))?;
-            }
-            out.write_all(b"\n  </AppendedData>\n</VTKFile>\n")?;
-            for (slot, offset) in slots.iter().zip(offsets) {
-                out.seek(SeekFrom::Start(*slot as u64))?;
-                write!(out, "{offset}\"")?;
-            }
-            Ok(())
-        })
+        let document = self.document();
+        document.write(path)
     }
 
     fn check(&self) -> Result<(), String> {
@@ -246,8 +211,7 @@ impl<'a> VtiWriter<'a> {
         }
     }
 
-    /// The document up to the `_` of the appended data, and where in it each array's offset is to be filled in.
-    fn document(&self) -> (String, Vec<usize>) {
+    fn document(&self) -> Document<'_> {
         let l = self.lattice;
         let cells = l.cells();
         let extent = format!("0 {} 0 {} 0 {}", cells[0], cells[1], cells[2]);
@@ -262,66 +226,31 @@ impl<'a> VtiWriter<'a> {
         } else {
             spacing = axes.diagonal();
         }
-        let mut t = String::from(
-            "<?xml version=\"1.0\"?>\n<VTKFile type=\"ImageData\" version=\"1.0\" byte_order=\"LittleEndian\" \
-             header_type=\"UInt64\" compressor=\"vtkZLibDataCompressor\">\n",
-        );
-        let _ = writeln!(
-            t,
-            "  <ImageData WholeExtent=\"{extent}\" Origin=\"{} {} {}\" Spacing=\"{} {} {}\"{direction}>",
+        let mut d = Document::new("ImageData");
+        d.text(&format!(
+            "  <ImageData WholeExtent=\"{extent}\" Origin=\"{} {} {}\" Spacing=\"{} {} {}\"{direction}>\n    <FieldData>\n",
             origin.x, origin.y, origin.z, spacing.x, spacing.y, spacing.z
-        );
-        let mut slots = Vec::new();
-        let mut array = |t: &mut String, a: &Array, tuples: String| {
-            let (kind, name, n) = (a.samples.vtk_type(), escape(&a.name), a.components);
-            let _ = write!(
-                t,
-                "      <DataArray type=\"{kind}\" Name=\"{name}\"{tuples} NumberOfComponents=\"{n}\" \
-                 format=\"appended\" offset=\""
-            );
-            slots.push(t.len());
-            // Room for any 64-bit offset and the closing quote; XML ignores the spaces that stay.
-            let _ = writeln!(t, "{:21}/>", "");
-        };
-        t.push_str("    <FieldData>\n");
+        ));
         for a in &self.field_data {
             let tuples = format!(" NumberOfTuples=\"{}\"", a.samples.len() / a.components);
-            array(&mut t, a, tuples);
+            d.array(&a.name, a.components, a.samples, &tuples);
         }
         for (name, text) in &self.field_strings {
             // As VTK writes them: signed character codes.
             let codes: Vec<String> = text.bytes().map(|c| (c as i8).to_string()).collect();
-            let _ = writeln!(
-                t,
+            d.text(&format!(
                 "      <Array type=\"String\" Name=\"{}\" NumberOfTuples=\"1\" format=\"ascii\">\n        {} 0\n      \
-                 </Array>",
+                 </Array>\n",
                 escape(name),
                 codes.join(" ")
-            );
+            ));
         }
         let scalars = self.active_scalars.as_ref().map(|s| format!(" Scalars=\"{}\"", escape(s))).unwrap_or_default();
-        let _ = writeln!(t, "    </FieldData>\n    <Piece Extent=\"{extent}\">\n      <PointData{scalars}>");
+        d.text(&format!("    </FieldData>\n    <Piece Extent=\"{extent}\">\n      <PointData{scalars}>\n"));
         for a in &self.point_data {
-            array(&mut t, a, String::new());
+            d.array(&a.name, a.components, a.samples, "");
         }
-        t.push_str("      </PointData>\n      <CellData/>\n    </Piece>\n  </ImageData>\n");
-        t.push_str("  <AppendedData encoding=\"raw\">\n   _");
-        (t, slots)
+        d.text("      </PointData>\n      <CellData/>\n    </Piece>\n  </ImageData>\n");
+        d
     }
-}
-
-/// Text for an XML attribute.
-fn escape(text: &str) -> String {
-    let mut out = String::with_capacity(text.len());
-    for c in text.chars() {
-        match c {
-            '&' => out.push_str("&amp;"),
-            '<' => out.push_str("&lt;"),
-            '>' => out.push_str("&gt;"),
-            '"' => out.push_str("&quot;"),
-            '\n' | '\r' | '\t' => out.push(' '),
-            c => out.push(c),
-        }
-    }
-    out
 }

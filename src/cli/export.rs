@@ -1,0 +1,117 @@
+//! `isolume export`: one array of a bake, or a volume, in another format.
+
+use super::{expect_extension, writable};
+use crate::error::{Error, Result};
+use crate::export::{bake_file, slices};
+use crate::progress::Progress;
+use crate::scene_file::RawOptions;
+use crate::volume::vti::{VtiFile, VtiWriter};
+use crate::volume::{Lattice, Samples, Space, Volume, npy, nrrd};
+use std::path::{Path, PathBuf};
+
+#[derive(clap::Args, Debug)]
+#[command(after_help = "\
+The arrays of a bake: `radiance` (linear RGB), `rgb` (the same for the eye: exposed, clamped, sRGB-encoded), `std_error`, `mask`
+and `value`, the volume itself. A .nrrd holds vectors as 3D Slicer reads them; a .npy has the shape (z, y, x) or (z, y, x, 3); an
+.exr has one layer per slice along z.
+
+Examples:
+  isolume export lit.vti -o radiance.npy
+  isolume export lit.vti --array rgb -o rgb.nrrd
+  isolume export map.mrc -o map.vti")]
+pub(super) struct Export {
+    /// Bake (.vti), or any volume
+    input: PathBuf,
+    /// Output: .nrrd, .npy, .exr or .vti
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// The array to write (default: radiance of a bake, the scalars of a volume)
+    #[arg(long, value_name = "NAME")]
+    array: Option<String>,
+    /// What the world's axes mean, for the .nrrd: lps, ras or las (default: as the volume's own file said)
+    #[arg(long, value_name = "SPACE")]
+    space: Option<String>,
+    #[command(flatten)]
+    raw: RawOptions,
+}
+
+/// Values on a lattice, with what to call them.
+struct Array {
+    lattice: Lattice,
+    space: Space,
+    name: String,
+    components: usize,
+    samples: Samples,
+}
+
+impl Export {
+    pub(super) fn run(self, progress: Progress) -> Result<()> {
+        expect_extension(&self.output, &["nrrd", "npy", "exr", "vti"])?;
+        writable(&self.output)?;
+        let space = self.space.as_ref().map(|name| {
+            let unknown = || Error::Invalid(format!("--space {name}: give lps, ras or las"));
+            Space::from_name(name).ok_or_else(unknown)
+        });
+        let mut array = self.load()?;
+        if let Some(space) = space {
+            array.space = space?;
+        }
+        let Array { lattice, space, name, components, samples } = &array;
+        let path = &self.output;
+        match path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase().as_str() {
+            "nrrd" => nrrd::write(path, lattice, *space, *components, samples.into(), &[("array", name)])?,
+            "npy" => npy::write(path, lattice, *components, samples.into())?,
+            "exr" => slices::write(path, lattice, *components, samples.into())?,
+            _ => VtiWriter::new(lattice)
+                .point_data(name, *components, samples)
+                .active_scalars(name)
+                .field_string(bake_file::SPACE, space.name())
+                .write(path)?,
+        }
+        if progress == Progress::Shown {
+            let [x, y, z] = lattice.dims();
+            eprintln!("{}: `{name}`, {x}×{y}×{z} × {components} {}", path.display(), samples.element_type().name());
+        }
+        Ok(())
+    }
+
+    fn load(&self) -> Result<Array> {
+        let is_vti = self.input.extension().is_some_and(|e| e.eq_ignore_ascii_case("vti"));
+        if is_vti && !self.raw.given() {
+            return array_of(&self.input, self.array.as_deref());
+        }
+        let volume = open(&self.input, &self.raw)?;
+        if let Some(name) = self.array.as_deref().filter(|n| *n != "value") {
+            return Err(Error::invalid(
+                &self.input,
+                format!("is a volume with one array, `value`, and has no `{name}`"),
+            ));
+        }
+        let (lattice, space) = (volume.lattice.clone(), volume.space);
+        Ok(Array { lattice, space, name: "value".into(), components: 1, samples: volume.into_samples() })
+    }
+}
+
+/// An array of a `.vti`: the one of that name, else `radiance`, else the scalars.
+fn array_of(path: &Path, name: Option<&str>) -> Result<Array> {
+    let mut file = VtiFile::read(path)?;
+    let text = file.field_strings.iter().find(|(key, _)| key == bake_file::SPACE);
+    let space = text.and_then(|(_, text)| Space::from_name(text)).unwrap_or_default();
+    let chosen = file.point_data.iter().position(|a| a.name == name.unwrap_or("radiance"));
+    let Some(chosen) = chosen else {
+        if let Some(name) = name {
+            let names: Vec<String> = file.point_data.iter().map(|a| format!("`{}`", a.name)).collect();
+            let names = names.join(", ");
+            return Err(Error::invalid(path, format!("has no point data `{name}`; it has {names}")));
+        }
+        let (lattice, samples) = file.into_scalars().map_err(|e| e.in_file(path))?;
+        return Ok(Array { lattice, space, name: "value".into(), components: 1, samples });
+    };
+    let array = file.point_data.swap_remove(chosen);
+    Ok(Array { lattice: file.lattice, space, name: array.name, components: array.components, samples: array.samples })
+}
+
+/// A volume by its extension, or by the layout that is given.
+pub(super) fn open(path: &Path, raw: &RawOptions) -> Result<Volume> {
+    if raw.given() { raw.layout(path)?.read(path) } else { Volume::open(path) }
+}

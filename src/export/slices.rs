@@ -1,0 +1,64 @@
+//! A grid as an OpenEXR of several layers, one per slice: for compositing programs and for pipelines that read EXR.
+
+use crate::atomic::AtomicFile;
+use crate::error::{Error, Result};
+use crate::volume::Lattice;
+use crate::volume::vti::SamplesRef;
+use exr::meta::attribute::{AttributeValue, Text};
+use exr::prelude::WritableImage;
+use exr::prelude::{
+    AnyChannel, AnyChannels, Blocks, Compression, Encoding, FlatSamples, Image, ImageAttributes, IntegerBounds, Layer,
+    LayerAttributes, LineOrder,
+};
+use std::path::Path;
+
+/// Writes one layer per slice along the third axis, `z0000`, `z0001` …, each nx × ny pixels of 32-bit floats (scan lines, ZIP),
+/// with the channels `R`, `G`, `B` for three components and `Y` for one. Row j of a layer is sample j: the first row, which
+/// viewers show on top, is the one at the lattice's origin. The values are written as they are.
+///
+/// The text attributes `isolume:origin` (world position of sample (0, 0, 0)) and `isolume:axes` (the three steps, one axis after
+/// the other) place the pixels.
+///
+/// # Errors
+/// `Invalid` if the count is not the lattice's samples × `components`, or for other component counts than 1 and 3; `Io`.
+pub fn write(path: &Path, lattice: &Lattice, components: usize, values: SamplesRef<'_>) -> Result<()> {
+    values.check(lattice, components).map_err(|e| Error::invalid(path, e))?;
+    let names: &[&str] = match components {
+        1 => &["Y"],
+        3 => &["R", "G", "B"],
+        n => return Err(Error::invalid(path, format!("arrays of {n} components: EXR slices hold 1 or 3"))),
+    };
+    let [nx, ny, nz] = lattice.dims();
+    let text = |s: &str| Text::from_slice_unchecked(s.as_bytes());
+    let numbers = |v: &[f64]| v.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
+    let encoding =
+        Encoding { compression: Compression::ZIP16, blocks: Blocks::ScanLines, line_order: LineOrder::Increasing };
+    let layers: Vec<_> = (0..nz)
+        .map(|k| {
+            let channels = names.iter().enumerate().map(|(c, name)| {
+                let slice = (0..nx * ny).map(|i| values.get_f32((k * nx * ny + i) * components + c)).collect();
+                AnyChannel::new(*name, FlatSamples::F32(slice))
+            });
+            Layer::new(
+                (nx, ny),
+                LayerAttributes::named(&*format!("z{k:04}")),
+                encoding,
+                AnyChannels::sort(channels.collect()),
+            )
+        })
+        .collect();
+    let mut attributes = ImageAttributes::new(IntegerBounds::from_dimensions((nx, ny)));
+    for (name, value) in
+        [("origin", lattice.origin().to_array().to_vec()), ("axes", lattice.axes().to_cols_array().to_vec())]
+    {
+        attributes.other.insert(text(&format!("isolume:{name}")), AttributeValue::Text(text(&numbers(&value))));
+    }
+    let mut file = AtomicFile::create(path)?;
+    // On this thread: the crate would start a thread pool of its own beside rayon's.
+    let image = Image::from_layers(attributes, layers);
+    let written = image.write().non_parallel().to_buffered(&mut file).map_err(|e| match e {
+        exr::error::Error::Io(e) => e,
+        e => std::io::Error::other(e),
+    });
+    file.finish(written)
+}

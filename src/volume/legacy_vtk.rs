@@ -1,0 +1,339 @@
+//! Legacy VTK files (`.vtk`) of structured points, ascii or binary. \[VTK\]
+
+use crate::error::{Error, Result};
+use crate::files;
+use crate::volume::{ElementType, Endian, Lattice, Samples, Volume, ascii};
+use glam::DVec3;
+use std::path::Path;
+
+/// Reads the first one-component scalars of the point data, or else the first one-component array of its `FIELD` data.
+///
+/// `ASPECT_RATIO`, the keyword of version 1, means the same as `SPACING`; a missing spacing is 1. `long` has 64 bits.
+///
+/// # Errors
+/// `Io`; `Invalid` for a broken header, or arrays cut short; `NotSupported` for other data sets and for cell data alone.
+pub fn read(path: &Path) -> Result<Volume> {
+    let bytes = files::read(path)?;
+    let (lattice, samples) = parse(&bytes).map_err(|e| e.in_file(path))?;
+    Volume::new(path.display().to_string(), lattice, samples)
+}
+
+/// Where reading stands in the bytes of a file.
+struct Cursor<'a> {
+    bytes: &'a [u8],
+    at: usize,
+    binary: bool,
+}
+
+fn invalid<T>(message: String) -> Result<T> {
+    Err(Error::Invalid(message))
+}
+
+/// An array's samples are decoded only if they are the ones wanted.
+struct Array<'a> {
+    element: ElementType,
+    values: &'a [u8],
+    count: usize,
+}
+
+impl<'a> Cursor<'a> {
+    /// The next line, without its end; `None` at the end of the file.
+    fn line(&mut self) -> Option<String> {
+        let rest = self.bytes.get(self.at..).filter(|r| !r.is_empty())?;
+        let end = rest.iter().position(|&b| b == b'\n');
+        self.at += end.map_or(rest.len(), |e| e + 1);
+        Some(String::from_utf8_lossy(&rest[..end.unwrap_or(rest.len())]).trim().to_string())
+    }
+
+    /// The words of the next line that holds any.
+    fn words(&mut self) -> Option<Vec<String>> {
+        loop {
+            let words: Vec<String> = self.line()?.split_ascii_whitespace().map(str::to_string).collect();
+            if !words.is_empty() {
+                return Some(words);
+            }
+        }
+    }
+
+    /// The values that begin here: exactly `count` words of text, or their bytes.
+    fn array(&mut self, name: &str, kind: &str, count: usize) -> Result<Array<'a>> {
+        let element = element(kind)
+            .ok_or_else(|| Error::NotSupported(format!("array `{name}` has type `{kind}`, which is not read")))?;
+        let rest = &self.bytes[self.at..];
+        let length = if self.binary {
+            count.checked_mul(element.size()).filter(|&n| n <= rest.len()).ok_or(rest.len() / element.size())
+        } else {
+            text_length(rest, count)
+        };
+        let length = length.or_else(|found| {
+            invalid(format!("array `{name}`: {count} values promised, {found} found; the file is cut short"))
+        })?;
+        self.at += length;
+        Ok(Array { element, values: &rest[..length], count })
+    }
+
+    fn samples(&self, array: &Array) -> Result<Samples> {
+        if self.binary {
+            return Ok(Samples::from_bytes(array.values, array.element, Endian::Big));
+        }
+        ascii::parse(array.values, array.element, array.count).map_err(Error::Invalid)
+    }
+}
+
+/// Bytes that `count` words take, or how many words there are.
+fn text_length(text: &[u8], count: usize) -> Result<usize, usize> {
+    let (mut at, mut found) = (0, 0);
+    while found < count {
+        let Some(begin) = text[at..].iter().position(|b| !b.is_ascii_whitespace()) else { return Err(found) };
+        let word = &text[at + begin..];
+        at += begin + word.iter().position(u8::is_ascii_whitespace).unwrap_or(word.len());
+        found += 1;
+    }
+    Ok(at)
+}
+
+fn element(kind: &str) -> Option<ElementType> {
+    Some(match kind {
+        "char" | "signed_char" => ElementType::I8,
+        "unsigned_char" => ElementType::U8,
+        "short" => ElementType::I16,
+        "unsigned_short" => ElementType::U16,
+        "int" => ElementType::I32,
+        "unsigned_int" => ElementType::U32,
+        "long" | "vtktypeint64" => ElementType::I64,
+        "unsigned_long" | "vtktypeuint64" => ElementType::U64,
+        "float" => ElementType::F32,
+        "double" => ElementType::F64,
+        // Written with 32 bits, whatever VTK holds in memory.
+        "vtkIdType" | "vtkidtype" => ElementType::I32,
+        _ => return None,
+    })
+}
+
+fn numbers<T: std::str::FromStr, const N: usize>(words: &[String]) -> Result<[T; N]> {
+    let values: Option<Vec<T>> = words[1..].iter().map(|w| w.parse().ok()).collect();
+    values
+        .and_then(|v| v.try_into().ok())
+        .ok_or_else(|| Error::Invalid(format!("`{}`: the keyword must be followed by {N} numbers", words.join(" "))))
+}
+
+/// Component count of an attribute's last words; 1 if it is not there.
+fn components(words: &[String], at: usize) -> Result<usize> {
+    match words.get(at) {
+        None => Ok(1),
+        Some(w) => w.parse().or_else(|_| invalid(format!("`{}`: `{w}` is no number of components", words.join(" ")))),
+    }
+}
+
+fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
+    let mut cursor = Cursor { bytes, at: 0, binary: false };
+    if !cursor.line().is_some_and(|l| l.starts_with("# vtk DataFile Version")) {
+        return invalid("does not begin with `# vtk DataFile Version`, so it is no legacy VTK file".into());
+    }
+    let _title = cursor.line();
+    cursor.binary = match cursor.words().as_deref() {
+        Some([word]) if word.eq_ignore_ascii_case("binary") => true,
+        Some([word]) if word.eq_ignore_ascii_case("ascii") => false,
+        other => return invalid(format!("line 3 is {other:?}; it must be ASCII or BINARY")),
+    };
+    let dataset = cursor.words().unwrap_or_default();
+    if dataset.first().is_none_or(|w| w != "DATASET") || dataset.len() != 2 {
+        return invalid(format!("`{}`: it must be DATASET and a type", dataset.join(" ")));
+    }
+    if dataset[1] != "STRUCTURED_POINTS" {
+        let kind = &dataset[1];
+        return Err(Error::NotSupported(format!(
+            "holds a {kind}; only STRUCTURED_POINTS are read (resample it to an image)"
+        )));
+    }
+
+    let (mut dims, mut spacing, mut origin): (Option<[usize; 3]>, [f64; 3], [f64; 3]) = (None, [1.0; 3], [0.0; 3]);
+    let points = loop {
+        let Some(words) = cursor.words() else { return invalid("has no POINT_DATA".into()) };
+        match words[0].to_ascii_uppercase().as_str() {
+            "DIMENSIONS" => dims = Some(numbers(&words)?),
+            "SPACING" | "ASPECT_RATIO" => spacing = numbers(&words)?,
+            "ORIGIN" => origin = numbers(&words)?,
+            "FIELD" => skip_field(&mut cursor, &words)?,
+            "METADATA" => while cursor.line().is_some_and(|l| !l.is_empty()) {},
+            "POINT_DATA" => break numbers::<usize, 1>(&words)?[0],
+            "CELL_DATA" => return Err(cells()),
+            _ => return invalid(format!("`{}`: no keyword of STRUCTURED_POINTS", words.join(" "))),
+        }
+    };
+    let dims = dims.ok_or_else(|| Error::Invalid("has no DIMENSIONS".into()))?;
+    let lattice = Lattice::aligned(dims, DVec3::from_array(origin), DVec3::from_array(spacing))?;
+    if points != lattice.len() {
+        return invalid(format!("POINT_DATA {points} does not fit DIMENSIONS {dims:?}, which are {}", lattice.len()));
+    }
+
+    let mut field: Option<Array> = None;
+    let count =
+        |n: usize| points.checked_mul(n).ok_or_else(|| Error::Invalid(format!("{n} components do not fit the memory")));
+    while let Some(words) = cursor.words() {
+        let key = words[0].to_ascii_uppercase();
+        let word = |at: usize| {
+            words.get(at).ok_or_else(|| Error::Invalid(format!("`{}`: too few words behind {key}", words.join(" "))))
+        };
+        match key.as_str() {
+            "SCALARS" => {
+                let n = components(&words, 3)?;
+                let before = cursor.at;
+                if !cursor.words().is_some_and(|w| w[0] == "LOOKUP_TABLE") {
+                    cursor.at = before;
+                }
+                let array = cursor.array(word(1)?, word(2)?, count(n)?)?;
+                if n == 1 {
+                    return Ok((lattice, cursor.samples(&array)?));
+                }
+            }
+            // A table of colours, 4 per entry.
+            "LOOKUP_TABLE" => {
+                let entries = components(&words, 2)?.saturating_mul(4);
+                cursor.array(word(1)?, if cursor.binary { "unsigned_char" } else { "float" }, entries)?;
+            }
+            "COLOR_SCALARS" => {
+                let n = components(&words, 2)?;
+                cursor.array(word(1)?, if cursor.binary { "unsigned_char" } else { "float" }, count(n)?)?;
+            }
+            "VECTORS" | "NORMALS" => drop(cursor.array(word(1)?, word(2)?, count(3)?)?),
+            "TENSORS" => drop(cursor.array(word(1)?, word(2)?, count(9)?)?),
+            "TEXTURE_COORDINATES" => {
+                let n = components(&words, 2)?;
+                cursor.array(word(1)?, word(3)?, count(n)?)?;
+            }
+            "FIELD" => {
+                for _ in 0..components(&words, 2)? {
+                    let (array, n) = field_array(&mut cursor)?;
+                    if n == 1 && array.count == points && field.is_none() {
+                        field = Some(array);
+                    }
+                }
+            }
+            "METADATA" => while cursor.line().is_some_and(|l| !l.is_empty()) {},
+            "CELL_DATA" => break,
+            _ => return invalid(format!("`{}`: no keyword of POINT_DATA", words.join(" "))),
+        }
+    }
+    match field {
+        Some(array) => Ok((lattice, cursor.samples(&array)?)),
+        None => Err(cells()),
+    }
+}
+
+fn cells() -> Error {
+    Error::NotSupported(
+        "has no point data of one component (cell data are not read: convert them to point data)".into(),
+    )
+}
+
+/// One array of a `FIELD`, and its components.
+fn field_array<'a>(cursor: &mut Cursor<'a>) -> Result<(Array<'a>, usize)> {
+    let mut words = cursor.words().unwrap_or_default();
+    // Behind each array there may be notes about it.
+    if words.first().is_some_and(|w| w == "METADATA") {
+        while cursor.line().is_some_and(|l| !l.is_empty()) {}
+        words = cursor.words().unwrap_or_default();
+    }
+    let number = |at: usize| words.get(at).and_then(|w| w.parse::<usize>().ok());
+    let (Some(n), Some(tuples), Some(kind)) = (number(1), number(2), words.get(3)) else {
+        return invalid(format!(
+            "`{}`: an array of a FIELD begins with name, components, tuples, type",
+            words.join(" ")
+        ));
+    };
+    let count = n.checked_mul(tuples).ok_or_else(|| Error::Invalid(format!("{n} × {tuples} values are too many")))?;
+    Ok((cursor.array(&words[0], kind, count)?, n))
+}
+
+fn skip_field(cursor: &mut Cursor, words: &[String]) -> Result<()> {
+    for _ in 0..components(words, 2)? {
+        field_array(cursor)?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const HEAD: &str = "# vtk DataFile Version 3.0\ntitle\nASCII\nDATASET STRUCTURED_POINTS\nDIMENSIONS 3 2 2\n\
+                        SPACING 0.5 1 2\nORIGIN 1 2 3\nPOINT_DATA 12\n";
+    const NUMBERS: &str = "0 1 2 3 4 5\n6 7 8 9 10 11\n";
+
+    fn ok(bytes: &[u8], element: ElementType) {
+        let (lattice, samples) = parse(bytes).unwrap();
+        assert_eq!(lattice.to_world(DVec3::ONE), DVec3::new(1.5, 3.0, 5.0));
+        assert_eq!(samples.element_type(), element);
+        assert!((0..12).all(|i| samples.get(i) == i as f64));
+    }
+
+    #[test]
+    fn text_and_big_endian_bytes() {
+        ok(format!("{HEAD}SCALARS s int\nLOOKUP_TABLE default\n{NUMBERS}").as_bytes(), ElementType::I32);
+        ok(format!("{HEAD}SCALARS s float 1\n{NUMBERS}").as_bytes(), ElementType::F32);
+        let old = HEAD.replace("SPACING", "ASPECT_RATIO").replace("3.0", "1.0");
+        ok(format!("{old}SCALARS s double\nLOOKUP_TABLE default\n{NUMBERS}").as_bytes(), ElementType::F64);
+        for (kind, element) in [
+            ("unsigned_char", ElementType::U8),
+            ("short", ElementType::I16),
+            ("unsigned_short", ElementType::U16),
+            ("unsigned_int", ElementType::U32),
+            ("vtktypeint64", ElementType::I64),
+            ("float", ElementType::F32),
+            ("double", ElementType::F64),
+        ] {
+            let data: Vec<u8> = (0..12u8)
+                .flat_map(|i| match element {
+                    ElementType::F32 => f32::from(i).to_be_bytes().to_vec(),
+                    ElementType::F64 => f64::from(i).to_be_bytes().to_vec(),
+                    _ => [&[0; 7][..element.size() - 1], &[i]].concat(),
+                })
+                .collect();
+            let head = HEAD.replace("ASCII", "BINARY");
+            let scalars = format!("{head}SCALARS s {kind}\nLOOKUP_TABLE default\n");
+            ok(&[scalars.as_bytes(), &data, b"\n"].concat(), element);
+            // Behind vectors whose bytes look like lines.
+            let behind =
+                format!("{head}VECTORS v short\n{}\nSCALARS s {kind} 1\nLOOKUP_TABLE default\n", "\n\n".repeat(36));
+            ok(&[behind.as_bytes(), &data, b"\n"].concat(), element);
+            let field = format!("{head}FIELD FieldData 2\nv 3 12 short\n{}\nh 1 12 {kind}\n", "ab".repeat(36));
+            ok(&[field.as_bytes(), &data, b"\nMETADATA\nINFORMATION 0\n\n"].concat(), element);
+        }
+    }
+
+    #[test]
+    fn arrays_in_front_are_passed_over() {
+        let nine = "1 0 0 0 1 0 0 0 1\n".repeat(12);
+        let three = "1 0 0\n".repeat(12);
+        let two = "1 0\n".repeat(12);
+        let text = format!(
+            "{HEAD}NORMALS n float\n{three}TENSORS t float\n{nine}TEXTURE_COORDINATES c 2 float\n{two}COLOR_SCALARS rgb 3\n\
+             {three}LOOKUP_TABLE mine 2\n0 0 0 1\n1 1 1 1\nSCALARS v float 2\nLOOKUP_TABLE default\n{two}METADATA\n\
+             INFORMATION 0\n\nSCALARS s short\nLOOKUP_TABLE default\n{NUMBERS}"
+        );
+        ok(text.as_bytes(), ElementType::I16);
+    }
+
+    #[test]
+    fn broken_files_are_refused() {
+        let refused = |text: String, words: &str| {
+            let message = parse(text.as_bytes()).unwrap_err().to_string();
+            assert!(message.contains(words), "{words}: {message}");
+        };
+        let good = format!("{HEAD}SCALARS s int\nLOOKUP_TABLE default\n{NUMBERS}");
+        refused(good.replace(" 11\n", "\n"), "11 found");
+        refused(good.replace("ASCII", "BINARY"), "cut short");
+        refused(good.replace("int", "bit"), "`bit`");
+        refused(good.replace(" 11\n", " x\n"), "`x`");
+        refused(good.replace("POINT_DATA 12", "POINT_DATA 13"), "13");
+        refused(good.replace("POINT_DATA", "CELL_DATA"), "cell data");
+        refused(good.replace("3 2 2", "12 1 1"), "flatland");
+        refused(good.replace("3 2 2", "9999999 9999999 9999999"), "too large");
+        refused(good.replace("STRUCTURED_POINTS", "POLYDATA"), "POLYDATA");
+        refused(good.replace("# vtk", "# vkt"), "no legacy VTK");
+        refused(good.replace("SPACING 0.5 1", "SPACING 0.5"), "3 numbers");
+        refused(HEAD.into(), "no point data");
+        refused(good.replace("SCALARS s int", "VECTORS v int"), "cut short");
+    }
+}

@@ -1,0 +1,46 @@
+use super::*;
+
+#[test]
+fn files_are_told_apart_by_their_extension() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let lattice = Lattice::aligned([2, 3, 2], DVec3::new(1.0, 2.0, 3.0), DVec3::new(0.5, 1.0, 4.0)).unwrap();
+    let volume = Volume::new("made", lattice, Samples::I16((0..12).map(|i| i * 100 - 500).collect())).unwrap();
+    for name in ["a.VTI", "b.nrrd"] {
+        volume.write(at(name)).unwrap();
+        let read = Volume::open(at(name)).unwrap();
+        assert_eq!((&read.lattice, read.samples()), (&volume.lattice, volume.samples()));
+    }
+    assert!(matches!(volume.write(at("c.png")), Err(Error::NotSupported(_))));
+    assert!(!at("c.png").exists());
+    std::fs::write(at("d.xyz"), []).unwrap();
+    let message = Volume::open(at("d.xyz")).unwrap_err().to_string();
+    assert!(message.contains("d.xyz") && message.contains(".nii.gz"), "{message}");
+    assert!(matches!(Volume::open(at("none.vti")), Err(Error::Io { .. })));
+    std::fs::write(at("e.raw"), []).unwrap();
+    assert!(Volume::open(at("e.raw")).unwrap_err().to_string().contains("no header"));
+    for name in [
+        "f.nii",
+        "f.nii.gz",
+        "f.nhdr",
+        "f.mha",
+        "f.mhd",
+        "f.mrc",
+        "f.MAP",
+        "f.map.gz",
+        "f.ccp4",
+        "f.rec",
+        "f.cube",
+        "f.cube.gz",
+        "f.vti",
+        "f.vtk",
+        "f.npy",
+        "f.tif",
+        "f.tiff",
+        "f.tif.zip",
+    ] {
+        std::fs::write(at(name), []).unwrap();
+        let message = Volume::open(at(name)).unwrap_err().to_string();
+        assert!(message.contains(name) && !message.contains("extension"), "{message}");
+    }
+}
