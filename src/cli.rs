@@ -15,11 +15,6 @@ use crate::export::bake_file::{self, BakedVolume};
 use crate::progress::{self, Progress};
 use crate::render::{Camera, Rendered, Shading, render};
 use crate::scene_file::{RawOptions, SceneOptions, load};
-<<<<<<< HEAD
-use crate::volume::Volume;
-=======
-use crate::volume::generate::Generator;
->>>>>>> 2191a4f46f9ce2017ad59a933d5b736e1b4574ae
 use crate::volume::statistics::VolumeStatistics;
 use clap::{Parser, Subcommand};
 use glam::DVec3;
@@ -91,21 +86,6 @@ struct Info {
 }
 
 #[derive(clap::Args, Debug)]
-<<<<<<< HEAD
-=======
-struct Generate {
-    /// bumps, sphere, linear[:a,b,c], xyz, or two-cylinders[:gap]
-    kind: String,
-    /// Samples along each edge
-    #[arg(long, default_value_t = 101, value_name = "N")]
-    size: usize,
-    /// Output: .vti, .nrrd or .npy
-    #[arg(short, long, value_name = "FILE")]
-    output: PathBuf,
-}
-
-#[derive(clap::Args, Debug)]
->>>>>>> 2191a4f46f9ce2017ad59a933d5b736e1b4574ae
 #[command(after_help = "\
 The result holds point data `value` (contour on it), `rgb` (colour by it, without lighting and without a colour map),
 `radiance` (linear), `std_error` and `mask`, the walls' light as field data, and every setting.
@@ -131,7 +111,7 @@ struct Bake {
 
 #[derive(clap::Args, Debug)]
 struct Render {
-    /// A bake (.vti)
+    /// A bake (.vti); with --reference or --local also a volume or scene file
     file: PathBuf,
     /// The isosurface to draw, in the volume's units
     #[arg(long, value_name = "C", allow_negative_numbers = true)]
@@ -169,6 +149,8 @@ struct Render {
     /// Brightness: multiplies the bake's exposure
     #[arg(long, default_value_t = 1.0, value_name = "FACTOR")]
     exposure: f64,
+    #[command(flatten)]
+    scene: SceneOptions,
 }
 
 impl Cli {
@@ -246,23 +228,6 @@ impl Info {
     }
 }
 
-<<<<<<< HEAD
-=======
-impl Generate {
-    fn run(self, progress: Progress) -> Result<()> {
-        let generator = Generator::from_name(&self.kind)?;
-        expect_extension(&self.output, &["vti", "nrrd", "npy"])?;
-        writable(&self.output)?;
-        let volume = generator.sample([self.size; 3])?;
-        volume.write(&self.output)?;
-        if progress == Progress::Shown {
-            eprintln!("{}: {} of {} samples", self.output.display(), generator.name(), volume.samples().len());
-        }
-        Ok(())
-    }
-}
-
->>>>>>> 2191a4f46f9ce2017ad59a933d5b736e1b4574ae
 impl Bake {
     fn run(self, progress: Progress) -> Result<()> {
         let begun = Instant::now();
@@ -354,8 +319,16 @@ impl Render {
         if !(1..=1 << 16).contains(&self.samples) {
             return Err(Error::Invalid("--samples: 1 to 65536 rays per pixel".into()));
         }
-        let baked = BakedVolume::read(&self.file)?;
-        let mut camera = Camera::facing(&baked.scene, self.height);
+        let baked = match extract::open_bake(&self.file)? {
+            None if !self.reference && !self.local => Some(BakedVolume::read(&self.file)?),
+            found => found,
+        };
+        let loaded = match baked {
+            Some(_) => None,
+            None => Some(load(&self.file, &self.scene)?.scene),
+        };
+        let scene = baked.as_ref().map(|b| &b.scene).or(loaded.as_ref()).expect("one of the two was read");
+        let mut camera = Camera::facing(scene, self.height);
         camera.fov = self.fov;
         if let Some(width) = self.width {
             camera.size[0] = width;
@@ -363,30 +336,34 @@ impl Render {
         if let Some(up) = triple(self.up.as_ref(), "up")? {
             camera.up = up;
         }
-        let [lo, hi] = baked.scene.bounds();
+        let [lo, hi] = scene.bounds();
         if let Some(eye) = triple(self.eye.as_ref(), "eye")? {
             (camera.eye, camera.target) = (eye, 0.5 * (lo + hi));
         }
         if let Some(target) = triple(self.target.as_ref(), "target")? {
             camera.target = target;
         }
-        let shading = if self.local { Shading::Local } else { Shading::Baked };
+        let exposure = baked.as_ref().map_or_else(|| scene.exposure(), |b| b.exposure);
         let rendered = if self.reference {
-            let picture = reference::picture(&baked.scene, self.isovalue, &camera, self.samples, &device()?)?;
+            let picture = reference::picture(scene, self.isovalue, &camera, self.samples, &device()?)?;
             Rendered { picture, unbaked: 0.0 }
         } else {
-            render(&baked, self.isovalue, &camera, shading, self.samples, &device()?)?
+            let shading = match &baked {
+                Some(baked) if !self.local => Shading::Baked(baked),
+                _ => Shading::Local(exposure),
+            };
+            render(scene, self.isovalue, &camera, shading, self.samples, &device()?)?
         };
-        let exposure = baked.exposure * self.exposure;
+        let exposure = exposure * self.exposure;
         if self.output.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr")) {
             let attributes = [
                 ("isolume".to_owned(), format!("{} ({})", env!("CARGO_PKG_VERSION"), env!("ISOLUME_COMMIT"))),
-                ("bake".to_owned(), self.file.display().to_string()),
+                ("source".to_owned(), self.file.display().to_string()),
                 ("isovalue".to_owned(), self.isovalue.to_string()),
                 ("exposure".to_owned(), exposure.to_string()),
                 ("samplesPerPixel".to_owned(), self.samples.to_string()),
                 ("renderTimeSeconds".to_owned(), begun.elapsed().as_secs_f64().to_string()),
-                ("report".to_owned(), baked.report.to_string()),
+                ("report".to_owned(), baked.as_ref().map_or_else(|| "null".into(), |b| b.report.to_string())),
             ];
             rendered.picture.write_exr(&self.output, &attributes)?;
         } else {

@@ -63,12 +63,12 @@ impl Camera {
 }
 
 /// How surfaces get their colours.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Shading {
-    /// By the baked radiance.
-    Baked,
-    /// By a headlight and a constant: what viewers do without a bake.
-    Local,
+#[derive(Clone, Copy)]
+pub enum Shading<'a> {
+    /// By the baked radiance; the scene drawn must be the bake's.
+    Baked(&'a BakedVolume),
+    /// By a headlight and a constant, what viewers do without a bake: radiance that this exposure brings to [0, 1].
+    Local(f64),
 }
 
 /// What a picture says about itself.
@@ -85,18 +85,17 @@ pub struct Rendered {
 /// # Errors
 /// `Invalid` for an isovalue outside the sweep or an impossible camera; `Embree`.
 pub fn render(
-    baked: &BakedVolume,
+    scene: &Scene,
     isovalue: f64,
     camera: &Camera,
-    shading: Shading,
+    shading: Shading<'_>,
     samples: u32,
     device: &Device,
 ) -> Result<Rendered> {
-    let scene = &baked.scene;
     let sweep = scene.field.sweep();
     if !(isovalue >= sweep.lo() && isovalue <= sweep.hi()) {
         return Err(Error::Invalid(format!(
-            "isovalue {isovalue} lies outside the baked sweep {} … {}; choose one inside, or bake a wider sweep",
+            "isovalue {isovalue} lies outside the sweep {} … {}; choose one inside, or bake a wider sweep",
             sweep.lo(),
             sweep.hi()
         )));
@@ -105,8 +104,8 @@ pub fn render(
     let c = sweep.isovalue(isovalue);
     let unbaked = AtomicU64::new(0);
     let shade = |ray: &FlattenedRay, hit: FlattenedHit, direction: DVec3| match shading {
-        Shading::Local => local(scene, ray, hit, direction) / baked.exposure,
-        Shading::Baked => radiance(baked, ray, hit).unwrap_or_else(|| {
+        Shading::Local(exposure) => local(scene, ray, hit, direction) / exposure,
+        Shading::Baked(baked) => radiance(baked, ray, hit).unwrap_or_else(|| {
             unbaked.fetch_add(1, Ordering::Relaxed);
             DVec3::ZERO
         }),

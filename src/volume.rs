@@ -455,7 +455,6 @@ impl Volume {
         let path = path.as_ref();
         let extension = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
         match extension.as_str() {
-<<<<<<< HEAD
             "vti" => {
                 let writer = vti::VtiWriter::new(&self.lattice).point_data("value", 1, &self.samples);
                 notes
@@ -464,22 +463,15 @@ impl Volume {
                     .active_scalars("value")
                     .write(path)
             }
-            "nrrd" => nrrd::write(self, path, notes),
-            _ => {
-                Err(Error::not_supported(path, "volumes are written as .vti or .nrrd; give it one of these extensions"))
+            "nrrd" => {
+                let notes: Vec<(&str, &str)> = notes.iter().map(|(k, v)| (k.as_str(), v.as_str())).collect();
+                nrrd::write(path, &self.lattice, self.space, 1, (&self.samples).into(), &notes)
             }
-=======
-            "vti" => vti::VtiWriter::new(&self.lattice)
-                .point_data("value", 1, &self.samples)
-                .active_scalars("value")
-                .write(path),
-            "nrrd" => nrrd::write(path, &self.lattice, self.space, 1, (&self.samples).into(), &[]),
             "npy" => npy::write(path, &self.lattice, 1, (&self.samples).into()),
             _ => Err(Error::not_supported(
                 path,
                 "volumes are written as .vti, .nrrd or .npy; give it one of these extensions",
             )),
->>>>>>> 2191a4f46f9ce2017ad59a933d5b736e1b4574ae
         }
     }
 

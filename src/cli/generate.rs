@@ -29,7 +29,7 @@ pub(super) struct Generate {
     /// Samples along each edge (default: 101, fluid 120)
     #[arg(long, value_name = "N")]
     size: Option<usize>,
-    /// Output: .vti or .nrrd
+    /// Output: .vti, .nrrd or .npy
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     #[command(flatten)]
@@ -76,7 +76,7 @@ enum Species {
 
 impl Generate {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
-        expect_extension(&self.output, &["vti", "nrrd"])?;
+        expect_extension(&self.output, &["vti", "nrrd", "npy"])?;
         match self.kind.as_str() {
             "pasta" => self.pasta(progress),
             "fluid" => self.fluid(progress),

@@ -32,7 +32,8 @@ pub(super) fn figure6(study: &Study, subject: &Subject, name: &str, strategy: St
     let panels = [
         samples(&baked, strategy, bake.report.seed)?,
         slice(&baked, 0.4),
-        render(&baked, subject.main_isovalue(), &square(&baked), Shading::Baked, 8, &study.device)?.picture,
+        render(&subject.scene, subject.main_isovalue(), &square(&baked), Shading::Baked(&baked), 8, &study.device)?
+            .picture,
     ];
     let mut sheet = Picture::new(3 * PANEL + 2 * GAP, PANEL);
     sheet.rgb.fill([1.0 / baked.exposure as f32; 3]);

@@ -45,17 +45,6 @@ pub fn read(path: &Path) -> Result<Volume> {
     Ok(Volume { space, ..Volume::new(path.display().to_string(), lattice, samples)? })
 }
 
-<<<<<<< HEAD
-/// Writes a volume as an attached, raw, little-endian NRRD. The file's world is the lattice's, without a name.
-/// `notes` become key/value pairs.
-///
-/// The file appears under its name only when it is complete.
-///
-/// # Errors
-/// `Io`.
-pub fn write(volume: &Volume, path: &Path, notes: &[(String, String)]) -> Result<()> {
-    let lattice = &volume.lattice;
-=======
 /// Reads a field of two axes (others must hold a single sample); `None` if the file holds a volume. The steps along the axes are
 /// the lengths of their `space directions`, or `spacings`, or 1.
 ///
@@ -98,7 +87,6 @@ pub fn write(
     notes: &[(&str, &str)],
 ) -> Result<()> {
     values.check(lattice, components).map_err(|e| Error::invalid(path, e))?;
->>>>>>> 2191a4f46f9ce2017ad59a933d5b736e1b4574ae
     let [nx, ny, nz] = lattice.dims();
     let kind = match values.element_type() {
         ElementType::U8 => "uint8",
@@ -131,29 +119,11 @@ pub fn write(
         head += &format!("{key}:={value}\n");
     }
     files::write_atomically(path, |out| {
-<<<<<<< HEAD
-        write!(
-            out,
-            "NRRD0004\n# written by isolume\ntype: {kind}\ndimension: 3\nspace dimension: 3\nsizes: {nx} {ny} {nz}\n\
-             space directions: {} {} {}\nkinds: domain domain domain\nendian: little\nencoding: raw\n\
-             space origin: {}\n",
-            vector(axes.x_axis),
-            vector(axes.y_axis),
-            vector(axes.z_axis),
-            vector(lattice.origin()),
-        )?;
-        for (key, text) in notes {
-            writeln!(out, "{key}:={}", text.replace(['\n', '\r'], " "))?;
-        }
-        writeln!(out)?;
-        each_sample_type!(volume.samples(), v => v.iter().try_for_each(|s| out.write_all(&s.to_le_bytes())))
-=======
         out.write_all(head.as_bytes())?;
         out.write_all(b"\n")?;
         let mut packed = GzEncoder::new(out, Compression::fast());
         values.write_le(&mut packed)?;
         packed.finish().map(drop)
->>>>>>> 2191a4f46f9ce2017ad59a933d5b736e1b4574ae
     })
 }
 
