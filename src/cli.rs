@@ -7,6 +7,7 @@ mod flatland;
 mod generate;
 mod reference;
 mod study;
+mod view;
 
 use crate::bake::{BakeOptions, BakeSettings, bake};
 use crate::embree::Device;
@@ -60,6 +61,8 @@ enum Verb {
     Bake(Bake),
     /// Draw an isosurface of a bake inside its box
     Render(Render),
+    /// Make a web page of a bake: sweep the isovalue with a slider, turn it with the mouse
+    View(view::View),
     /// Take one isosurface away as a mesh, with a bake's light on its vertices
     Extract(extract::Extract),
     /// Write one array of a bake, or a volume, in another format: .nrrd, .npy, .exr or .vti
@@ -181,6 +184,7 @@ impl Cli {
             Verb::Generate(v) => v.run(progress),
             Verb::Bake(v) => v.run(progress),
             Verb::Render(v) => v.run(progress),
+            Verb::View(v) => v.run(progress),
             Verb::Extract(v) => v.run(progress),
             Verb::Export(v) => v.run(progress),
             Verb::Reference(v) => v.run(progress),

@@ -53,6 +53,7 @@ pub mod scene_file;
 pub mod export;
 pub mod surface_mesh;
 pub mod render;
+pub mod view;
 // One isosurface at a time in 3D, and how far a bake is from it.
 pub mod reference;
 pub mod accuracy;

@@ -1,0 +1,326 @@
+//! `isolume view`: what the page holds, and what a browser makes of it.
+
+#[path = "view/browser.rs"]
+mod browser;
+
+use base64::Engine;
+use glam::{DMat3, DVec3};
+use isolume::export::bake_file::BakedVolume;
+use isolume::mask::Mask;
+use isolume::view::{Payload, codec};
+use isolume::volume::{Lattice, Samples, Volume};
+use std::fs;
+use std::io::Read;
+use std::path::Path;
+use std::process::Command;
+
+fn isolume(dir: &Path, args: &[&str]) {
+    let output = Command::new(env!("CARGO_BIN_EXE_isolume")).current_dir(dir).args(args).output().unwrap();
+    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+}
+
+const QUICK: [&str; 9] =
+    ["--photons", "20000", "--samples", "20000", "--gather", "16", "--wall-resolution", "16", "--quiet"];
+
+/// A bake of the bumps, as `out.vti` in `dir`.
+fn bake_bumps(dir: &Path, size: &str, extra: &[&str]) -> BakedVolume {
+    isolume(dir, &["generate", "bumps", "--size", size, "-o", "b.vti", "-q"]);
+    let bake = ["bake", "b.vti", "--isovalues", "3.6", "95", "-o", "out.vti"];
+    isolume(dir, &[&bake[..], &QUICK, extra].concat());
+    BakedVolume::read(&dir.join("out.vti")).unwrap()
+}
+
+/// The text of the page's element `id`.
+fn element<'a>(page: &'a str, id: &str) -> &'a str {
+    let rest = page.split_once(&format!("id=\"{id}\">")).unwrap().1;
+    rest.split_once("</script>").unwrap().0
+}
+
+#[test]
+fn the_page_holds_the_bake_and_nothing_from_elsewhere() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let baked = bake_bumps(dir, "41", &["--sides", "both"]);
+    isolume(dir, &["view", "out.vti", "-o", "page.html", "--title", "</script><b>&", "-q"]);
+    let page = fs::read_to_string(dir.join("page.html")).unwrap();
+    for foreign in ["http:", "https:", "src=", "@import", "import(", "fetch(", "XMLHttpRequest"] {
+        assert!(!page.contains(foreign), "the page is self-contained, but says {foreign}");
+    }
+    let description: serde_json::Value = serde_json::from_str(element(&page, "description")).unwrap();
+    assert_eq!(description["title"], "</script><b>&");
+    let packed = base64::engine::general_purpose::STANDARD.decode(element(&page, "data")).unwrap();
+    let mut bytes = Vec::new();
+    flate2::read::ZlibDecoder::new(&packed[..]).read_to_end(&mut bytes).unwrap();
+    assert_eq!(description["length"], bytes.len());
+
+    // Each array where the description says, with the bake's values in it.
+    let n = baked.lattice().len();
+    let plane = |offset: usize| {
+        let mut last = 0u8;
+        bytes[offset..offset + n].iter().map(|d| { last = last.wrapping_add(*d); last }).collect::<Vec<_>>()
+    };
+    let (mut code, mut worst) = (0u16, 0f64);
+    for (i, &s) in baked.scene.field.samples().iter().enumerate() {
+        code = code.wrapping_add(u16::from_be_bytes([bytes[i], bytes[n + i]]));
+        let distance = (f64::from(s) - f64::from(s).clamp(0.0, 1.0)).abs();
+        worst = worst.max((codec::decode(code) - f64::from(s)).abs() - 0.001 * distance);
+    }
+    assert!(worst <= 0.51 / 32_768.0, "isovalues are off by {worst}");
+    let scale = description["scale"].as_f64().unwrap();
+    assert!((1.0..=4.0).contains(&scale));
+    let lights = description["lights"].as_array().unwrap();
+    assert_eq!(lights.len(), 2, "both sides");
+    for (light, (_, grid)) in lights.iter().zip(&baked.sides) {
+        let offset = usize::try_from(light.as_u64().unwrap()).unwrap();
+        for c in 0..3 {
+            for (byte, radiance) in plane(offset + c * n).iter().zip(&grid.radiance) {
+                let stored = isolume::export::picture::srgb_decode(f32::from(*byte) / 255.0);
+                let given = (f64::from(radiance[c]) * baked.exposure / scale).min(1.0);
+                let slack = 0.01 * given + 2e-4;
+                assert!((f64::from(stored) - given).abs() < slack, "{stored} for {given}");
+            }
+        }
+        let mask = plane(offset + 3 * n);
+        assert!(mask.iter().zip(&grid.mask).all(|(b, m)| (*b == 0) == (*m == Mask::Empty)));
+    }
+    let walls = description["flats"].as_array().unwrap();
+    assert_eq!(walls.len(), 6);
+    assert!(walls.iter().filter(|w| !w["texture"].is_null()).count() >= 5);
+    // Real data: 181×217×181 in 40 MB are 5.6 bytes a point; two sides and the fixed parts stay below that here.
+    assert!(page.len() < 60_000 + 56 * n / 10, "{} bytes for {n} points", page.len());
+}
+
+#[test]
+fn a_bake_too_large_for_a_browser_is_refused_and_volumes_are_no_bakes() {
+    let dir = tempfile::tempdir().unwrap();
+    isolume(dir.path(), &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
+    for (args, word) in [(["view", "b.vti", "-o", "p.html"], "is no bake"), (["view", "b.vti", "-o", "p.png"], ".html")] {
+        let output = Command::new(env!("CARGO_BIN_EXE_isolume")).current_dir(dir.path()).args(args).output().unwrap();
+        assert_eq!(output.status.code(), Some(2));
+        assert!(String::from_utf8_lossy(&output.stderr).contains(word));
+    }
+    assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1, "nothing is left behind");
+}
+
+/// A picture as bytes, RGB from top to bottom.
+struct Bytes {
+    size: [usize; 2],
+    rgb: Vec<[u8; 3]>,
+}
+
+impl Bytes {
+    /// What `isolume render` draws.
+    fn render(dir: &Path, args: &[&str]) -> Self {
+        let fixed = ["render", "out.vti", "-o", "r.png", "--height", "240", "--samples", "16", "-q"];
+        isolume(dir, &[&fixed[..], args].concat());
+        let file = fs::File::open(dir.join("r.png")).unwrap();
+        let mut reader = png::Decoder::new(std::io::BufReader::new(file)).read_info().unwrap();
+        let mut bytes = vec![0; reader.output_buffer_size().unwrap()];
+        let info = reader.next_frame(&mut bytes).unwrap();
+        let rgb = bytes.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect();
+        Self { size: [info.width as usize, info.height as usize], rgb }
+    }
+
+    /// What the browser read back, from bottom to top.
+    fn posted(size: [usize; 2], bytes: &[u8]) -> Self {
+        assert_eq!(bytes.len(), 4 * size[0] * size[1]);
+        let rows = bytes.chunks_exact(4 * size[0]).rev();
+        Self { size, rgb: rows.flat_map(|r| r.chunks_exact(4).map(|c| [c[0], c[1], c[2]])).collect() }
+    }
+
+    /// Mean difference and the share of pixels that differ by more than 2 % of white, away from edges, where one ray per
+    /// pixel and sixteen must differ.
+    fn differences(&self, other: &Self) -> (f64, f64, f64) {
+        let [w, h] = self.size;
+        assert_eq!(self.size, other.size);
+        let apart = |a: [u8; 3], b: [u8; 3]| (0..3).map(|c| f64::from(a[c].abs_diff(b[c])) / 255.0).fold(0.0, f64::max);
+        let (mut sum, mut count, mut beyond) = (0.0, 0.0, 0.0);
+        for y in 1..h - 1 {
+            for x in 1..w - 1 {
+                let at = y * w + x;
+                let edge = |p: &Self| [at - 1, at + 1, at - w, at + w].iter().any(|&n| apart(p.rgb[at], p.rgb[n]) > 0.06);
+                if edge(self) || edge(other) {
+                    continue;
+                }
+                let d = apart(self.rgb[at], other.rgb[at]);
+                sum += d;
+                count += 1.0;
+                beyond += f64::from(d > 0.02);
+            }
+        }
+        (sum / count, beyond / count, count / (w * h) as f64)
+    }
+}
+
+/// One view in both programs: what the page sets, and what `isolume render` is told.
+struct View {
+    name: &'static str,
+    page: String,
+    render: Vec<String>,
+}
+
+/// Compares views of the bake in `dir`, and returns everything else that the page posted.
+fn compare(dir: &Path, program: &Path, views: &[View], driver: &str) -> Vec<(String, Vec<u8>)> {
+    isolume(dir, &["view", "out.vti", "-o", "page.html", "-q"]);
+    let page = fs::read_to_string(dir.join("page.html")).unwrap();
+    let pictures: Vec<Bytes> = views
+        .iter()
+        .map(|v| Bytes::render(dir, &v.render.iter().map(String::as_str).collect::<Vec<_>>()))
+        .collect();
+    let mut script = String::new();
+    for (view, picture) in views.iter().zip(&pictures) {
+        let [w, h] = picture.size;
+        script += &format!("isolume.set({}); await post('{}', isolume.pixels({w}, {h}));\n", view.page, view.name);
+    }
+    let posted = browser::drive(program, &page, &(script + driver), 240);
+    let errors: Vec<_> = posted.iter().filter(|(n, _)| n == "error").map(|(_, b)| String::from_utf8_lossy(b)).collect();
+    assert!(errors.is_empty(), "the page says: {errors:?}");
+    for (view, picture) in views.iter().zip(&pictures) {
+        let (_, bytes) = posted.iter().find(|(n, _)| n == view.name).expect("every view is posted");
+        let shown = Bytes::posted(picture.size, bytes);
+        let (mean, beyond, share) = picture.differences(&shown);
+        println!("{}: mean {:.2} %, {:.2} % of pixels beyond 2 %, {:.0} % compared", view.name, 100.0 * mean, 100.0 * beyond, 100.0 * share);
+        if let Some(folder) = std::env::var_os("ISOLUME_VIEW_PICTURES") {
+            for (p, kind) in [(picture, "render"), (&shown, "page")] {
+                let linear = p.rgb.iter().map(|c| c.map(|b| isolume::export::picture::srgb_decode(f32::from(b) / 255.0)));
+                let picture = isolume::export::picture::Picture { width: p.size[0], height: p.size[1], rgb: linear.collect() };
+                picture.write_png(Path::new(&folder).join(format!("{}-{kind}.png", view.name)), 1.0).unwrap();
+            }
+        }
+        assert!(share > 0.6 && mean < 0.02 && beyond < 0.02, "{}", view.name);
+    }
+    posted
+}
+
+fn words(text: &str) -> Vec<String> {
+    text.split_whitespace().map(str::to_owned).collect()
+}
+
+fn chromium() -> Option<std::path::PathBuf> {
+    let found = browser::find();
+    if found.is_none() {
+        println!("skipped: no Chromium on the path or in ISOLUME_CHROMIUM");
+    }
+    found
+}
+
+#[test]
+fn the_browser_shows_what_render_draws() {
+    let Some(program) = chromium() else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    bake_bumps(dir, "41", &[]);
+    // The unit cube: half a diagonal is √3/2; the eye stands 1.8737 from the centre.
+    let (azimuth, elevation) = (30f64.to_radians(), 20f64.to_radians());
+    let forward = DVec3::new(azimuth.sin() * elevation.cos(), azimuth.cos() * elevation.cos(), -elevation.sin());
+    let eye = DVec3::splat(0.5) - forward * (0.5 + 0.5 / 20f64.to_radians().tan());
+    let unit = |v: f64| (v - 3.6) / (95.0 - 3.6);
+    let view = |name, page: String, render: &str| View { name, page, render: words(render) };
+    let views = [
+        view("at-47", format!("{{ iso: {} }}", unit(47.0)), "--isovalue 47"),
+        view("at-20", format!("{{ iso: {} }}", unit(20.0)), "--isovalue 20"),
+        view("local", format!("{{ iso: {}, shading: 'local' }}", unit(47.0)), "--isovalue 47 --local"),
+        view(
+            "turned",
+            format!("{{ iso: {}, shading: 'global', azimuth: 30, elevation: 20 }}", unit(47.0)),
+            &format!("--isovalue 47 --eye {},{},{}", eye.x, eye.y, eye.z),
+        ),
+        view(
+            "exposed",
+            format!("{{ iso: {}, azimuth: 0, elevation: 0, exposure: 0.5 }}", unit(47.0)),
+            "--isovalue 47 --exposure 0.5",
+        ),
+    ];
+    let driver = "
+        isolume.set({ exposure: 1, tint: [1, 1, 1], clip: '', iso: 0.4 });
+        await post('before', isolume.pixels(240, 240));
+        const slide = (id, value) => { const e = document.getElementById(id); e.value = value; e.dispatchEvent(new Event('input', { bubbles: true })); };
+        slide('isovalue', 0.6);
+        await post('after', isolume.pixels(240, 240));
+        slide('tint', '#ff0000');
+        await post('red', isolume.pixels(240, 240));
+        isolume.set({ tint: [1, 1, 1], clip: 'y', cut: 0.45 });
+        await post('clipped', isolume.pixels(240, 240));
+        isolume.set({ clip: '', walls: false });
+        await post('bare', isolume.pixels(240, 240));
+        const key = (k) => document.getElementById('view').dispatchEvent(new KeyboardEvent('keydown', { key: k, bubbles: true }));
+        const states = [];
+        for (const k of [']', 'ArrowLeft', 'ArrowUp', '+', 'g', 'w', 'c', 'h', 'r']) { key(k); states.push(JSON.stringify(isolume.state)); }
+        await post('keys', JSON.stringify(states));
+        await post('milliseconds', String(isolume.time(5, 640, 480)));
+        dispatchEvent(new Event('resize'));
+        await new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)));
+    ";
+    let posted = compare(dir, &program, &views, driver);
+    let get = |name: &str| &posted.iter().find(|(n, _)| n == name).expect("posted").1;
+    let changed = |a: &[u8], b: &[u8]| a.chunks(4).zip(b.chunks(4)).filter(|(p, q)| p != q).count() as f64 / (a.len() / 4) as f64;
+    assert!(changed(get("before"), get("after")) > 0.1, "the slider changes the picture");
+    assert!(get("red").chunks(4).all(|p| p[1] == 0 && p[2] == 0) && get("red").chunks(4).any(|p| p[0] > 50), "a red light");
+    assert!(changed(get("after"), get("clipped")) > 0.02, "the plane cuts");
+    assert!(get("bare").chunks(4).filter(|p| p[..3] == [0, 0, 0]).count() > 240 * 240 / 10, "no walls");
+    let states: Vec<String> = serde_json::from_slice(get("keys")).unwrap();
+    // Every key changes the state but h, which shows the help, and r, which restores the first one.
+    assert!(states.windows(2).enumerate().all(|(i, w)| (w[0] != w[1]) == (i != 6)), "{states:?}");
+    let first: serde_json::Value = serde_json::from_str(states.last().unwrap()).unwrap();
+    assert_eq!((first["iso"].as_f64(), first["zoom"].as_f64()), (Some(0.5), Some(1.0)));
+    println!("{} ms per frame of 640×480", String::from_utf8_lossy(get("milliseconds")));
+}
+
+/// Anisotropic, oblique and flipped axes, closed by caps inside a box with a margin, both sides stored, far from the
+/// origin: all that could be mixed up.
+#[test]
+fn axes_caps_and_sides_are_where_render_has_them() {
+    let Some(program) = chromium() else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let dims = [25, 17, 33];
+    let axes = DMat3::from_cols(DVec3::new(0.0, 0.2, -1.0), DVec3::new(2.0, 0.0, 0.3), DVec3::new(0.1, -0.9, 0.0));
+    let lattice = Lattice::new(dims, DVec3::new(1000.0, -2000.0, 500.0), axes).unwrap();
+    let samples = (0..lattice.len()).map(|o| {
+        let p = DVec3::from_array(lattice.ijk(o).map(|i| i as f64)) / DVec3::new(24.0, 16.0, 32.0);
+        let bump = |m: DVec3, s: f64| (-(p - m).length_squared() / (2.0 * s * s)).exp();
+        (100.0 * bump(DVec3::new(0.6, 0.15, 0.5), 0.2) + 80.0 * bump(DVec3::new(0.3, 0.7, 0.3), 0.12)) as f32
+    });
+    Volume::new("skew", lattice.clone(), Samples::F32(samples.collect())).unwrap().write(dir.join("b.nrrd")).unwrap();
+    let bake = ["bake", "b.nrrd", "--isovalues", "5", "90", "-o", "out.vti", "--box", "cornell", "--margin", "0.1"];
+    isolume(dir, &[&bake[..], &QUICK, &["--boundary", "capped", "--sides", "both", "--outside", "higher"]].concat());
+    let view = |name, shading: &str, extra: &str| View {
+        name,
+        page: format!("{{ iso: {}, shading: '{shading}' }}", (40.0 - 5.0) / 85.0),
+        render: words(&format!("--isovalue 40 {extra}")),
+    };
+    let views = [view("skew", "global", ""), view("skew-local", "local", "--local")];
+    compare(dir, &program, &views, "");
+}
+
+#[test]
+fn a_file_needs_no_server_and_writes_nothing_to_the_console() {
+    let Some(program) = chromium() else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    bake_bumps(dir, "21", &[]);
+    isolume(dir, &["view", "out.vti", "-o", "page.html", "-q"]);
+    let address = format!("file://{}#isovalue=47&azimuth=20", dir.join("page.html").display());
+    let output = browser::command(&program, &dir.join("profile"))
+        .args(["--window-size=800,600", "--virtual-time-budget=20000", "--run-all-compositor-stages-before-draw"])
+        .arg(format!("--screenshot={}", dir.join("shot.png").display()))
+        .arg(address)
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    let console: Vec<&str> = said.lines().filter(|l| l.contains("CONSOLE")).collect();
+    assert!(console.is_empty(), "{console:?}");
+    let file = fs::File::open(dir.join("shot.png")).unwrap();
+    let mut reader = png::Decoder::new(std::io::BufReader::new(file)).read_info().unwrap();
+    let mut bytes = vec![0; reader.output_buffer_size().unwrap()];
+    reader.next_frame(&mut bytes).unwrap();
+    assert!(bytes.iter().filter(|b| **b > 60).count() > bytes.len() / 10, "the screenshot is not dark");
+}
+
+#[test]
+fn pages_are_a_function_of_the_bake() {
+    let dir = tempfile::tempdir().unwrap();
+    let baked = bake_bumps(dir.path(), "13", &[]);
+    let [a, b] = [0, 1].map(|_| Payload::new(&baked, "t").unwrap());
+    assert_eq!((a.description.to_string(), &a.bytes), (b.description.to_string(), &b.bytes));
+}
