@@ -32,13 +32,14 @@ check: deps
 	$(CARGO) clippy --all-targets -- -D warnings
 	export RUSTDOCFLAGS='-D warnings'; $(CARGO) doc --no-deps
 
-# Every reader and writer against the tools people use (PyPI, pinned), and the recipes. PEERS_DATA=folder adds its volumes.
+# Every reader and writer against the tools people use (PyPI, pinned), the recipes, and radiance against Mitsuba 3. PEERS_DATA=folder adds its volumes.
 PEERS = third_party/peers
 PROGRAM = $${CARGO_TARGET_DIR:-target}/release/isolume
 peers: deps $(PEERS)/installed
 	$(CARGO) build --release
 	$(PEERS)/bin/python scripts/peers/formats.py $(PROGRAM) $(PEERS_DATA)
 	$(PEERS)/bin/python scripts/peers/recipes.py $(PROGRAM) docs/recipes.md
+	$(PEERS)/bin/python scripts/peers/mitsuba3.py $(PROGRAM) $(PEERS)/mitsuba3
 
 $(PEERS)/installed: scripts/peers/requirements.txt
 	python3 -m venv $(PEERS)
