@@ -1,6 +1,6 @@
 # isolume is a plain cargo package; this file gets its two native libraries and names the common errands.
 
-.PHONY: all deps demo test check bench doc clean distclean
+.PHONY: all deps demo test check peers bench doc clean distclean
 
 # `make deps` writes third_party/env.sh only if libclang had to be unpacked there.
 CARGO = if [ -f third_party/env.sh ]; then . third_party/env.sh; fi; cargo
@@ -31,6 +31,20 @@ check: deps
 	cargo fmt --check
 	$(CARGO) clippy --all-targets -- -D warnings
 	export RUSTDOCFLAGS='-D warnings'; $(CARGO) doc --no-deps
+
+# Every reader and writer against the tools people use (PyPI, pinned), the recipes, and radiance against Mitsuba 3. PEERS_DATA=folder adds its volumes.
+PEERS = third_party/peers
+PROGRAM = $${CARGO_TARGET_DIR:-target}/release/isolume
+peers: deps $(PEERS)/installed
+	$(CARGO) build --release
+	$(PEERS)/bin/python scripts/peers/formats.py $(PROGRAM) $(PEERS_DATA)
+	$(PEERS)/bin/python scripts/peers/recipes.py $(PROGRAM) docs/recipes.md
+	$(PEERS)/bin/python scripts/peers/mitsuba3.py $(PROGRAM) $(PEERS)/mitsuba3
+
+$(PEERS)/installed: scripts/peers/requirements.txt
+	python3 -m venv $(PEERS)
+	$(PEERS)/bin/pip install --quiet --requirement $<
+	@touch $@
 
 bench: deps
 	$(CARGO) bench

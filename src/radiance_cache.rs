@@ -241,29 +241,46 @@ fn fill_flat<T: Tracer>(
 }
 
 /// Irradiance of photons that were reflected before, per texel: a histogram over (u, v, c), smoothed by a 2D kernel × a
-/// 1D kernel in c that keeps flux, twice: what the first smoothing took away is smoothed and put back, so that the bias
-/// left is of fourth order in the kernel's width. \[Tukey77\]
+/// 1D kernel in c that keep flux and shrink with more photons; twice: what the first smoothing took away is smoothed and
+/// put back, so that the bias left is of fourth order in their width. \[Tukey77\]
 #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
 fn flat_irradiance(flat: &flat::Flat, number: usize, dims: [usize; 3], photons: &[FlatPhoton]) -> Vec<[f32; 3]> {
     let mut bins = FlatTexture::black(dims);
     let mut power = vec![DVec3::ZERO; bins.texels.len()];
+    let mut count = 0u64;
     for p in photons.iter().filter(|p| p.flat as usize == number && p.bounces > 0) {
         power[bins.texel(p.uvc)] += p.power.as_dvec3();
+        count += 1;
     }
     let texel = flat.area() / (dims[0] * dims[1]) as f64 / dims[2] as f64;
     let image: Vec<DVec3> = power.into_iter().map(|p| p / texel).collect();
-    let once = smooth(image.clone(), dims);
-    let lost = smooth(image.iter().zip(&once).map(|(i, s)| *i - *s).collect(), dims);
+    let passes = passes(count as f64 / image.len() as f64);
+    let once = smooth(image.clone(), dims, passes);
+    let lost = smooth(image.iter().zip(&once).map(|(i, s)| *i - *s).collect(), dims, passes);
     // Not clamped at 0: that would brighten what few photons reach.
     let twice = once.iter().zip(&lost).map(|(s, l)| *s + *l);
     bins.texels.iter_mut().zip(twice).for_each(|(t, e)| *t = e.as_vec3().to_array());
     bins.texels
 }
 
-/// Three passes of ¼ ½ ¼ along each axis.
-fn smooth(mut image: Vec<DVec3>, dims: [usize; 3]) -> Vec<DVec3> {
-    for _ in 0..3 {
-        for axis in 0..3 {
+/// Photons that a texel's kernel should hold: about 3 % of noise after twicing.
+const PHOTONS_PER_KERNEL: f64 = 2000.0;
+
+/// Passes of ¼ ½ ¼ along u, v and c for so many photons per texel: a kernel that shrinks as they grow. It is (2√π σ)³
+/// texels worth with σ² of half the passes; c gets half of them, since there are fewer texels along it.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
+fn passes(photons_per_texel: f64) -> [usize; 3] {
+    let texels = PHOTONS_PER_KERNEL / photons_per_texel.max(1e-9);
+    let sigma = (texels * 2f64.sqrt()).cbrt() / (2.0 * std::f64::consts::PI.sqrt());
+    let along = 2.0 * sigma * sigma;
+    let n = |x: f64, most: f64| x.round().clamp(1.0, most) as usize;
+    [n(along, 16.0), n(along, 16.0), n(0.5 * along, 8.0)]
+}
+
+/// Passes of ¼ ½ ¼ along each axis.
+fn smooth(mut image: Vec<DVec3>, dims: [usize; 3], passes: [usize; 3]) -> Vec<DVec3> {
+    for axis in 0..3 {
+        for _ in 0..passes[axis] {
             image = smooth_along(&image, dims, axis);
         }
     }
@@ -275,6 +292,8 @@ fn smooth_along(image: &[DVec3], dims: [usize; 3], axis: usize) -> Vec<DVec3> {
     let stride = [1, dims[0], dims[0] * dims[1]][axis];
     let n = dims[axis];
     (0..image.len())
+        .into_par_iter()
+        .with_min_len(4096)
         .map(|i| {
             let at = i / stride % n;
             let before = if at > 0 { image[i - stride] } else { image[i] };

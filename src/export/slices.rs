@@ -16,7 +16,7 @@ use std::path::Path;
 /// with the channels `R`, `G`, `B` for three components and `Y` for one. Row j of a layer is sample j: the first row, which
 /// viewers show on top, is the one at the lattice's origin. The values are written as they are.
 ///
-/// The text attributes `isolume:origin` (world position of sample (0, 0, 0)) and `isolume:axes` (the three steps, one axis after
+/// Each layer's text attributes `isolume:origin` (world position of sample (0, 0, 0)) and `isolume:axes` (the three steps, one axis after
 /// the other) place the pixels.
 ///
 /// # Errors
@@ -33,26 +33,22 @@ pub fn write(path: &Path, lattice: &Lattice, components: usize, values: SamplesR
     let numbers = |v: &[f64]| v.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
     let encoding =
         Encoding { compression: Compression::ZIP16, blocks: Blocks::ScanLines, line_order: LineOrder::Increasing };
+    let places = [("origin", lattice.origin().to_array().to_vec()), ("axes", lattice.axes().to_cols_array().to_vec())];
     let layers: Vec<_> = (0..nz)
         .map(|k| {
             let channels = names.iter().enumerate().map(|(c, name)| {
                 let slice = (0..nx * ny).map(|i| values.get_f32((k * nx * ny + i) * components + c)).collect();
                 AnyChannel::new(*name, FlatSamples::F32(slice))
             });
-            Layer::new(
-                (nx, ny),
-                LayerAttributes::named(&*format!("z{k:04}")),
-                encoding,
-                AnyChannels::sort(channels.collect()),
-            )
+            let mut attributes = LayerAttributes::named(&*format!("z{k:04}"));
+            for (name, value) in &places {
+                let name = text(&format!("isolume:{name}"));
+                attributes.other.insert(name, AttributeValue::Text(text(&numbers(value))));
+            }
+            Layer::new((nx, ny), attributes, encoding, AnyChannels::sort(channels.collect()))
         })
         .collect();
-    let mut attributes = ImageAttributes::new(IntegerBounds::from_dimensions((nx, ny)));
-    for (name, value) in
-        [("origin", lattice.origin().to_array().to_vec()), ("axes", lattice.axes().to_cols_array().to_vec())]
-    {
-        attributes.other.insert(text(&format!("isolume:{name}")), AttributeValue::Text(text(&numbers(&value))));
-    }
+    let attributes = ImageAttributes::new(IntegerBounds::from_dimensions((nx, ny)));
     let mut file = AtomicFile::create(path)?;
     // On this thread: the crate would start a thread pool of its own beside rayon's.
     let image = Image::from_layers(attributes, layers);

@@ -6,7 +6,7 @@ use crate::volume::{ElementType, Endian, Lattice, Samples, Volume, ascii};
 use glam::DVec3;
 use std::path::Path;
 
-/// Reads the first one-component scalars of the point data, or else the first one-component array of its `FIELD` data.
+/// Reads the first one-component scalars of the point data (unsigned char ones may be called `COLOR_SCALARS`), or else the first one-component array of its `FIELD` data.
 ///
 /// `ASPECT_RATIO`, the keyword of version 1, means the same as `SPACING`; a missing spacing is 1. `long` has 64 bits.
 ///
@@ -192,9 +192,17 @@ fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
                 let entries = components(&words, 2)?.saturating_mul(4);
                 cursor.array(word(1)?, if cursor.binary { "unsigned_char" } else { "float" }, entries)?;
             }
+            // VTK's writer calls unsigned char scalars so: bytes, or text in units of 255.
             "COLOR_SCALARS" => {
                 let n = components(&words, 2)?;
-                cursor.array(word(1)?, if cursor.binary { "unsigned_char" } else { "float" }, count(n)?)?;
+                let array = cursor.array(word(1)?, if cursor.binary { "unsigned_char" } else { "float" }, count(n)?)?;
+                if n == 1 {
+                    let samples = match cursor.samples(&array)? {
+                        Samples::F32(v) => Samples::U8(v.into_iter().map(|v| (v * 255.0).round() as u8).collect()),
+                        samples => samples,
+                    };
+                    return Ok((lattice, samples));
+                }
             }
             "VECTORS" | "NORMALS" => drop(cursor.array(word(1)?, word(2)?, count(3)?)?),
             "TENSORS" => drop(cursor.array(word(1)?, word(2)?, count(9)?)?),
@@ -300,6 +308,15 @@ mod tests {
             let field = format!("{head}FIELD FieldData 2\nv 3 12 short\n{}\nh 1 12 {kind}\n", "ab".repeat(36));
             ok(&[field.as_bytes(), &data, b"\nMETADATA\nINFORMATION 0\n\n"].concat(), element);
         }
+    }
+
+    #[test]
+    fn unsigned_char_scalars_as_vtk_writes_them() {
+        let head = HEAD.replace("ASCII", "BINARY");
+        let bytes: Vec<u8> = (0..12).collect();
+        ok(&[format!("{head}COLOR_SCALARS s 1\n").as_bytes(), &bytes, b"\n"].concat(), ElementType::U8);
+        let text: String = (0..12).map(|i| format!("{:.6} ", f64::from(i) / 255.0)).collect();
+        ok(format!("{HEAD}COLOR_SCALARS s 1\n{text}\n").as_bytes(), ElementType::U8);
     }
 
     #[test]
