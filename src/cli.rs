@@ -1,10 +1,12 @@
 //! The command line: verbs, flags, and what they print. No physics here.
 
 mod compare;
+mod documentation;
 mod export;
 mod extract;
 mod flatland;
 mod generate;
+mod init;
 mod reference;
 mod study;
 mod view;
@@ -33,9 +35,13 @@ Examples:
   isolume info head.nii.gz                               what a volume holds, and a suggested sweep
   isolume bake head.nii.gz --isovalues 15 200 -o head.vti   illuminate every isosurface from 15 to 200
   isolume render head.vti --isovalue 80 -o head.png      a picture of one of them
+  isolume view head.vti -o head.html                     a web page with a slider over all of them
   isolume extract head.vti --isovalue 80 -o head.ply     the same as a mesh with its light
   isolume export head.vti --array rgb -o head.nrrd       the light as a volume for 3D Slicer; .npy for Python
   isolume generate bumps -o bumps.vti                    a volume to play with
+  isolume init head.nii.gz -o head.toml                  a scene file to edit: material, box, quality
+
+`isolume help VERB` shows the verb's flags and more examples.
 
 Exit codes: 0 done, 1 failed, 2 wrong usage or input, 130 interrupted."
 )]
@@ -55,6 +61,8 @@ pub struct Cli {
 enum Verb {
     /// Print what a volume holds: lattice, type, range, percentiles, histogram, a suggested sweep
     Info(Info),
+    /// Write a commented scene file for a volume, with a suggested sweep
+    Init(init::Init),
     /// Make a volume from a formula, or simulate one
     Generate(generate::Generate),
     /// Illuminate every isosurface of a volume or scene and write one file that holds both
@@ -75,9 +83,20 @@ enum Verb {
     Flatland(flatland::Flatland),
     /// Measure: tables and plots
     Study(study::Study),
+    /// Print completions for a shell
+    Completions(documentation::Completions),
+    /// Write manual pages, one per verb
+    Man(documentation::ManualPages),
 }
 
 #[derive(clap::Args, Debug)]
+#[command(after_help = "\
+The suggested sweep leaves out background and noise; it is what `bake` takes if it is told nothing else.
+
+Examples:
+  isolume info head.nii.gz
+  isolume info head.nii.gz --json                        the same for scripts
+  isolume info scan.raw --raw-dims 305,224,14 --raw-type u8")]
 struct Info {
     /// Volume: NIfTI, NRRD, MetaImage, MRC/CCP4, cube, VTK, NumPy, TIFF stack, or a headerless file with --raw-dims
     file: PathBuf,
@@ -106,6 +125,9 @@ struct Bake {
     /// Write seconds, rays, counts and settings as JSON
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
+    /// Print the same JSON
+    #[arg(long)]
+    json: bool,
     #[command(flatten)]
     scene: SceneOptions,
     #[command(flatten)]
@@ -113,6 +135,16 @@ struct Bake {
 }
 
 #[derive(clap::Args, Debug)]
+#[command(after_help = "\
+The picture holds the walls too. A .png is exposed so that a surface at the box's centre that faces the luminaire is white; an
+.exr holds linear radiance and every setting. Parts of the surface that show their inside are black unless the bake stored it
+(--sides both).
+
+Examples:
+  isolume render lit.vti --isovalue 80 -o lit.png
+  isolume render lit.vti --isovalue 80 -o local.png --local            the same view as other tools would light it
+  isolume render lit.vti --isovalue 80 -o side.exr --eye 90,-300,120 --target 90,108,90
+  isolume render lit.vti --isovalue 80 -o truth.png --reference --samples 256")]
 struct Render {
     /// A bake (.vti); with --reference or --local also a volume or scene file
     file: PathBuf,
@@ -181,6 +213,7 @@ impl Cli {
         let progress = if self.quiet { Progress::Quiet } else { Progress::Shown };
         match self.verb {
             Verb::Info(v) => v.run(),
+            Verb::Init(v) => v.run(progress),
             Verb::Generate(v) => v.run(progress),
             Verb::Bake(v) => v.run(progress),
             Verb::Render(v) => v.run(progress),
@@ -191,6 +224,8 @@ impl Cli {
             Verb::Compare(v) => v.run(progress),
             Verb::Flatland(v) => v.run(progress),
             Verb::Study(v) => v.run(progress),
+            Verb::Completions(v) => v.run(),
+            Verb::Man(v) => v.run(progress),
         }
     }
 }
@@ -277,6 +312,9 @@ impl Bake {
             let mut file = crate::atomic::AtomicFile::create(path)?;
             serde_json::to_writer_pretty(&mut file, &result.report).map_err(|e| Error::io(path, e.into()))?;
             file.commit()?;
+        }
+        if self.json {
+            println!("{}", serde_json::to_string_pretty(&result.report).expect("the report is plain data"));
         }
         if progress == Progress::Shown {
             let r = &result.report;

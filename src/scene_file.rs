@@ -1,5 +1,9 @@
 //! Scene files (TOML), and how a volume, a scene file and flags become a [`Scene`].
 
+mod fault;
+
+pub use fault::fault;
+
 use crate::bake::BakeOptions;
 use crate::error::{Error, Result};
 use crate::field::{Field, Sweep};
@@ -256,11 +260,7 @@ impl Source {
     }
 
     fn parse(&self) -> Result<SceneFile> {
-        toml::from_str(&self.text).map_err(|e| {
-            let before = e.span().map_or(0, |s| s.start.min(self.text.len()));
-            let line = self.text[..before].matches('\n').count() + 1;
-            Error::Invalid(format!("{}:{line}: {}", self.path.display(), e.message().replace('\n', " ")))
-        })
+        toml::from_str(&self.text).map_err(|e| fault(&self.path, &self.text, &e))
     }
 
     /// `error` as the fault of `key`, at the line where it stands.
@@ -398,7 +398,11 @@ mod tests {
     #[test]
     fn errors_name_file_line_and_key() {
         let e = error_of("[volume]\ngenerator = \"bumps\"\ncolour = 3\n");
-        assert!(e.contains("scene.toml:3:") && e.contains("colour") && !e.contains('\n'), "{e}");
+        assert!(e.contains("scene.toml:3: unknown key `colour` in [volume]; known: file") && !e.contains('\n'), "{e}");
+        let e = error_of("[volume]\ngenerator = \"bumps\"\n[surface]\noutside = \"heigher\"\n");
+        assert!(e.contains("scene.toml:4: unknown value `heigher` in [surface]; did you mean `higher`?"), "{e}");
+        let e = error_of("isovalue = [1, 2]\n[volume]\ngenerator = \"bumps\"\n");
+        assert!(e.contains("scene.toml:1: unknown key `isovalue`; did you mean `isovalues`?"), "{e}");
         let e = error_of("isovalues = [5, 5]\n[volume]\ngenerator = \"bumps\"\nsize = 9\n");
         assert!(e.contains("scene.toml:1: isovalues"), "{e}");
         let e = error_of("[volume]\nfile = \"nowhere.vti\"\n");

@@ -31,6 +31,9 @@ pub(super) struct Extract {
     /// Cut every cell into R³ by trilinear interpolation first, so that the triangles follow the surface more closely
     #[arg(long, default_value_t = 1, value_name = "R")]
     refine: usize,
+    /// Print vertices, triangles and seconds as JSON
+    #[arg(long)]
+    json: bool,
     #[command(flatten)]
     scene: SceneOptions,
 }
@@ -58,7 +61,17 @@ impl Extract {
             None => Vec::new(),
         };
         Mesh { colours: colours.as_deref(), ..mesh.export(&properties) }.write(&self.output)?;
-        if progress == Progress::Shown {
+        if self.json {
+            let numbers = serde_json::json!({
+                "file": self.output,
+                "isovalue": self.isovalue,
+                "vertices": mesh.positions.len(),
+                "triangles": mesh.triangles.len(),
+                "lit": radiance.is_some(),
+                "seconds": begun.elapsed().as_secs_f64(),
+            });
+            println!("{numbers:#}");
+        } else if progress == Progress::Shown {
             eprintln!(
                 "{}: {} vertices, {} triangles in {:.2} s",
                 self.output.display(),

@@ -62,6 +62,9 @@ pub(super) struct ReferenceArgs {
     /// Trace the trilinear surface itself instead of triangles
     #[arg(long)]
     trilinear: bool,
+    /// Print vertices, rays and seconds as JSON
+    #[arg(long)]
+    json: bool,
     #[command(flatten)]
     scene: SceneOptions,
 }
@@ -96,8 +99,19 @@ impl ReferenceArgs {
             compute(&scene, isovalue, self.refine, self.trilinear, &settings, &device()?, progress)?;
         let seconds = begun.elapsed().as_secs_f64();
         result.write(&self.output, &mesh)?;
-        if progress == Progress::Shown {
-            let count = result.sampled.iter().filter(|s| **s).count();
+        let count = result.sampled.iter().filter(|s| **s).count();
+        if self.json {
+            let numbers = serde_json::json!({
+                "file": self.output,
+                "isovalue": self.isovalue,
+                "vertices": mesh.local.len(),
+                "sampled": count,
+                "rays": result.rays,
+                "inside_starts": inside,
+                "seconds": seconds,
+            });
+            println!("{numbers:#}");
+        } else if progress == Progress::Shown {
             eprintln!(
                 "{}: {count} of {} vertices in {seconds:.2} s ({:.0} vertices/s, {:.2} M rays/s), {inside} rays began inside",
                 self.output.display(),

@@ -9,6 +9,11 @@ use crate::study::{self, Subject};
 use std::path::{Path, PathBuf};
 
 #[derive(clap::Args, Debug)]
+#[command(after_help = "\
+Examples:
+  isolume study flatland -o results
+  isolume study strategies scenes/cornell-bumps.toml -o results --quick
+  isolume study curve scenes/cornell-bumps.toml -o results")]
 pub(super) struct Study {
     #[command(subcommand)]
     what: What,
@@ -27,6 +32,10 @@ enum What {
 }
 
 #[derive(clap::Args, Debug)]
+#[command(after_help = "\
+Examples:
+  isolume study flatland -o results
+  isolume study flatland -o results --most 100000        a minute instead of many")]
 struct Flatland {
     /// Folder for study.csv, study.md, study.svg and figure5.png; made if it does not exist
     #[arg(short, long, value_name = "DIR")]

@@ -4,7 +4,7 @@ use super::{FlatScene, HeightField, Segment};
 use crate::error::{Error, Result};
 use crate::field::Sweep;
 use crate::flattened::Side;
-use crate::scene_file::{OutsideName, Rgb};
+use crate::scene_file::{OutsideName, Rgb, fault};
 use glam::{DVec2, DVec3};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
@@ -55,10 +55,7 @@ struct BoxKeys {
 /// `Io`; `Invalid` with file, line and key; what reading the field returns.
 pub fn load(path: &Path) -> Result<FlatScene> {
     let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
-    let file: File = toml::from_str(&text).map_err(|e| {
-        let line = e.span().map_or(1, |s| text[..s.start.min(text.len())].matches('\n').count() + 1);
-        Error::Invalid(format!("{}:{line}: {}", path.display(), e.message().replace('\n', " ")))
-    })?;
+    let file: File = toml::from_str(&text).map_err(|e| fault(path, &text, &e))?;
     build(path, &file).map_err(|e| match e {
         // What is wrong in the field's own file names that file already.
         Error::Invalid(message) if !message.starts_with(&field_name(path, &file)) => Error::invalid(path, message),

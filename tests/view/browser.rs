@@ -42,7 +42,7 @@ pub fn drive(program: &Path, page: &str, driver: &str, seconds: u64) -> Vec<(Str
         for (const kind of ['error', 'warn']) console[kind] = (...all) => post('error', all.join(' '));
     </script>";
     let script = format!(
-        "<script>(async () => {{ await isolume.ready; {driver} }})()\
+        "<script>(async () => {{ {driver} }})()\
          .then(() => post('done', ''), (e) => post('error', String(e)).then(() => post('done', '')));</script></body>"
     );
     let page = page.replacen("<head>", HOOKS, 1).replacen("</body>", &script, 1);

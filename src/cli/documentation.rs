@@ -1,0 +1,69 @@
+//! `isolume completions` and `isolume man`: what the command line says about itself, for shells and readers.
+
+use super::Cli;
+use crate::atomic::AtomicFile;
+use crate::error::{Error, Result};
+use crate::progress::Progress;
+use clap::CommandFactory;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+#[derive(clap::Args, Debug)]
+#[command(after_help = "\
+Examples:
+  isolume completions bash > ~/.local/share/bash-completion/completions/isolume
+  isolume completions zsh > ~/.zfunc/_isolume
+  isolume completions fish > ~/.config/fish/completions/isolume.fish")]
+pub(super) struct Completions {
+    /// The shell
+    shell: clap_complete::Shell,
+}
+
+impl Completions {
+    pub(super) fn run(self) -> Result<()> {
+        let mut script = Vec::new();
+        clap_complete::generate(self.shell, &mut Cli::command(), "isolume", &mut script);
+        // A reader that has seen enough is no failure.
+        match std::io::stdout().write_all(&script) {
+            Err(e) if e.kind() != std::io::ErrorKind::BrokenPipe => Err(Error::io("standard output", e)),
+            _ => Ok(()),
+        }
+    }
+}
+
+#[derive(clap::Args, Debug)]
+#[command(after_help = "\
+Examples:
+  isolume man -o ~/.local/share/man/man1                 then: man isolume-bake")]
+pub(super) struct ManualPages {
+    /// Folder for isolume.1, isolume-bake.1 and so on; made if it does not exist
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+}
+
+impl ManualPages {
+    pub(super) fn run(self, progress: Progress) -> Result<()> {
+        super::folder(&self.output)?;
+        let mut root = Cli::command().name("isolume");
+        root.build();
+        let count = write_pages(&self.output, &root, "isolume")?;
+        if progress == Progress::Shown {
+            eprintln!("{}: {count} manual pages", self.output.display());
+        }
+        Ok(())
+    }
+}
+
+/// The page of `command` and those of its verbs; how many.
+fn write_pages(folder: &Path, command: &clap::Command, name: &str) -> Result<usize> {
+    let path = folder.join(format!("{name}.1"));
+    let mut file = AtomicFile::create(&path)?;
+    let page = clap_mangen::Man::new(command.clone().name(name.to_owned()).bin_name(name.replace('-', " ")));
+    page.render(&mut file).map_err(|e| Error::io(&path, e))?;
+    file.commit()?;
+    let mut count = 1;
+    for verb in command.get_subcommands().filter(|v| v.get_name() != "help") {
+        count += write_pages(folder, verb, &format!("{name}-{}", verb.get_name()))?;
+    }
+    Ok(count)
+}

@@ -1,0 +1,102 @@
+//! `isolume init`: a scene file for a volume, with every key, its default and what it does.
+
+use super::{expect_extension, export};
+use crate::atomic::AtomicFile;
+use crate::error::{Error, Result};
+use crate::progress::Progress;
+use crate::scene_file::RawOptions;
+use crate::volume::statistics::VolumeStatistics;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+#[derive(clap::Args, Debug)]
+#[command(after_help = "\
+Every key of the file is commented; those with a # before them show the default. An existing file is left alone.
+
+Examples:
+  isolume init head.nii.gz                               writes head.toml beside it
+  isolume init head.nii.gz -o scene.toml
+  isolume init scan.raw --raw-dims 305,224,14 -o scan.toml")]
+pub(super) struct Init {
+    /// Volume
+    file: PathBuf,
+    /// Output: .toml (default: the volume's name, beside it)
+    #[arg(short, long, value_name = "FILE")]
+    output: Option<PathBuf>,
+    #[command(flatten)]
+    raw: RawOptions,
+}
+
+impl Init {
+    pub(super) fn run(self, progress: Progress) -> Result<()> {
+        let output = self.output.clone().unwrap_or_else(|| beside(&self.file));
+        expect_extension(&output, &["toml"])?;
+        if output.exists() {
+            return Err(Error::invalid(&output, "exists already; give another name with -o, or remove it first"));
+        }
+        let volume = export::open(&self.file, &self.raw)?;
+        let statistics = VolumeStatistics::of(&volume);
+        let named = relative(&self.file, &output)?;
+        let text = scene_text(&named, &self.raw, &statistics);
+        let mut file = AtomicFile::create(&output)?;
+        file.write_all(text.as_bytes()).map_err(|e| Error::io(&output, e))?;
+        file.commit()?;
+        if progress == Progress::Shown {
+            eprintln!("{}: edit it, then: isolume bake {} -o lit.vti", output.display(), output.display());
+        }
+        Ok(())
+    }
+}
+
+/// `head.nii.gz` to `head.toml`.
+fn beside(volume: &Path) -> PathBuf {
+    let name = volume.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let stem = name.split('.').find(|s| !s.is_empty()).unwrap_or("scene");
+    volume.with_file_name(format!("{stem}.toml"))
+}
+
+/// The volume's path as the scene file must name it, since paths in scene files are relative to them.
+fn relative(volume: &Path, output: &Path) -> Result<PathBuf> {
+    let folder = |p: &Path| p.parent().unwrap_or(Path::new("")).to_path_buf();
+    if folder(volume) == folder(output) {
+        return Ok(volume.file_name().map_or_else(|| volume.to_path_buf(), PathBuf::from));
+    }
+    if folder(output) == Path::new("") {
+        return Ok(volume.to_path_buf());
+    }
+    std::path::absolute(volume).map_err(|e| Error::io(volume, e))
+}
+
+fn scene_text(volume: &Path, raw: &RawOptions, statistics: &VolumeStatistics) -> String {
+    // Debug strings of text without control characters are TOML strings.
+    let quoted = |s: &str| toml::Value::String(s.to_owned()).to_string();
+    let [nx, ny, nz] = statistics.dims;
+    let about = match statistics.range {
+        Some([lo, hi]) => format!("{nx} x {ny} x {nz} samples of type {}, values {lo} to {hi}", statistics.element_type),
+        None => format!("{nx} x {ny} x {nz} samples, none of them finite"),
+    };
+    let sweep = match statistics.sweep {
+        Some([lo, hi]) => format!("isovalues = [{lo:?}, {hi:?}]"),
+        None => "# isovalues = [LO, HI]    # nothing to suggest: the volume holds no isosurface".to_owned(),
+    };
+    let mut layout = String::new();
+    if raw.given() {
+        layout = "\n# The layout of the headerless file.\n[volume.raw]\n".to_owned();
+        let mut key = |name: &str, value: Option<String>| {
+            if let Some(value) = value {
+                layout += &format!("{name} = {value}\n");
+            }
+        };
+        key("dims", raw.dims.as_ref().map(|v| format!("{v:?}")));
+        key("type", raw.element.as_deref().map(quoted));
+        key("endian", raw.endian.as_deref().map(quoted));
+        key("spacing", raw.spacing.as_ref().map(|v| format!("{v:?}")));
+        key("origin", raw.origin.as_ref().map(|v| format!("{v:?}")));
+        key("skip", raw.skip.map(|v| v.to_string()));
+    }
+    include_str!("init/scene.toml")
+        .replace("@about@", &about)
+        .replace("@sweep@", &sweep)
+        .replace("@layout@", &layout)
+        .replace("@file@", &quoted(&volume.to_string_lossy()))
+}
