@@ -85,9 +85,8 @@ impl Payload {
             codec::append_colours(&mut bytes, &grid.radiance, factor);
             codec::append_plane(&mut bytes, grid.mask.iter().map(|&m| if m == Mask::Empty { 0 } else { 255 }));
         }
-        let flats: Vec<Value> = (0..flat::count(scene))
-            .filter_map(|n| describe_flat(baked, &frame, n, factor, &mut bytes))
-            .collect();
+        let flats: Vec<Value> =
+            (0..flat::count(scene)).filter_map(|n| describe_flat(baked, &frame, n, factor, &mut bytes)).collect();
         let axes = lattice.axes();
         let sweep = scene.field.sweep();
         let camera = Camera::facing(scene, 1000);
@@ -135,7 +134,8 @@ fn describe_flat(baked: &BakedVolume, frame: &Frame, n: usize, factor: f32, byte
     let polygon = scene.polygons().get(n);
     let corner = f.at([0.0, 0.0]);
     let (e, g) = (f.at([1.0, 0.0]) - corner, f.at([0.0, 1.0]) - corner);
-    let vertices = polygon.map_or_else(|| vec![corner, corner + e, corner + e + g, corner + g], |p| p.vertices().to_vec());
+    let vertices =
+        polygon.map_or_else(|| vec![corner, corner + e, corner + e + g, corner + g], |p| p.vertices().to_vec());
     // (u, v) = (du · (x − corner), dv · (x − corner)): the dual vectors of two edges that need not be perpendicular.
     let dual = |a: DVec3, b: DVec3| {
         let across = a - b * (a.dot(b) / b.dot(b));

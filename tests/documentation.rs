@@ -81,7 +81,9 @@ fn every_key_of_a_scene_is_described_and_no_other() {
 fn the_defaults_of_bakes_are_the_described_ones() {
     let text = document("docs/scene.md");
     let number = |cell: &str| -> Option<f64> {
-        if let Some(power) = cell.strip_prefix('2').filter(|p| !p.is_empty() && p.chars().all(|c| "⁰¹²³⁴⁵⁶⁷⁸⁹".contains(c))) {
+        if let Some(power) =
+            cell.strip_prefix('2').filter(|p| !p.is_empty() && p.chars().all(|c| "⁰¹²³⁴⁵⁶⁷⁸⁹".contains(c)))
+        {
             let digits = power.chars().map(|c| "⁰¹²³⁴⁵⁶⁷⁸⁹".chars().position(|d| d == c).unwrap());
             return Some(f64::from(digits.fold(0, |n, d| 10 * n + d) as u32).exp2());
         }

@@ -76,7 +76,10 @@ fn completions_and_manual_pages() {
     fs::write(dir.join("c.sh"), script).unwrap();
     let tried = Command::new("bash")
         .current_dir(dir)
-        .args(["-c", "source ./c.sh; COMP_WORDS=(isolume ba); COMP_CWORD=1; _isolume isolume ba isolume; echo ${COMPREPLY[@]}"])
+        .args([
+            "-c",
+            "source ./c.sh; COMP_WORDS=(isolume ba); COMP_CWORD=1; _isolume isolume ba isolume; echo ${COMPREPLY[@]}",
+        ])
         .output()
         .unwrap();
     assert_eq!(String::from_utf8_lossy(&tried.stdout).trim(), "bake", "{}", String::from_utf8_lossy(&tried.stderr));
@@ -107,7 +110,9 @@ fn init_writes_a_scene_whose_comments_are_the_defaults() {
     let text = fs::read_to_string(&path).unwrap();
     let mut keys = 0;
     let open = |l: &str| {
-        let key = l.strip_prefix("# ").filter(|l| l.split(" = ").next().is_some_and(|k| !k.contains(' ')) && l.contains(" = "));
+        let key = l
+            .strip_prefix("# ")
+            .filter(|l| l.split(" = ").next().is_some_and(|k| !k.contains(' ')) && l.contains(" = "));
         keys += usize::from(key.is_some());
         key.unwrap_or(l).to_owned()
     };
@@ -148,7 +153,8 @@ fn results_as_json() {
     assert_eq!(report["settings"], parse(fs::read_to_string(dir.join("r.json")).unwrap())["settings"]);
     let mesh = parse(ok(dir, &["extract", "out.vti", "--isovalue", "47", "-o", "m.ply", "--json"]));
     assert!(mesh["vertices"].as_u64().unwrap() > 50 && mesh["lit"] == true, "{mesh}");
-    let reference = ["reference", "out.vti", "--isovalue", "47", "-o", "ref.ply", "--vertices", "50", "--samples", "16"];
+    let reference =
+        ["reference", "out.vti", "--isovalue", "47", "-o", "ref.ply", "--vertices", "50", "--samples", "16"];
     let reference = parse(ok(dir, &[&reference[..], &["--json"]].concat()));
     assert_eq!((&reference["sampled"], &reference["vertices"]), (&serde_json::json!(50), &mesh["vertices"]));
     assert!(parse(ok(dir, &["compare", "out.vti", "ref.ply", "--json"]))["percent_rms"].is_number());

@@ -58,7 +58,13 @@ fn the_page_holds_the_bake_and_nothing_from_elsewhere() {
     let n = baked.lattice().len();
     let plane = |offset: usize| {
         let mut last = 0u8;
-        bytes[offset..offset + n].iter().map(|d| { last = last.wrapping_add(*d); last }).collect::<Vec<_>>()
+        bytes[offset..offset + n]
+            .iter()
+            .map(|d| {
+                last = last.wrapping_add(*d);
+                last
+            })
+            .collect::<Vec<_>>()
     };
     let (mut code, mut worst) = (0u16, 0f64);
     for (i, &s) in baked.scene.field.samples().iter().enumerate() {
@@ -93,7 +99,8 @@ fn the_page_holds_the_bake_and_nothing_from_elsewhere() {
 fn a_bake_too_large_for_a_browser_is_refused_and_volumes_are_no_bakes() {
     let dir = tempfile::tempdir().unwrap();
     isolume(dir.path(), &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
-    for (args, word) in [(["view", "b.vti", "-o", "p.html"], "is no bake"), (["view", "b.vti", "-o", "p.png"], ".html")] {
+    for (args, word) in [(["view", "b.vti", "-o", "p.html"], "is no bake"), (["view", "b.vti", "-o", "p.png"], ".html")]
+    {
         let output = Command::new(env!("CARGO_BIN_EXE_isolume")).current_dir(dir.path()).args(args).output().unwrap();
         assert_eq!(output.status.code(), Some(2));
         assert!(String::from_utf8_lossy(&output.stderr).contains(word));
@@ -137,7 +144,8 @@ impl Bytes {
         for y in 1..h - 1 {
             for x in 1..w - 1 {
                 let at = y * w + x;
-                let edge = |p: &Self| [at - 1, at + 1, at - w, at + w].iter().any(|&n| apart(p.rgb[at], p.rgb[n]) > 0.06);
+                let edge =
+                    |p: &Self| [at - 1, at + 1, at - w, at + w].iter().any(|&n| apart(p.rgb[at], p.rgb[n]) > 0.06);
                 if edge(self) || edge(other) {
                     continue;
                 }
@@ -162,10 +170,8 @@ struct View {
 fn compare(dir: &Path, program: &Path, views: &[View], driver: &str) -> Vec<(String, Vec<u8>)> {
     isolume(dir, &["view", "out.vti", "-o", "page.html", "-q"]);
     let page = fs::read_to_string(dir.join("page.html")).unwrap();
-    let pictures: Vec<Bytes> = views
-        .iter()
-        .map(|v| Bytes::render(dir, &v.render.iter().map(String::as_str).collect::<Vec<_>>()))
-        .collect();
+    let pictures: Vec<Bytes> =
+        views.iter().map(|v| Bytes::render(dir, &v.render.iter().map(String::as_str).collect::<Vec<_>>())).collect();
     let mut script = "await isolume.ready;\n".to_owned();
     for (view, picture) in views.iter().zip(&pictures) {
         let [w, h] = picture.size;
@@ -178,7 +184,13 @@ fn compare(dir: &Path, program: &Path, views: &[View], driver: &str) -> Vec<(Str
         let (_, bytes) = posted.iter().find(|(n, _)| n == view.name).expect("every view is posted");
         let shown = Bytes::posted(picture.size, bytes);
         let (mean, beyond, share) = picture.differences(&shown);
-        println!("{}: mean {:.2} %, {:.2} % of pixels beyond 2 %, {:.0} % compared", view.name, 100.0 * mean, 100.0 * beyond, 100.0 * share);
+        println!(
+            "{}: mean {:.2} %, {:.2} % of pixels beyond 2 %, {:.0} % compared",
+            view.name,
+            100.0 * mean,
+            100.0 * beyond,
+            100.0 * share
+        );
         if let Some(folder) = std::env::var_os("ISOLUME_VIEW_PICTURES") {
             for (p, kind) in [(picture, "render"), (&shown, "page")] {
                 let linear = p.rgb.iter().map(|c| c.map(|b| srgb_decode(f32::from(b) / 255.0)));
@@ -252,9 +264,13 @@ fn the_browser_shows_what_render_draws() {
     ";
     let posted = compare(dir, &program, &views, driver);
     let get = |name: &str| &posted.iter().find(|(n, _)| n == name).expect("posted").1;
-    let changed = |a: &[u8], b: &[u8]| a.chunks(4).zip(b.chunks(4)).filter(|(p, q)| p != q).count() as f64 / (a.len() / 4) as f64;
+    let changed =
+        |a: &[u8], b: &[u8]| a.chunks(4).zip(b.chunks(4)).filter(|(p, q)| p != q).count() as f64 / (a.len() / 4) as f64;
     assert!(changed(get("before"), get("after")) > 0.1, "the slider changes the picture");
-    assert!(get("red").chunks(4).all(|p| p[1] == 0 && p[2] == 0) && get("red").chunks(4).any(|p| p[0] > 50), "a red light");
+    assert!(
+        get("red").chunks(4).all(|p| p[1] == 0 && p[2] == 0) && get("red").chunks(4).any(|p| p[0] > 50),
+        "a red light"
+    );
     assert!(changed(get("after"), get("clipped")) > 0.02, "the plane cuts");
     assert!(get("bare").chunks(4).filter(|p| p[..3] == [0, 0, 0]).count() > 240 * 240 / 10, "no walls");
     let states: Vec<String> = serde_json::from_slice(get("keys")).unwrap();

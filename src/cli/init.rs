@@ -72,7 +72,9 @@ fn scene_text(volume: &Path, raw: &RawOptions, statistics: &VolumeStatistics) ->
     let quoted = |s: &str| toml::Value::String(s.to_owned()).to_string();
     let [nx, ny, nz] = statistics.dims;
     let about = match statistics.range {
-        Some([lo, hi]) => format!("{nx} x {ny} x {nz} samples of type {}, values {lo} to {hi}", statistics.element_type),
+        Some([lo, hi]) => {
+            format!("{nx} x {ny} x {nz} samples of type {}, values {lo} to {hi}", statistics.element_type)
+        }
         None => format!("{nx} x {ny} x {nz} samples, none of them finite"),
     };
     let sweep = match statistics.sweep {

@@ -37,7 +37,11 @@ impl View {
         let bytes = view::write(&self.output, &baked, &title).map_err(|e| e.in_file(&self.file))?;
         if progress == Progress::Shown {
             let [x, y, z] = baked.lattice().dims();
-            eprintln!("{}: {x}×{y}×{z} points in {:.1} MB; open it in a browser", self.output.display(), bytes as f64 / 1e6);
+            eprintln!(
+                "{}: {x}×{y}×{z} points in {:.1} MB; open it in a browser",
+                self.output.display(),
+                bytes as f64 / 1e6
+            );
         }
         Ok(())
     }

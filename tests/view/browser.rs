@@ -7,7 +7,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 /// Chromium, if there is one: `ISOLUME_CHROMIUM`, or by its names on the path.
-pub fn find() -> Option<PathBuf> {
+pub(crate) fn find() -> Option<PathBuf> {
     if let Some(path) = std::env::var_os("ISOLUME_CHROMIUM") {
         return Some(path.into());
     }
@@ -16,10 +16,12 @@ pub fn find() -> Option<PathBuf> {
     std::env::split_paths(&folders).flat_map(|d| names.map(|n| d.join(n))).find(|p| p.is_file())
 }
 
-pub fn command(program: &Path, profile: &Path) -> Command {
+pub(crate) fn command(program: &Path, profile: &Path) -> Command {
     let mut command = Command::new(program);
     command.args(["--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run"]);
-    command.args(["--enable-logging=stderr", "--hide-scrollbars"]).arg(format!("--user-data-dir={}", profile.display()));
+    command
+        .args(["--enable-logging=stderr", "--hide-scrollbars"])
+        .arg(format!("--user-data-dir={}", profile.display()));
     command
 }
 
@@ -34,7 +36,7 @@ impl Drop for Running {
 
 /// Loads `page` with `driver` run after it, and returns what it posts, by name, until it posts `done`. Errors of the page
 /// are posted as `error`.
-pub fn drive(program: &Path, page: &str, driver: &str, seconds: u64) -> Vec<(String, Vec<u8>)> {
+pub(crate) fn drive(program: &Path, page: &str, driver: &str, seconds: u64) -> Vec<(String, Vec<u8>)> {
     const HOOKS: &str = "<head><script>
         const post = (name, body) => fetch('/' + name, { method: 'POST', body });
         addEventListener('error', (e) => post('error', e.message));
