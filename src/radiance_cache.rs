@@ -263,8 +263,8 @@ fn flat_irradiance(flat: &flat::Flat, number: usize, dims: [usize; 3], photons: 
     bins.texels
 }
 
-/// Photons that a texel's kernel should hold: about 3 % of noise after twicing.
-const PHOTONS_PER_KERNEL: f64 = 2000.0;
+/// Photons that a texel's kernel should hold: about 4 % of noise after twicing.
+const PHOTONS_PER_KERNEL: f64 = 1000.0;
 
 /// Passes of ¼ ½ ¼ along u, v and c for so many photons per texel: a kernel that shrinks as they grow. It is (2√π σ)³
 /// texels worth with σ² of half the passes; c gets half of them, since there are fewer texels along it.
