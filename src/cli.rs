@@ -4,6 +4,7 @@ mod compare;
 mod extract;
 mod flatland;
 mod reference;
+mod selftest;
 mod study;
 
 use crate::bake::{BakeOptions, BakeSettings, bake};
@@ -69,6 +70,8 @@ enum Verb {
     Flatland(flatland::Flatland),
     /// Measure: tables and plots
     Study(study::Study),
+    /// Run the hard cases on this machine and print one table
+    Selftest(selftest::SelfTest),
 }
 
 #[derive(clap::Args, Debug)]
@@ -193,6 +196,7 @@ impl Cli {
             Verb::Compare(v) => v.run(progress),
             Verb::Flatland(v) => v.run(progress),
             Verb::Study(v) => v.run(progress),
+            Verb::Selftest(v) => v.run(progress),
         }
     }
 }
