@@ -1,9 +1,11 @@
 //! The main job: from a scene to its illumination grid, by either engine, with counts and seconds.
 
+mod memory;
 mod photon_engine;
 mod settings;
 mod sweep_engine;
 
+pub use memory::MemoryEstimate;
 pub use settings::{BakeOptions, BakeSettings, Engine, Interpolation, Preset, StrategyName};
 
 use crate::checkpoint::{self, Checkpoint};

@@ -5,11 +5,12 @@
 //! process that is killed at any time leaves the last checkpoint intact. Who resumes gets the same bits, since blocks are
 //! either read back whole or computed anew.
 
+use crate::atomic;
 use crate::error::{Error, Result};
 use crate::files;
 use flate2::Crc;
 use std::collections::BTreeMap;
-use std::io::Write;
+use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
@@ -67,17 +68,30 @@ impl Stage<'_> {
 impl Checkpoint {
     /// A new checkpoint, without a file until `every` has passed (or [`Checkpoint::save`] is called). `job` says what
     /// determines the blocks' bits, in lines of `key: value`.
-    pub fn new(path: &Path, job: String, every: Duration) -> Self {
+    ///
+    /// # Errors
+    /// `Invalid` if there is a file at `path` that is no checkpoint: it is not to be overwritten.
+    pub fn new(path: &Path, job: String, every: Duration) -> Result<Self> {
+        if path.exists() {
+            let mut head = Vec::new();
+            let read = files::open(path)?.take(MAGIC.len() as u64).read_to_end(&mut head);
+            read.map_err(|e| Error::io(path, e))?;
+            if head != MAGIC {
+                return Err(Error::invalid(path, "exists and is no checkpoint; give --checkpoint another name"));
+            }
+        }
         let due = Instant::now() + every;
         let state = State { blocks: BTreeMap::new(), dirty: false, due, written: false, warned: false };
-        Self { path: path.to_path_buf(), job, every, state: Mutex::new(state) }
+        Ok(Self { path: path.to_path_buf(), job, every, state: Mutex::new(state) })
     }
 
-    /// Reads the blocks that an interrupted run of the same job left. False if there is no file.
+    /// Reads the blocks that an interrupted run of the same job left. False if there is no file. Half-written files of killed
+    /// runs are removed.
     ///
     /// # Errors
     /// `Io`; `Invalid` if the file is damaged or of another job; the message names the first difference.
     pub fn resume(&self) -> Result<bool> {
+        atomic::remove_orphans(&self.path);
         if !self.path.exists() {
             return Ok(false);
         }
@@ -234,25 +248,29 @@ mod tests {
     fn blocks_come_back_whole_and_only_to_the_same_job() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.checkpoint");
-        let first = Checkpoint::new(&path, job(1), Duration::from_secs(3600));
+        let first = Checkpoint::new(&path, job(1), Duration::from_secs(3600)).unwrap();
         assert!(!first.resume().unwrap(), "there is none yet");
         first.stage(1).save(7, || vec![1, 2, 3]);
         first.stage(2).save(7, || vec![4]);
         assert!(!path.exists(), "not due yet");
         assert!(first.save().unwrap());
-        let again = Checkpoint::new(&path, job(1), Duration::ZERO);
+        let again = Checkpoint::new(&path, job(1), Duration::ZERO).unwrap();
         assert!(again.resume().unwrap());
         assert_eq!(again.stage(1).load(7, 3), Some(vec![1, 2, 3]));
         assert_eq!(
             (again.stage(1).load(7, 4), again.stage(1).load(8, 3), Stage::UNSAVED.load(7, 3)),
             (None, None, None)
         );
-        let message = Checkpoint::new(&path, job(2), Duration::ZERO).resume().unwrap_err().to_string();
+        let message = Checkpoint::new(&path, job(2), Duration::ZERO).unwrap().resume().unwrap_err().to_string();
         assert!(message.contains("photons: 1") && message.contains("photons: 2"), "{message}");
         // Due at once: written with each block.
         again.stage(3).save(0, || vec![9]);
-        let third = Checkpoint::new(&path, job(1), Duration::ZERO);
+        let third = Checkpoint::new(&path, job(1), Duration::ZERO).unwrap();
         assert!(third.resume().unwrap() && third.blocks() == 3);
+        std::fs::write(folder.path().join("data.nrrd"), "precious data that is longer than a magic word").unwrap();
+        let message =
+            Checkpoint::new(&folder.path().join("data.nrrd"), job(1), Duration::ZERO).unwrap_err().to_string();
+        assert!(message.contains("no checkpoint"), "{message}");
         third.remove();
         assert!(!path.exists());
     }
