@@ -13,7 +13,7 @@ Examples:
   isolume selftest --quick
   isolume selftest --json > selftest.json")]
 pub(super) struct SelfTest {
-    /// Seconds instead of a minute or two
+    /// Seconds instead of minutes
     #[arg(long, conflicts_with = "long")]
     quick: bool,
     /// Hours: 10⁹ rays per watertight class, 10⁸ spawned rays

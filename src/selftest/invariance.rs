@@ -8,7 +8,7 @@ use crate::bake::{Bake, BakeOptions, BakeSettings, bake};
 use crate::embree::{Device, GraphTracer};
 use crate::error::Result;
 use crate::field::{Field, Sweep};
-use crate::flattened::{FlattenedHit, FlattenedRay};
+use crate::flattened::{FlattenedHit, FlattenedRay, Target};
 use crate::mask::Mask;
 use crate::progress::Progress;
 use crate::rng::{Rng, Stage};
@@ -201,6 +201,45 @@ pub fn intersections(rays: u64, device: &Device, progress: Progress) -> Result<V
         .collect()
 }
 
+/// Rays that start on edges and corners of the box, where walls meet: under every change they find the wall of the same
+/// name.
+///
+/// # Errors
+/// `Embree`, `Interrupted`.
+pub fn walls(rays: u64, device: &Device, progress: Progress) -> Result<Case> {
+    let base = scene(N, &SAME, true)?;
+    let tracer = GraphTracer::new(device, &base)?;
+    let mut total = Tally::default();
+    for change in &changes() {
+        let other = scene(N, change, true)?;
+        let other_tracer = GraphTracer::new(device, &other)?;
+        let tally = many(progress, "walls", rays, |i| {
+            let mut rng = Rng::stream(7, Stage::Test, i);
+            let last = (N - 1) as f64;
+            let mut p = DVec3::new(rng.unit(), rng.unit(), rng.unit()) * last;
+            p = p.round();
+            let free = (rng.bits() % 4) as usize;
+            (0..3).filter(|&a| a != free).for_each(|a| p[a] = if rng.bits() & 1 == 0 { 0.0 } else { last });
+            let d = warp::sphere(rng.unit2()).as_vec3().as_dvec3();
+            let find = |scene: &Scene, change: &Change, tracer: &GraphTracer| {
+                let x = p * 0.0234375 * change.scale + change.shift;
+                // Above every value: nothing but walls.
+                let origin = scene.lattice().to_index(x).as_vec3();
+                let ray = scene.ray(origin, d, 2.0, crate::flattened::Departure::Free);
+                let name = |h: FlattenedHit| match h.target {
+                    Target::Polygon(id) => scene.polygons()[id as usize].name.clone(),
+                    other => format!("{other:?}"),
+                };
+                tracer.intersect(&ray).map(name)
+            };
+            let (a, b) = (find(&base, &SAME, &tracer), find(&other, change, &other_tracer));
+            Some(if a == b { Ok(0.0) } else { Err(format!("{}: from {p} along {d}: {a:?}, then {b:?}", change.name)) })
+        })?;
+        total = total.join(tally);
+    }
+    Ok(total.case("invariance", "walls from the box's edges and corners", None, "the same wall under every change"))
+}
+
 /// A small bake.
 fn baked(scene: &Scene, seed: u64, device: &Device) -> Result<Bake> {
     let options = BakeOptions {
@@ -248,16 +287,18 @@ pub fn bakes(count: u64, device: &Device, progress: Progress) -> Result<Vec<Case
         }
         Ok(moments)
     };
-    let stage = progress.stage("bakes", changes().len() as u64);
+    let stage = progress.stage("bakes", 1 + changes().len() as u64);
     let first = runs(&base, 100)?;
     let reference = bits(&baked(&base, 1, device)?);
     let changes = changes();
     // Several changes × 8 octants; Student's t with few seeds is wider than a normal, so the level is 1e-3 of that.
-    let limit = student_limit(sidak(1e-3, 8 * changes.len()), 2 * count - 2);
+    let limit = student_limit(sidak(1e-3, 8 * (changes.len() + 1)), 2 * count - 2);
     let mut cases = Vec::new();
-    for (n, change) in changes.iter().enumerate() {
+    // Nothing but other seeds: what the statistic is when nothing can matter.
+    let control = Change { name: "nothing but other seeds", ..SAME };
+    for (n, change) in [control].iter().chain(&changes).enumerate() {
         let other = scene(SIZE, change, true)?;
-        let mut tally = Tally::default();
+        let (mut tally, mut apart) = (Tally::default(), 0f64);
         let h_only = change.exact && change.scale == 1.0 && change.shift == DVec3::ZERO;
         if h_only {
             let same = bits(&baked(&other, 1, device)?) == reference;
@@ -266,11 +307,17 @@ pub fn bakes(count: u64, device: &Device, progress: Progress) -> Result<Vec<Case
             let second = runs(&other, 1000 * (n as u64 + 1))?;
             for (octant, (a, b)) in first.iter().zip(&second).enumerate() {
                 let error = (a.std_error().powi(2) + b.std_error().powi(2)).sqrt();
-                tally.push(octant as u64, Ok((a.mean() - b.mean()).abs() / error));
+                let difference = (a.mean() - b.mean()).abs();
+                apart = apart.max(difference / a.mean());
+                tally.push(octant as u64, Ok(difference / error));
             }
         }
-        let note = if h_only { "every bit of the grid" } else { "standard errors, light per octant" };
-        cases.push(tally.case("bake", change.name, (!h_only).then_some(limit), note));
+        let note = if h_only {
+            "every bit of the grid".to_owned()
+        } else {
+            format!("standard errors, light per octant; at most {:.2} % apart", 100.0 * apart)
+        };
+        cases.push(tally.case("bake", change.name, (!h_only).then_some(limit), &note));
         if !stage.tick(1) {
             break;
         }
@@ -306,6 +353,7 @@ fn bits(bake: &Bake) -> Vec<u32> {
 /// `Embree`, `Interrupted`.
 pub fn cases(trials: &Trials, device: &Device, progress: Progress) -> Result<Vec<Case>> {
     let mut cases = intersections(trials.invariance, device, progress)?;
+    cases.push(walls(trials.invariance / 10, device, progress)?);
     cases.extend(bakes(trials.bakes, device, progress)?);
     Ok(cases)
 }
