@@ -1,10 +1,12 @@
 //! How much memory a bake takes, before it takes it.
 
 use super::{BakeSettings, Engine, StrategyName};
+use crate::embree::{Device, GraphTracer};
 use crate::error::{Error, Result};
 use crate::flat::{self, FlatTexture};
+use crate::flattened::Side;
 use crate::mask::{Mask, masks};
-use crate::photon::{FlatPhoton, SurfacePhoton};
+use crate::photon::{FlatPhoton, PhotonSettings, SurfacePhoton, trace_photons};
 use crate::radiance::RadianceSample;
 use crate::scene::Scene;
 use crate::volume::Volume;
@@ -12,11 +14,8 @@ use crate::volume::Volume;
 /// The program, its libraries and threads.
 const PROGRAM: u64 = 24 << 20;
 
-/// Landings stored per photon: measured 1.7 to 2.2 in the default box.
-const LANDINGS: f64 = 1.9;
-
-/// Share of landings in the largest photon map: one side of the level sets, first landings left out.
-const MAPPED: f64 = 0.25;
+/// Photons traced to learn how often they land.
+const PILOTS: u64 = 1 << 12;
 
 /// Bytes per mapped photon while its map is built, and when it stands.
 const MAPPING: f64 = 76.0;
@@ -36,12 +35,13 @@ pub struct MemoryEstimate {
 }
 
 impl MemoryEstimate {
-    /// The estimate for a scene that is loaded.
+    /// The estimate for a scene that is loaded. A few photons are traced to learn how often they land: in a closed white
+    /// cavity that can be hundreds of times.
     ///
     /// # Errors
-    /// `Invalid` if the grid has too many points.
+    /// `Invalid` if the grid has too many points; `Embree`.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "an estimate of positive numbers")]
-    pub fn new(scene: &Scene, volume: &Volume, settings: &BakeSettings) -> Result<Self> {
+    pub fn new(scene: &Scene, volume: &Volume, settings: &BakeSettings, device: &Device) -> Result<Self> {
         let lattice = settings.grid.lattice(scene.lattice())?;
         let (voxels, points) = (scene.lattice().len() as u64, lattice.len() as u64);
         // On the volume's own lattice: a finer one needs about the same share of its points.
@@ -67,7 +67,7 @@ impl MemoryEstimate {
         let export = grids + flats + points * (4 + 13 * stored) + WRITER.min(points * (5 + 29 * stored) * 2);
         let stages = match settings.engine {
             Engine::Photon => {
-                let landings = settings.photons as f64 * LANDINGS;
+                let [landings, mapped] = landings(scene, settings, device)?;
                 let photon = size_of::<SurfacePhoton>().max(size_of::<FlatPhoton>()) as f64;
                 let photons = (landings * photon) as u64;
                 let gather = settings.gather_rays > 0;
@@ -78,10 +78,10 @@ impl MemoryEstimate {
                     (_, Some(n)) => n,
                     (_, None) => (needed as f64 * settings.samples_per_point) as u64,
                 };
-                let map = if gather { 0 } else { (landings * MAPPED * MAP) as u64 };
+                let map = if gather { 0 } else { (mapped * MAP) as u64 };
                 vec![
                     ("photons", base + photons * 9 / 8),
-                    ("cache", base + photons + (landings * MAPPED * MAPPING) as u64 + nodes + flats * 3),
+                    ("cache", base + photons + (mapped * MAPPING) as u64 + nodes + flats * 3),
                     ("samples", base + photons + map + nodes + flats + samples * per_sample + grids),
                     ("export", base + export),
                 ]
@@ -113,6 +113,22 @@ impl MemoryEstimate {
             size(most)
         )))
     }
+}
+
+/// Landings to be expected of all photons, and those in the largest photon map: one side of the level sets, first landings
+/// left out.
+fn landings(scene: &Scene, settings: &BakeSettings, device: &Device) -> Result<[f64; 2]> {
+    let tracer = GraphTracer::new(device, scene)?;
+    let pilot = PhotonSettings {
+        count: PILOTS.min(settings.photons),
+        max_bounces: settings.bounces,
+        seed: settings.seed,
+        fixed_isovalue: None,
+    };
+    let pilots = trace_photons(scene, &tracer, &pilot, &|_| true);
+    let each = settings.photons as f64 / pilots.emitted.max(1) as f64;
+    let of = |side: Side| pilots.surface.iter().filter(|p| p.side == side && p.bounces > 0).count();
+    Ok([pilots.stored() as f64 * each, of(Side::Lower).max(of(Side::Higher)) as f64 * each])
 }
 
 /// Bytes for people.

@@ -78,7 +78,8 @@ impl Bake {
                 eprintln!("warning: nothing emits light; everything will be black");
             }
         }
-        let memory = MemoryEstimate::new(&loaded.scene, &loaded.volume, &settings)?;
+        let device = device()?;
+        let memory = MemoryEstimate::new(&loaded.scene, &loaded.volume, &settings, &device)?;
         if progress == Progress::Shown || self.dry_run {
             eprintln!("{:>14}  {memory}", "memory");
         }
@@ -89,7 +90,6 @@ impl Bake {
             return Ok(());
         }
         let checkpoint = self.checkpoint(job(&loaded.scene, &settings))?;
-        let device = device()?;
         let work = || -> Result<(crate::bake::Bake, Instant)> {
             let mut result = bake_resumable(&loaded.scene, &settings, &device, progress, Some(&checkpoint))?;
             result.report.seconds.load = load_seconds;
