@@ -1,6 +1,6 @@
 # isolume is a plain cargo package; this file gets its two native libraries and names the common errands.
 
-.PHONY: all deps demo test check peers bench doc clean distclean
+.PHONY: all deps demo test check peers bench fuzz doc clean distclean
 
 # `make deps` writes third_party/env.sh only if libclang had to be unpacked there.
 CARGO = if [ -f third_party/env.sh ]; then . third_party/env.sh; fi; cargo
@@ -48,6 +48,18 @@ $(PEERS)/installed: scripts/peers/requirements.txt
 
 bench: deps
 	$(CARGO) bench
+
+# Every reader for FUZZ_SECONDS; needs the nightly toolchain and `cargo install cargo-fuzz`. Seeds: tests/corpus.
+FUZZ_SECONDS = 60
+FUZZ = nifti:nii nrrd:nrrd vti:vti raw:raw
+
+fuzz: deps
+	@cargo fuzz --version >/dev/null 2>&1 || { echo "make fuzz: needs cargo install cargo-fuzz, and rustup toolchain install nightly"; exit 1; }
+	@if [ -f third_party/env.sh ]; then . third_party/env.sh; fi; for target in $(FUZZ); do \
+	  name=$${target%:*}; seeds=fuzz/corpus/$$name; mkdir -p $$seeds; \
+	  cp tests/corpus/*.$${target#*:} tests/corpus/*.$${target#*:}.gz $$seeds/ 2>/dev/null; \
+	  cargo +nightly fuzz run $$name -- -max_total_time=$(FUZZ_SECONDS) -max_len=65536 -rss_limit_mb=1024 -timeout=10 || exit 1; \
+	done
 
 doc: deps
 	$(CARGO) doc --no-deps

@@ -88,6 +88,24 @@ impl AtomicFile {
     }
 }
 
+/// Removes the temporary files of `path` whose processes are gone; only where the system lists its processes.
+pub(crate) fn remove_orphans(path: &Path) {
+    let processes = Path::new("/proc");
+    let (Some(name), true) = (path.file_name().and_then(|n| n.to_str()), processes.join("self").exists()) else {
+        return;
+    };
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+        let owner = entry.file_name().to_str().and_then(|n| {
+            let middle = n.strip_prefix('.')?.strip_prefix(name)?.strip_prefix('.')?.strip_suffix(".tmp")?;
+            middle.split_once('-').filter(|(_, count)| count.parse::<u32>().is_ok())?.0.parse::<u32>().ok()
+        });
+        if owner.is_some_and(|process| !processes.join(process.to_string()).exists()) {
+            let _ = fs::remove_file(entry.path());
+        }
+    }
+}
+
 impl Write for AtomicFile {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         self.open()?.write(bytes)
@@ -162,6 +180,20 @@ mod tests {
         assert!(message(Path::new("")).contains("no file name"));
         #[cfg(unix)]
         assert!(message(Path::new("/dev/null")).contains("no regular file"));
+    }
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn only_orphans_are_removed() {
+        let folder = tempfile::tempdir().unwrap();
+        // No process has number 0, and ours lives.
+        let ours = format!(".a.bin.{}-3.tmp", std::process::id());
+        for name in [".a.bin.0-1.tmp", &ours, ".a.bin.0-x.tmp", ".b.bin.0-1.tmp", "a.bin"] {
+            fs::write(folder.path().join(name), "x").unwrap();
+        }
+        remove_orphans(&folder.path().join("a.bin"));
+        assert_eq!(entries(folder.path()).len(), 4);
+        assert!(!folder.path().join(".a.bin.0-1.tmp").exists());
     }
 
     #[cfg(unix)]

@@ -1,11 +1,14 @@
 //! The main job: from a scene to its illumination grid, by either engine, with counts and seconds.
 
+mod memory;
 mod photon_engine;
 mod settings;
 mod sweep_engine;
 
+pub use memory::MemoryEstimate;
 pub use settings::{BakeOptions, BakeSettings, Engine, Interpolation, Preset, StrategyName};
 
+use crate::checkpoint::{self, Checkpoint};
 use crate::embree::Device;
 use crate::error::{Error, Result};
 use crate::flat::FlatTexture;
@@ -114,12 +117,32 @@ struct Lit {
     misses: u64,
 }
 
+/// Stages `first` and the next of a checkpoint.
+fn stages(checkpoint: Option<&Checkpoint>, first: u32) -> [checkpoint::Stage<'_>; 2] {
+    [first, first + 1].map(|n| checkpoint.map_or(checkpoint::Stage::UNSAVED, |c| c.stage(n)))
+}
+
 /// Illuminates every isosurface of the sweep.
 ///
 /// # Errors
 /// `Invalid` if no level set of the sweep has a gradient anywhere, `NotSupported` for a scene the engine cannot light,
 /// `Embree`, or `Interrupted`.
 pub fn bake(scene: &Scene, settings: &BakeSettings, device: &Device, progress: Progress) -> Result<Bake> {
+    bake_resumable(scene, settings, device, progress, None)
+}
+
+/// As [`bake`], keeping finished blocks of the long stages (radiance cache, radiance samples) in `checkpoint` and taking
+/// from there what a run of the same [`job`] finished: with the same bits, counts included.
+///
+/// # Errors
+/// As [`bake`].
+pub fn bake_resumable(
+    scene: &Scene,
+    settings: &BakeSettings,
+    device: &Device,
+    progress: Progress,
+    checkpoint: Option<&Checkpoint>,
+) -> Result<Bake> {
     let lattice = settings.grid.lattice(scene.lattice())?;
     let masks = masks(&scene.field, &lattice);
     if masks.iter().all(|&m| m == Mask::Empty) {
@@ -129,9 +152,16 @@ pub fn bake(scene: &Scene, settings: &BakeSettings, device: &Device, progress: P
         ));
     }
     let mut lit = match settings.engine {
-        Engine::Photon => photon_engine::light(scene, settings, &lattice, &masks, device, progress)?,
-        Engine::Sweep => sweep_engine::light(scene, settings, &lattice, &masks, device, progress)?,
+        Engine::Photon => photon_engine::light(scene, settings, &lattice, &masks, device, progress, checkpoint)?,
+        Engine::Sweep => sweep_engine::light(scene, settings, &lattice, &masks, device, progress, checkpoint)?,
     };
+    if lit.sides.iter().all(|(_, grid)| grid.mask.iter().all(|&m| m == Mask::Empty)) {
+        return Err(Error::Invalid(
+            "no grid point lies on or beside an isosurface of the sweep: its values are too close together for this \
+             volume; widen --isovalues, or refine --grid"
+                .into(),
+        ));
+    }
     let mut non_finite = 0;
     for (_, grid) in &mut lit.sides {
         for (rgb, mask) in grid.radiance.iter_mut().zip(&mut grid.mask) {
@@ -165,4 +195,26 @@ pub fn bake(scene: &Scene, settings: &BakeSettings, device: &Device, progress: P
         settings: settings.clone(),
     };
     Ok(Bake { lattice, sides: lit.sides, flats: lit.flats, exposure: scene.exposure(), report })
+}
+
+/// What determines a bake's bits, as lines of `key: value`: for [`Checkpoint::new`].
+pub fn job(scene: &Scene, settings: &BakeSettings) -> String {
+    let mut text = format!("version: {} ({})\n", env!("CARGO_PKG_VERSION"), env!("ISOLUME_COMMIT"));
+    let mut add = |key: &str, value: String| text.push_str(&format!("{key}: {value}\n"));
+    if let Ok(serde_json::Value::Object(settings)) = serde_json::to_value(settings) {
+        settings.iter().for_each(|(key, value)| add(key, value.to_string()));
+    }
+    add("normalisation", format!("{:?}", settings.normalisation));
+    let lattice = scene.lattice();
+    add("lattice", format!("{:?} {:?} {:?}", lattice.dims(), lattice.origin(), lattice.axes()));
+    add("isovalues", format!("{:?}", scene.field.sweep()));
+    let mut crc = flate2::Crc::new();
+    scene.field.samples().iter().for_each(|s| crc.update(&s.to_le_bytes()));
+    add("samples' checksum", format!("{:08x}", crc.sum()));
+    add("surface", format!("{:?}", scene.surface));
+    add("boundary", format!("{:?}", scene.boundary));
+    for p in scene.polygons() {
+        add(&format!("polygon '{}'", p.name), format!("{:?} {} {}", p.vertices(), p.albedo, p.emission));
+    }
+    text
 }

@@ -19,13 +19,23 @@ impl Cell {
         a | b << 1 | d << 2 | e << 3 | f << 4 | g << 5 | h << 6 | i << 7
     }
 
-    /// h at cell-local `p` in [0, 1]³.
+    /// h at cell-local `p` in [0, 1]³; exact at the corners.
     #[inline(always)]
     pub fn value(&self, p: DVec3) -> f64 {
         let s = self.s.map(f64::from);
-        let x = |a: usize| s[a] + p.x * (s[a + 1] - s[a]);
-        let (y0, y1) = (x(0) + p.y * (x(2) - x(0)), x(4) + p.y * (x(6) - x(4)));
-        y0 + p.z * (y1 - y0)
+        let x = |a: usize| lerp(s[a], s[a + 1], p.x);
+        lerp(lerp(x(0), x(2), p.y), lerp(x(4), x(6), p.y), p.z)
+    }
+
+    /// dh/dt at cell-local `p` along `d`. Each difference is weighted by what it counts for there.
+    #[inline(always)]
+    pub fn slope(&self, p: DVec3, d: DVec3) -> f64 {
+        let s = self.s.map(f64::from);
+        let along = |a: usize, b: usize, u: f64, c: usize, v: f64| {
+            let rise = |o: usize| s[o + a] - s[o];
+            lerp(lerp(rise(0), rise(b), u), lerp(rise(c), rise(b + c), u), v)
+        };
+        d.x * along(1, 2, p.y, 4, p.z) + d.y * along(2, 1, p.x, 4, p.z) + d.z * along(4, 1, p.x, 2, p.y)
     }
 
     /// h − c along p + t d as a cubic in t, by 37-operation coefficients: h = P(x,y) + z Q(x,y), each restricted to the
@@ -58,12 +68,15 @@ impl Cell {
         match count {
             0 => false,
             4 => true,
-            _ => {
-                let (f0, f1) = (s00 + u * (s10 - s00), s01 + u * (s11 - s01));
-                f0 + v * (f1 - f0) >= c
-            }
+            _ => lerp(lerp(s00, s10, u), lerp(s01, s11, u), v) >= c,
         }
     }
+}
+
+/// a to b by weights: a corner that does not count (u = 0 or 1) leaves no rounding behind, however large it is.
+#[inline(always)]
+fn lerp(a: f64, b: f64, u: f64) -> f64 {
+    (1.0 - u) * a + u * b
 }
 
 #[cfg(test)]
@@ -112,6 +125,32 @@ mod tests {
                 _ => rng.unit(),
             };
             assert_eq!(a.face_inside(axis, true, c, u, v), b.face_inside(axis, false, c, u, v));
+        }
+    }
+
+    #[test]
+    fn a_huge_corner_far_away_does_not_touch_the_sign() {
+        let cell = Cell { s: [1e30, 0.5, 1e30, 0.25, 1e30, 0.5, -1e30, 0.25] };
+        assert_eq!(cell.value(DVec3::X), 0.5);
+        assert_eq!(cell.value(DVec3::new(1.0, 0.5, 0.25)), 0.375);
+        assert_eq!(cell.slope(DVec3::new(1.0, 0.5, 0.25), DVec3::new(0.0, 2.0, 1.0)), -0.5);
+        // Faces across y and z, at the edges where x = 1.
+        for (v, c, inside) in [(0.0, 0.5, true), (0.0, 0.6, false), (1.0, 0.25, true), (1.0, 0.3, false)] {
+            assert_eq!(cell.face_inside(2, false, c, 1.0, v), inside, "z, {v} {c}");
+        }
+        for (c, inside) in [(0.5, true), (0.6, false)] {
+            assert_eq!(cell.face_inside(1, false, c, 0.5, 1.0), inside, "y, {c}");
+        }
+    }
+
+    #[test]
+    fn the_slope_is_the_cubics() {
+        let mut rng = Rng::stream(1, Stage::Test, 2);
+        for _ in 0..1000 {
+            let cell = random_cell(&mut rng);
+            let p = DVec3::new(rng.unit(), rng.unit(), rng.unit());
+            let d = DVec3::new(rng.unit() - 0.5, rng.unit() - 0.5, rng.unit() - 0.5);
+            assert!((cell.slope(p, d) - cell.cubic(0.4, p, d).c[1]).abs() < 1e-14);
         }
     }
 

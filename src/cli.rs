@@ -1,5 +1,6 @@
 //! The command line: verbs, flags, and what they print. No physics here.
 
+mod bake;
 mod compare;
 mod documentation;
 mod export;
@@ -8,13 +9,13 @@ mod flatland;
 mod generate;
 mod init;
 mod reference;
+mod selftest;
 mod study;
 mod view;
 
-use crate::bake::{BakeOptions, BakeSettings, bake};
 use crate::embree::Device;
 use crate::error::{Error, Result};
-use crate::export::bake_file::{self, BakedVolume};
+use crate::export::bake_file::BakedVolume;
 use crate::progress::{self, Progress};
 use crate::render::{Camera, Rendered, Shading, render};
 use crate::scene_file::{RawOptions, SceneOptions, load};
@@ -66,7 +67,7 @@ enum Verb {
     /// Make a volume from a formula, or simulate one
     Generate(generate::Generate),
     /// Illuminate every isosurface of a volume or scene and write one file that holds both
-    Bake(Bake),
+    Bake(bake::Bake),
     /// Draw an isosurface of a bake inside its box
     Render(Render),
     /// Make a web page of a bake: sweep the isovalue with a slider, turn it with the mouse
@@ -83,6 +84,8 @@ enum Verb {
     Flatland(flatland::Flatland),
     /// Measure: tables and plots
     Study(study::Study),
+    /// Run the hard cases on this machine and print one table
+    Selftest(selftest::SelfTest),
     /// Print completions for a shell
     Completions(documentation::Completions),
     /// Write manual pages, one per verb
@@ -105,33 +108,6 @@ struct Info {
     json: bool,
     #[command(flatten)]
     raw: RawOptions,
-}
-
-#[derive(clap::Args, Debug)]
-#[command(after_help = "\
-The result holds point data `value` (contour on it), `rgb` (colour by it, without lighting and without a colour map),
-`radiance` (linear), `std_error` and `mask`, the walls' light as field data, and every setting.
-
-Examples:
-  isolume bake ch2.nii.gz --isovalues 15 200 -o head.vti --report head.json
-  isolume bake scene.toml -o out.vti --preset preview
-  isolume bake scan.raw --raw-dims 305,224,14 --raw-spacing 0.24,0.24,1 -o scan.vti")]
-struct Bake {
-    /// Volume, or scene file (.toml)
-    input: PathBuf,
-    /// Output: .vti
-    #[arg(short, long, value_name = "FILE")]
-    output: PathBuf,
-    /// Write seconds, rays, counts and settings as JSON
-    #[arg(long, value_name = "FILE")]
-    report: Option<PathBuf>,
-    /// Print the same JSON
-    #[arg(long)]
-    json: bool,
-    #[command(flatten)]
-    scene: SceneOptions,
-    #[command(flatten)]
-    bake: BakeOptions,
 }
 
 #[derive(clap::Args, Debug)]
@@ -224,6 +200,7 @@ impl Cli {
             Verb::Compare(v) => v.run(progress),
             Verb::Flatland(v) => v.run(progress),
             Verb::Study(v) => v.run(progress),
+            Verb::Selftest(v) => v.run(progress),
             Verb::Completions(v) => v.run(),
             Verb::Man(v) => v.run(progress),
         }
@@ -262,81 +239,6 @@ impl Info {
             println!("{}", serde_json::to_string_pretty(&statistics).expect("statistics are plain data"));
         } else {
             print!("{}", statistics.to_text());
-        }
-        Ok(())
-    }
-}
-
-impl Bake {
-    fn run(self, progress: Progress) -> Result<()> {
-        let begun = Instant::now();
-        let found = self.output.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
-        if ["nrrd", "npy", "exr"].contains(&found.as_str()) {
-            return Err(Error::invalid(
-                &self.output,
-                "cannot hold a bake with its walls and settings; bake to a .vti, and `isolume export` writes its arrays",
-            ));
-        }
-        expect_extension(&self.output, &["vti"])?;
-        writable(&self.output)?;
-        if let Some(report) = &self.report {
-            writable(report)?;
-        }
-        let loaded = load(&self.input, &self.scene)?;
-        let load_seconds = begun.elapsed().as_secs_f64();
-        let settings = BakeSettings::new(&self.bake.or(&loaded.bake))?;
-        let sweep = loaded.scene.field.sweep();
-        if progress == Progress::Shown {
-            let [nx, ny, nz] = loaded.volume.lattice.dims();
-            eprintln!(
-                "{}: {nx}×{ny}×{nz}, isovalues {} … {}, {} luminaire(s), {} threads",
-                self.input.display(),
-                sweep.lo(),
-                sweep.hi(),
-                loaded.scene.luminaires().len(),
-                rayon::current_num_threads()
-            );
-            if loaded.scene.luminaires().is_empty() && loaded.scene.surface.emission == DVec3::ZERO {
-                eprintln!("warning: nothing emits light; everything will be black");
-            }
-        }
-        let device = device()?;
-        let mut result = bake(&loaded.scene, &settings, &device, progress)?;
-        result.report.seconds.load = load_seconds;
-        let export = Instant::now();
-        result.report.seconds.total = begun.elapsed().as_secs_f64();
-        bake_file::write(&self.output, &loaded.scene, &loaded.volume, &result)?;
-        result.report.seconds.export = export.elapsed().as_secs_f64();
-        result.report.seconds.total = begun.elapsed().as_secs_f64();
-        if let Some(path) = &self.report {
-            let mut file = crate::atomic::AtomicFile::create(path)?;
-            serde_json::to_writer_pretty(&mut file, &result.report).map_err(|e| Error::io(path, e.into()))?;
-            file.commit()?;
-        }
-        if self.json {
-            println!("{}", serde_json::to_string_pretty(&result.report).expect("the report is plain data"));
-        }
-        if progress == Progress::Shown {
-            let r = &result.report;
-            eprintln!(
-                "{:>14}  {:.2} s: {} rays ({:.1} M/s), {} photons stored, {} samples",
-                "total",
-                r.seconds.total,
-                r.rays,
-                r.rays_per_second / 1e6,
-                r.photons.stored,
-                r.samples
-            );
-            eprintln!(
-                "{:>14}  {} masked ({} filled), {} gather misses, {} without gradient, {} not finite",
-                "counts",
-                r.masked,
-                r.filled,
-                r.misses,
-                r.samples_without_gradient,
-                r.non_finite + r.non_finite_voxels
-            );
-            eprintln!("{:>14}  {}", "written", self.output.display());
         }
         Ok(())
     }

@@ -30,6 +30,8 @@ pub struct Estimate {
     pub variance: f64,
     /// Rays traced.
     pub rays: u64,
+    /// Of them, gather rays that landed where the cache holds nothing.
+    pub misses: u64,
 }
 
 /// Luminance of linear RGB with sRGB's primaries. \[BT.709\]

@@ -24,7 +24,7 @@ pub enum Error {
     #[error("Embree: {0}")]
     Embree(String),
     /// The user interrupted the work.
-    #[error("interrupted; nothing was written")]
+    #[error("interrupted; no output was written")]
     Interrupted,
     /// A check on results failed (`compare`, `selftest`).
     #[error("{0}")]
@@ -60,9 +60,16 @@ impl Error {
         }
     }
 
-    /// The exit code of the command line: 2 for bad usage or input, 130 when interrupted, 1 for the rest.
+    /// The exit code of the command line: 2 for bad usage or input (paths that cannot be read or written among it), 130 when interrupted, 1 for the rest.
     pub fn exit_code(&self) -> u8 {
+        use std::io::ErrorKind as K;
         match self {
+            // Nobody asked for too much: the disk ran out.
+            Error::Io { source, .. }
+                if matches!(source.kind(), K::StorageFull | K::QuotaExceeded | K::FileTooLarge) =>
+            {
+                1
+            }
             Error::Io { .. } | Error::Invalid(_) | Error::NotSupported(_) => 2,
             Error::Interrupted => 130,
             Error::Embree(_) | Error::Failed(_) => 1,

@@ -165,13 +165,14 @@ impl Field {
         [s[0], s[1], s[y], s[y + 1], s[z], s[z + 1], s[z + y], s[z + y + 1]]
     }
 
-    /// h at `p` (trilinear); NaN in a cell that holds no surface.
+    /// h at `p` (trilinear), exact at the nodes; NaN in a cell that holds no surface.
     pub fn value(&self, p: DVec3) -> f64 {
         let (cell, u) = self.locate(p);
         let s = self.corners(cell).map(f64::from);
-        let x = |a: usize| s[a] + u.x * (s[a + 1] - s[a]);
-        let (y0, y1) = (x(0) + u.y * (x(2) - x(0)), x(4) + u.y * (x(6) - x(4)));
-        y0 + u.z * (y1 - y0)
+        // By weights: a corner that does not count leaves no rounding behind, however large it is.
+        let lerp = |a: f64, b: f64, u: f64| (1.0 - u) * a + u * b;
+        let x = |a: usize| lerp(s[a], s[a + 1], u.x);
+        lerp(lerp(x(0), x(2), u.y), lerp(x(4), x(6), u.y), u.z)
     }
 
     /// ∇h at `p` of the trilinear cell, per world unit. Jumps at cell faces: it serves sides and |∇h|, not cosines.

@@ -24,16 +24,17 @@ pub fn gathered_irradiance<T: Tracer>(
     let set = Sobol::set(seed, Stage::Gather, index);
     let mut sum = DVec3::ZERO;
     let mut moments = Moments::default();
+    let mut misses = 0;
     for i in 0..rays {
         let direction = frame.to_world(cosine_hemisphere(set.point2(i, 0)));
         let ray = scene.ray(receiver.position, direction, receiver.isovalue, receiver.departure);
         let radiance = match tracer.intersect(&ray) {
-            Some(hit) => cache.lookup(scene, hit.target, ray.at(hit.t), receiver.isovalue),
+            Some(hit) => cache.lookup(scene, hit.target, ray.at(hit.t), receiver.isovalue, &mut misses),
             None => DVec3::ZERO,
         };
         sum += radiance;
         moments.push(luminance(radiance));
     }
     let n = f64::from(rays.max(1));
-    Estimate { mean: sum * (PI / n), variance: PI * PI * moments.variance() / n, rays: u64::from(rays) }
+    Estimate { mean: sum * (PI / n), variance: PI * PI * moments.variance() / n, rays: u64::from(rays), misses }
 }

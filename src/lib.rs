@@ -16,6 +16,7 @@ pub mod warp;
 pub mod cubic;
 pub mod nearest;
 pub mod progress;
+pub mod checkpoint;
 // Samples, value, gradient, range.
 pub mod volume;
 pub mod field;
@@ -60,5 +61,7 @@ pub mod accuracy;
 pub mod plot;
 pub mod study;
 pub mod flatland;
+// Hard cases, counted.
+pub mod selftest;
 // Verbs.
 pub mod cli;

@@ -167,6 +167,8 @@ fn parametrise(v: &[DVec3], normal: DVec3) -> (DVec3, [DVec3; 2]) {
 pub struct LocalPolygon {
     normal: DVec3,
     offset: f64,
+    /// World slope of a ray per local slope.
+    stretch: f64,
     /// How far behind the plane a start may lie by the rounding of f32 coordinates and still count as on it.
     slack: f64,
     /// Inside is where every edge's plane is not negative: (normal of the edge in the polygon's plane, offset).
@@ -182,7 +184,9 @@ impl LocalPolygon {
         let v: Vec<DVec3> = polygon.vertices.iter().map(|&x| lattice.to_index(x)).collect();
         // The world normal's plane in local coordinates; flipped axes turn the winding, not the plane.
         let axes = lattice.axes();
-        let normal = (axes.transpose() * polygon.normal).normalize();
+        let normal = axes.transpose() * polygon.normal;
+        let stretch = normal.length();
+        let normal = normal / stretch;
         let (mut lo, mut hi) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
         for &p in &v {
             (lo, hi) = (lo.min(p), hi.max(p));
@@ -202,7 +206,7 @@ impl LocalPolygon {
             .collect();
         let reach = lo.abs().max(hi.abs()).max_element().max(1.0);
         let slack = 8.0 * f64::from(f32::EPSILON) * reach;
-        Self { normal, offset: normal.dot(v[0]), slack, edges, lo, hi, opaque_back: polygon.opaque_back }
+        Self { normal, offset: normal.dot(v[0]), stretch, slack, edges, lo, hi, opaque_back: polygon.opaque_back }
     }
 
     /// Bounds in the local frame.
@@ -231,6 +235,15 @@ impl LocalPolygon {
         }
         let p = o + t * d;
         self.edges.iter().all(|&(e, offset)| e.dot(p) >= offset).then_some(t)
+    }
+
+    /// If a ray from `o` along `d` that meets this polygon starts on its plane, within the rounding of f32 coordinates: how
+    /// fast it goes in, in the world. Where several walls meet, a start on their edge lies on all of them, and the one it
+    /// goes into fastest is the one that a ray from beside the edge meets first: the same wall in every frame.
+    #[inline]
+    pub fn starts_on(&self, o: DVec3, d: DVec3) -> Option<f64> {
+        let on = (self.normal.dot(o) - self.offset).abs() <= self.slack;
+        on.then(|| self.stretch * self.normal.dot(d).abs())
     }
 
     /// [`LocalPolygon::intersect`] for a whole ray.

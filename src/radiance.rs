@@ -1,6 +1,7 @@
 //! Radiance samples: direct light by shadow rays, indirect light from the photon map or by final gather. \[BB09 §2.3\]
 
 use crate::brdf::reflected;
+use crate::checkpoint;
 use crate::direct::{Receiver, direct_irradiance, luminance};
 use crate::flattened::{Departure, Side};
 use crate::gather::gathered_irradiance;
@@ -41,9 +42,37 @@ pub struct RadianceSamples {
     pub without_gradient: u64,
     /// Rays traced.
     pub rays: u64,
+    /// Gather rays that landed where the cache holds nothing.
+    pub misses: u64,
+}
+
+impl RadianceSample {
+    /// Bytes of a sample in a checkpoint, without its position.
+    const SAVED: usize = 16;
+}
+
+/// Samples as a block: rays, misses, and radiance and variance of each; a variance of −1 stands for none.
+fn to_block(counts: [u64; 2], samples: &[Option<RadianceSample>]) -> Vec<u8> {
+    let numbers = samples.iter().flat_map(|s| match s {
+        Some(s) => [s.radiance.x, s.radiance.y, s.radiance.z, s.variance],
+        None => [0.0, 0.0, 0.0, -1.0],
+    });
+    counts.into_iter().flat_map(u64::to_le_bytes).chain(numbers.flat_map(f32::to_le_bytes)).collect()
+}
+
+/// The inverse of [`to_block`], for samples at `positions`.
+fn from_block(bytes: &[u8], positions: &[Vec3]) -> ([u64; 2], Vec<Option<RadianceSample>>) {
+    let (counts, numbers) = bytes.split_at(16);
+    let counts = counts.as_chunks().0.iter().map(|b| u64::from_le_bytes(*b)).collect::<Vec<_>>();
+    let samples = numbers.as_chunks::<{ RadianceSample::SAVED }>().0.iter().zip(positions).map(|(b, &position)| {
+        let [x, y, z, variance] = std::array::from_fn(|i| f32::from_le_bytes(std::array::from_fn(|n| b[4 * i + n])));
+        (variance != -1.0).then(|| RadianceSample { position, radiance: Vec3::new(x, y, z), variance })
+    });
+    ([counts[0], counts[1]], samples.collect())
 }
 
 /// Samples `side` of the level sets through `positions`. `tick(n)` reports n samples done; returning false stops early.
+/// Blocks are kept in `saved` and looked for there.
 #[allow(clippy::cast_possible_truncation, reason = "isovalues and storage are f32")]
 #[allow(clippy::too_many_arguments, reason = "one call per bake")]
 pub fn sample_radiance<T: Tracer>(
@@ -54,9 +83,10 @@ pub fn sample_radiance<T: Tracer>(
     side: Side,
     shadow_rays: u32,
     seed: u64,
+    saved: checkpoint::Stage<'_>,
     tick: &(dyn Fn(u64) -> bool + Sync),
 ) -> RadianceSamples {
-    let rays = AtomicU64::new(0);
+    let (rays, misses) = (AtomicU64::new(0), AtomicU64::new(0));
     const CHUNK: usize = 1024;
     let chunks: Vec<Vec<Option<RadianceSample>>> = positions
         .par_chunks(CHUNK)
@@ -65,8 +95,15 @@ pub fn sample_radiance<T: Tracer>(
             if !tick(0) {
                 return Vec::new();
             }
+            if let Some(bytes) = saved.load(chunk, 16 + RadianceSample::SAVED * positions.len()) {
+                let (counts, samples) = from_block(&bytes, positions);
+                rays.fetch_add(counts[0], Ordering::Relaxed);
+                misses.fetch_add(counts[1], Ordering::Relaxed);
+                tick(positions.len() as u64);
+                return samples;
+            }
             let mut scratch = Neighbours::default();
-            let mut traced = 0;
+            let (mut traced, mut missed) = (0, 0);
             let samples = positions
                 .iter()
                 .enumerate()
@@ -92,6 +129,7 @@ pub fn sample_radiance<T: Tracer>(
                         Indirect::Gather(cache, rays) => {
                             let e = gathered_irradiance(scene, tracer, cache, &receiver, *rays, (key.1, key.0));
                             traced += e.rays;
+                            missed += e.misses;
                             (e.mean, e.variance)
                         }
                     };
@@ -103,13 +141,15 @@ pub fn sample_radiance<T: Tracer>(
                         variance: ((direct.variance + variance) * scale * scale) as f32,
                     })
                 })
-                .collect();
+                .collect::<Vec<_>>();
             rays.fetch_add(traced, Ordering::Relaxed);
+            misses.fetch_add(missed, Ordering::Relaxed);
+            saved.save(chunk, || to_block([traced, missed], &samples));
             tick(positions.len() as u64);
             samples
         })
         .collect();
     let samples = chunks.concat();
     let without_gradient = samples.iter().filter(|s| s.is_none()).count() as u64;
-    RadianceSamples { samples, without_gradient, rays: rays.into_inner() }
+    RadianceSamples { samples, without_gradient, rays: rays.into_inner(), misses: misses.into_inner() }
 }

@@ -2,6 +2,7 @@
 //! flats as (u, v, c) textures. Direct light by shadow rays plus photons without their first landings. \[Christensen99\]
 
 use crate::brdf::reflected;
+use crate::checkpoint;
 use crate::direct::{Receiver, direct_irradiance};
 use crate::flat::{self, FlatTexture};
 use crate::flattened::{Departure, Side, Target};
@@ -38,12 +39,12 @@ pub struct RadianceCache {
     flats: Vec<Option<FlatTexture>>,
     /// Rays traced to fill it.
     pub rays: u64,
-    /// Lookups that found no node of their cell filled.
-    misses: AtomicU64,
 }
 
 impl RadianceCache {
-    /// Fills the cache: flats always, nodes if `with_nodes` (a gather needs them, pictures of walls do not). `tick(n)` reports n nodes or texels done; returning false stops early.
+    /// Fills the cache: flats always, nodes if `with_nodes` (a gather needs them, pictures of walls do not). `tick(n)` reports n nodes or texels done; returning false stops early. `saved`: where the blocks of nodes of each side (lower, higher) are
+    /// kept and looked for.
+    #[allow(clippy::too_many_arguments, reason = "one call per bake")]
     pub fn new<T: Tracer>(
         scene: &Scene,
         tracer: &T,
@@ -51,6 +52,7 @@ impl RadianceCache {
         estimate: EstimateSettings,
         settings: &CacheSettings,
         with_nodes: bool,
+        saved: [checkpoint::Stage<'_>; 2],
         tick: &(dyn Fn(u64) -> bool + Sync),
     ) -> Self {
         let rays = AtomicU64::new(0);
@@ -61,15 +63,16 @@ impl RadianceCache {
             let used = side == scene.surface.outside
                 || scene.surface.both_sides
                 || photons.surface.iter().any(|p| p.side == side);
-            (with_nodes && used).then(|| fill_nodes(scene, tracer, photons, side, estimate, settings, tick, &rays))
+            (with_nodes && used)
+                .then(|| fill_nodes(scene, tracer, photons, side, estimate, settings, saved[side.index()], tick, &rays))
         });
-        Self { nodes, flats, rays: rays.into_inner(), misses: AtomicU64::new(0) }
+        Self { nodes, flats, rays: rays.into_inner() }
     }
 
     /// A cache of radiance known already: per side (lower, higher) RGB at the nodes of the scene's lattice, NaN where
     /// unknown, and the flats' textures.
     pub fn from_parts(nodes: [Option<Vec<[f32; 3]>>; 2], flats: Vec<Option<FlatTexture>>) -> Self {
-        Self { nodes, flats, rays: 0, misses: AtomicU64::new(0) }
+        Self { nodes, flats, rays: 0 }
     }
 
     /// Total work units that `tick` will see, for a progress bar.
@@ -77,10 +80,11 @@ impl RadianceCache {
         scene.lattice().len() as u64
     }
 
-    /// Outgoing radiance where a ray of hyperplane `isovalue` landed, without what luminaires emit.
-    pub fn lookup(&self, scene: &Scene, target: Target, position: DVec3, isovalue: f32) -> DVec3 {
+    /// Outgoing radiance where a ray of hyperplane `isovalue` landed, without what luminaires emit. Counts up `misses`
+    /// if no node of the cell is filled.
+    pub fn lookup(&self, scene: &Scene, target: Target, position: DVec3, isovalue: f32, misses: &mut u64) -> DVec3 {
         match target {
-            Target::Surface(side) => self.surface(scene, side, position),
+            Target::Surface(side) => self.surface(scene, side, position, misses),
             Target::Cap(_, Side::Higher) => DVec3::ZERO,
             Target::Cap(face, Side::Lower) => {
                 let uv = flat::face_texture(scene, face, position);
@@ -98,7 +102,7 @@ impl RadianceCache {
     }
 
     /// Trilinear over the filled nodes of the cell.
-    fn surface(&self, scene: &Scene, side: Side, position: DVec3) -> DVec3 {
+    fn surface(&self, scene: &Scene, side: Side, position: DVec3, misses: &mut u64) -> DVec3 {
         let Some(nodes) = &self.nodes[side.index()] else { return scene.surface.emission };
         let ([i, j, k], u) = scene.field.locate(position);
         let (mut sum, mut weight) = (DVec3::ZERO, 0.0);
@@ -119,7 +123,7 @@ impl RadianceCache {
         if weight > 0.0 {
             return sum / weight;
         }
-        self.misses.fetch_add(1, Ordering::Relaxed);
+        *misses += 1;
         scene.surface.emission
     }
 
@@ -132,11 +136,6 @@ impl RadianceCache {
     pub fn into_flats(self) -> Vec<Option<FlatTexture>> {
         self.flats
     }
-
-    /// Lookups so far that found nothing.
-    pub fn misses(&self) -> u64 {
-        self.misses.load(Ordering::Relaxed)
-    }
 }
 
 #[allow(clippy::too_many_arguments, reason = "one call")]
@@ -148,6 +147,7 @@ fn fill_nodes<T: Tracer>(
     side: Side,
     estimate: EstimateSettings,
     settings: &CacheSettings,
+    saved: checkpoint::Stage<'_>,
     tick: &(dyn Fn(u64) -> bool + Sync),
     rays: &AtomicU64,
 ) -> Vec<[f32; 3]> {
@@ -159,8 +159,17 @@ fn fill_nodes<T: Tracer>(
         if !tick(0) {
             return;
         }
+        if let Some(bytes) = saved.load(chunk, 8 + size_of_val(out)) {
+            let (traced, values) = bytes.split_first_chunk().expect("8 bytes and more");
+            rays.fetch_add(u64::from_le_bytes(*traced), Ordering::Relaxed);
+            for (value, b) in out.as_flattened_mut().iter_mut().zip(values.as_chunks().0) {
+                *value = f32::from_le_bytes(*b);
+            }
+            tick(out.len() as u64);
+            return;
+        }
         let mut scratch = Neighbours::default();
-        let mut traced = 0;
+        let mut traced = 0u64;
         for (n, value) in out.iter_mut().enumerate() {
             let node = chunk * ROW + n;
             if masks[node] == Mask::Empty {
@@ -192,6 +201,10 @@ fn fill_nodes<T: Tracer>(
             }
         }
         rays.fetch_add(traced, Ordering::Relaxed);
+        saved.save(chunk, || {
+            let values = out.as_flattened().iter().flat_map(|x| x.to_le_bytes());
+            traced.to_le_bytes().into_iter().chain(values).collect()
+        });
         tick(out.len() as u64);
     });
     nodes
@@ -263,8 +276,8 @@ fn flat_irradiance(flat: &flat::Flat, number: usize, dims: [usize; 3], photons: 
     bins.texels
 }
 
-/// Photons that a texel's kernel should hold: about 3 % of noise after twicing.
-const PHOTONS_PER_KERNEL: f64 = 2000.0;
+/// Photons that a texel's kernel should hold: about 4 % of noise after twicing.
+const PHOTONS_PER_KERNEL: f64 = 1000.0;
 
 /// Passes of ¼ ½ ¼ along u, v and c for so many photons per texel: a kernel that shrinks as they grow. It is (2√π σ)³
 /// texels worth with σ² of half the passes; c gets half of them, since there are fewer texels along it.

@@ -7,7 +7,7 @@
 mod path;
 mod surface_map;
 
-pub use path::{PathTracer, path_radiance};
+pub use path::{PathTracer, path_picture};
 pub use surface_map::{SurfaceMap, SurfaceMapSettings};
 
 use crate::direct::Receiver;

@@ -217,7 +217,7 @@ fn the_same_bits_for_any_number_of_threads() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "17", "-o", "b.vti", "-q"]);
-    let grids: Vec<Vec<f32>> = ["1", "2", "7"]
+    let grids: Vec<Vec<f32>> = ["1", "2", "7", "16"]
         .iter()
         .map(|threads| {
             let mut bake = vec!["bake", "b.vti", "-o", "t.vti", "--isovalues", "3.6", "95", "--threads", threads, "-q"];

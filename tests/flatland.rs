@@ -180,7 +180,7 @@ fn an_extruded_field_looks_to_n_3_as_to_n_2() {
         let scene = extruded(&flat, slices);
         let options = BakeOptions {
             strategy: Some(StrategyName::Nodes),
-            photons: Some(1 << 20),
+            photons: Some(1 << 21),
             shadow_rays: Some(64),
             gather_rays: Some(256),
             wall_resolution: Some(64),

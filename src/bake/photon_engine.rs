@@ -1,6 +1,7 @@
 //! BB09's engine: photons, a radiance cache, samples by exact rays, interpolation.
 
-use super::{BakeSettings, Interpolation, Lit, PhotonCounts};
+use super::{BakeSettings, Interpolation, Lit, PhotonCounts, stages};
+use crate::checkpoint::Checkpoint;
 use crate::embree::{Device, GraphTracer};
 use crate::error::{Error, Result};
 use crate::field::Field;
@@ -25,6 +26,7 @@ pub(super) fn light(
     masks: &[Mask],
     device: &Device,
     progress: Progress,
+    checkpoint: Option<&Checkpoint>,
 ) -> Result<Lit> {
     let mut lit = Lit::default();
     let begun = Instant::now();
@@ -58,7 +60,9 @@ pub(super) fn light(
     };
     let estimate = settings.estimate();
     let gather = settings.gather_rays > 0;
-    let cache = RadianceCache::new(scene, &tracer, &photons, estimate, &cache_settings, gather, &|n| stage.tick(n));
+    let saved = stages(checkpoint, 0);
+    let cache =
+        RadianceCache::new(scene, &tracer, &photons, estimate, &cache_settings, gather, saved, &|n| stage.tick(n));
     lit.seconds.cache = stage.end()?;
     lit.rays += cache.rays;
 
@@ -74,10 +78,13 @@ pub(super) fn light(
         let (at, owners) = place(scene, settings, lattice, masks)?;
         let stage = progress.stage("samples", at.len() as u64);
         let (shadow_rays, seed) = (settings.shadow_rays, settings.seed);
-        let sampled = sample_radiance(scene, &tracer, &indirect, &at, side, shadow_rays, seed, &|n| stage.tick(n));
+        let saved = stages(checkpoint, 2)[side.index()];
+        let sampled =
+            sample_radiance(scene, &tracer, &indirect, &at, side, shadow_rays, seed, saved, &|n| stage.tick(n));
         stage.end()?;
         lit.seconds.samples += begun.elapsed().as_secs_f64();
         lit.rays += sampled.rays;
+        lit.misses += sampled.misses;
         lit.without_gradient += sampled.without_gradient;
         lit.samples += at.len() as u64 - sampled.without_gradient;
 
@@ -97,7 +104,6 @@ pub(super) fn light(
         lit.seconds.interpolate += stage.end()?;
         lit.sides.push((side, grid));
     }
-    lit.misses = cache.misses();
     lit.flats = cache.into_flats();
     Ok(lit)
 }
@@ -135,13 +141,14 @@ pub(super) fn at_points(
     points.flat_map(|o| stand_ins(field, lattice, o, seed).into_iter().flatten().map(move |p| (p.as_vec3(), o))).unzip()
 }
 
-/// The mean of the samples that each grid point owns.
+/// The mean of the samples that each grid point owns; points of which no sample was found stay empty, which viewers
+/// and [`IlluminationGrid::interpolate`] leave out.
 #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
 pub(super) fn collect(masks: &[Mask], owners: &[usize], samples: &[Option<RadianceSample>]) -> IlluminationGrid {
     let mut grid = IlluminationGrid {
         radiance: vec![[0.0; 3]; masks.len()],
         std_error: vec![0.0; masks.len()],
-        mask: masks.iter().map(|&m| if m == Mask::Empty { m } else { Mask::Filled }).collect(),
+        mask: vec![Mask::Empty; masks.len()],
     };
     let mut i = 0;
     while i < owners.len() {

@@ -1,8 +1,9 @@
 //! The fast engine: line sweeps light every node; exact rays fill the points beside the sweep's ends.
 
 use super::photon_engine::{at_points, collect};
-use super::{BakeSettings, Lit};
+use super::{BakeSettings, Lit, stages};
 use crate::brdf::reflected;
+use crate::checkpoint::Checkpoint;
 use crate::embree::{Device, GraphTracer};
 use crate::error::Result;
 use crate::flattened::Side;
@@ -28,6 +29,7 @@ pub(super) fn light(
     masks: &[Mask],
     device: &Device,
     progress: Progress,
+    checkpoint: Option<&Checkpoint>,
 ) -> Result<Lit> {
     let mut lit = Lit::default();
     // Sweeps light the lattice they run on: a finer grid is a finer copy of the same field.
@@ -66,9 +68,12 @@ pub(super) fn light(
         let stage = progress.stage("samples", at.len() as u64);
         let indirect = Indirect::Gather(&cache, settings.gather_rays.max(1));
         let (shadow_rays, seed) = (settings.shadow_rays, settings.seed);
-        let sampled = sample_radiance(scene, &tracer, &indirect, &at, s.side, shadow_rays, seed, &|n| stage.tick(n));
+        let saved = stages(checkpoint, 2)[s.side.index()];
+        let sampled =
+            sample_radiance(scene, &tracer, &indirect, &at, s.side, shadow_rays, seed, saved, &|n| stage.tick(n));
         stage.end()?;
         lit.rays += sampled.rays;
+        lit.misses += sampled.misses;
         lit.samples += at.len() as u64 - sampled.without_gradient;
         lit.without_gradient += sampled.without_gradient;
         let mut grid = collect(masks, &owners, &sampled.samples);
@@ -76,7 +81,6 @@ pub(super) fn light(
         lit.sides.push((s.side, grid));
     }
     lit.seconds.samples = begun.elapsed().as_secs_f64();
-    lit.misses = cache.misses();
     lit.flats = cache.into_flats();
     Ok(lit)
 }

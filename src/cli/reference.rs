@@ -5,15 +5,12 @@ use super::{device, expect_extension, writable};
 use crate::embree::{Device, GraphTracer, SurfaceTracer};
 use crate::error::{Error, Result};
 use crate::export::picture::Picture;
-use crate::flattened::FlattenedRay;
 use crate::progress::Progress;
-use crate::reference::{Integrator, Reference, ReferenceSettings, SurfaceMapSettings, path_radiance, reference};
-use crate::render::{Camera, trace_picture};
-use crate::rng::{Rng, Stage};
+use crate::reference::{Integrator, Reference, ReferenceSettings, SurfaceMapSettings, path_picture, reference};
+use crate::render::Camera;
 use crate::scene::Scene;
 use crate::scene_file::{SceneOptions, load};
 use crate::surface_mesh::{SurfaceMesh, unit_isovalue};
-use glam::DVec3;
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -154,11 +151,5 @@ pub(super) fn compute(
 /// A path-traced picture of the triangles at `isovalue` (source units).
 pub(super) fn picture(scene: &Scene, isovalue: f64, camera: &Camera, samples: u32, device: &Device) -> Result<Picture> {
     let isovalue = unit_isovalue(&scene.field, isovalue)?;
-    let tracer = SurfaceTracer::new(device, scene, isovalue, 1)?;
-    // Paths are told apart by their ray: the same picture on any number of threads.
-    let shade = |ray: &FlattenedRay, hit, direction: DVec3| {
-        let key = direction.to_array().iter().fold(0u64, |k, x| (k ^ x.to_bits()).wrapping_mul(0x9e37_79b9_7f4a_7c15));
-        path_radiance(scene, &tracer, ray, hit, &mut Rng::stream(1, Stage::Path, key))
-    };
-    trace_picture(scene, &tracer, isovalue, camera, samples, &shade)
+    path_picture(scene, &SurfaceTracer::new(device, scene, isovalue, 1)?, isovalue, camera, samples)
 }

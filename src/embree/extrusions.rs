@@ -52,12 +52,39 @@ impl Extrusions {
     ///
     /// # Errors
     /// `Embree` if the library refuses.
-    pub(super) fn attach(builder: &mut SceneBuilder<'_>, scene: &Scene, mask: u32) -> Result<()> {
-        if scene.polygons().is_empty() {
-            return Ok(());
-        }
+    pub(super) fn attach(builder: &mut SceneBuilder<'_>, scene: &Scene, mask: u32) -> Result<Arc<Self>> {
         let polygons = scene.polygons().iter().map(|p| LocalPolygon::new(p, scene.lattice())).collect();
-        builder.user_shared(Arc::new(Self { polygons }), mask).map(drop)
+        let this = Arc::new(Self { polygons });
+        if !scene.polygons().is_empty() {
+            builder.user_shared(this.clone(), mask)?;
+        }
+        Ok(this)
+    }
+
+    /// The polygon that a ray met which met polygon `id`: another one only if it starts on both, where rounding would choose.
+    #[inline]
+    pub(super) fn settle(&self, ray: &FlattenedRay, id: u32) -> u32 {
+        let (o, d) = (ray.origin.as_dvec3(), ray.direction.as_dvec3());
+        match self.polygons[id as usize].starts_on(o, d) {
+            None => id,
+            Some(speed) => self.fastest(ray, id, speed),
+        }
+    }
+
+    #[cold]
+    fn fastest(&self, ray: &FlattenedRay, id: u32, speed: f64) -> u32 {
+        let (o, d) = (ray.origin.as_dvec3(), ray.direction.as_dvec3());
+        let mut best = (speed, id);
+        for (n, polygon) in (0u32..).zip(&self.polygons) {
+            // By rounding apart is the same: luminaires come first.
+            if let Some(speed) = polygon.starts_on(o, d)
+                && speed > best.0 * (1.0 + if n < best.1 { -1e-6 } else { 1e-6 })
+                && polygon.meet(n, ray).is_some()
+            {
+                best = (speed, n);
+            }
+        }
+        best.1
     }
 
     #[inline]

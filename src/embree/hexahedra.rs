@@ -22,6 +22,7 @@ use std::sync::Arc;
 pub struct GraphTracer<'a> {
     bvh: Bvh<'a>,
     volume: u32,
+    extrusions: Arc<Extrusions>,
 }
 
 /// The graph as one primitive.
@@ -47,8 +48,8 @@ impl<'a> GraphTracer<'a> {
     pub fn with_pyramid(device: &Device, scene: &'a Scene, pyramid: Arc<Pyramid>) -> Result<Self> {
         let mut builder = SceneBuilder::new(device)?;
         let volume = builder.user_shared(Arc::new(Graph { field: &scene.field, pyramid }), u32::MAX)?;
-        Extrusions::attach(&mut builder, scene, u32::MAX)?;
-        Ok(Self { bvh: builder.commit()?, volume })
+        let extrusions = Extrusions::attach(&mut builder, scene, u32::MAX)?;
+        Ok(Self { bvh: builder.commit()?, volume, extrusions })
     }
 }
 
@@ -63,7 +64,7 @@ impl Tracer for GraphTracer<'_> {
         let target = if rayhit.hit.geometry == self.volume {
             decode_target(rayhit.hit.u.to_bits())
         } else {
-            Target::Polygon(rayhit.hit.prim)
+            Target::Polygon(self.extrusions.settle(ray, rayhit.hit.prim))
         };
         Some(FlattenedHit { t: rayhit.ray.tfar, target })
     }
@@ -79,12 +80,12 @@ impl Tracer for GraphTracer<'_> {
             let (valid, packet) = packet(rays);
             let mut rayhit = RayHit16::new(packet);
             self.bvh.intersect16(&valid, &mut rayhit);
-            for (lane, hit) in hits.iter_mut().enumerate() {
+            for (lane, (hit, ray)) in hits.iter_mut().zip(rays).enumerate() {
                 let found = &rayhit.hit;
                 *hit = match found.geometry[lane] {
                     INVALID_ID => None,
                     id if id == self.volume => Some(decode_target(found.u[lane].to_bits())),
-                    _ => Some(Target::Polygon(found.prim[lane])),
+                    _ => Some(Target::Polygon(self.extrusions.settle(ray, found.prim[lane]))),
                 }
                 .map(|target| FlattenedHit { t: rayhit.ray.tfar[lane], target });
             }

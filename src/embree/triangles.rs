@@ -20,6 +20,7 @@ use crate::isosurface::{Isosurface, extract_refined};
 use crate::scene::{Boundary, Scene};
 use crate::tracer::Tracer;
 use glam::Vec3;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Distance between a start and the plane of the triangle it stands on, in units of f32's epsilon times the largest
@@ -34,6 +35,7 @@ const POLYGONS: u32 = 2;
 pub struct SurfaceTracer<'a> {
     bvh: Bvh<'a>,
     triangles: u32,
+    extrusions: Arc<Extrusions>,
     field: &'a Field,
     mesh: Isosurface,
     inside_starts: AtomicU64,
@@ -71,9 +73,9 @@ impl<'a> SurfaceTracer<'a> {
         let vertices: Vec<[f32; 3]> = mesh.vertices.iter().map(|v| v.as_vec3().to_array()).collect();
         let mut builder = SceneBuilder::new(device)?;
         let triangles = builder.triangles(&vertices, &mesh.triangles, TRIANGLES)?;
-        Extrusions::attach(&mut builder, scene, POLYGONS)?;
+        let extrusions = Extrusions::attach(&mut builder, scene, POLYGONS)?;
         let bvh = builder.commit()?;
-        Ok(Self { bvh, triangles, field: &scene.field, mesh, inside_starts: AtomicU64::new(0) })
+        Ok(Self { bvh, triangles, extrusions, field: &scene.field, mesh, inside_starts: AtomicU64::new(0) })
     }
 
     /// The mesh, in index coordinates, counter-clockwise from the lower side.
@@ -98,7 +100,7 @@ impl<'a> SurfaceTracer<'a> {
         }
         let (t, prim) = (rayhit.ray.tfar, rayhit.hit.prim);
         if rayhit.hit.geometry != self.triangles {
-            return Some(Found::Polygon(t, prim));
+            return Some(Found::Polygon(t, self.extrusions.settle(ray, prim)));
         }
         let against = Vec3::from_array(rayhit.hit.normal).dot(ray.direction) < 0.0;
         Some(Found::Triangle(t, prim, if against { Side::Lower } else { Side::Higher }))

@@ -373,14 +373,15 @@ impl Ray<'_> {
         let last = t_exit >= self.reach;
         let local = self.local(cell, t);
         let cubic = corners.cubic(self.c, local, DVec3::from_array(self.d));
+        // Signs come from weights, not from the cubic's coefficients, which a huge corner far away may have rounded off.
         let start = if first {
-            cubic.value(0.0) >= 0.0
+            corners.value(local) >= self.c
         } else {
             self.crossing(&corners, inside, entry, far[entry] == 0, cell, t)
         };
         let span = if last { (self.reach - t).max(0.0) } else { t_exit - t };
         let end = if last {
-            cubic.value(span) >= 0.0
+            corners.value(self.local(cell, t + span)) >= self.c
         } else {
             self.crossing(&corners, inside, exit, far[exit] == 1, cell, t_exit)
         };
@@ -401,7 +402,9 @@ impl Ray<'_> {
         let t_exit = self.time(exit, cell[exit] + far[exit]).max(0.0);
         let last = t_exit >= self.reach;
         // f(t) = t q(t): the sign of q is the sign of h − c once the ray has left.
-        let cubic = corners.cubic(self.c, self.local(cell, 0.0), DVec3::from_array(self.d)).deflate();
+        let (local, d) = (self.local(cell, 0.0), DVec3::from_array(self.d));
+        let mut cubic = corners.cubic(self.c, local, d).deflate();
+        cubic.c[0] = corners.slope(local, d);
         let start = cubic.c.iter().find(|&&x| x != 0.0).is_none_or(|&x| x > 0.0);
         if start != (side == Side::Higher) {
             return Step::Hit(FlattenedHit { t: 0.0, target: Target::Surface(side) });

@@ -2,8 +2,11 @@
 
 use crate::brdf::reflected;
 use crate::direct::Receiver;
+use crate::error::Result;
+use crate::export::picture::Picture;
 use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target};
 use crate::luminaire::{point_term, unoccluded};
+use crate::render::{Camera, trace_picture};
 use crate::rng::{Rng, Sobol, Stage};
 use crate::scene::Scene;
 use crate::tracer::Tracer;
@@ -163,14 +166,27 @@ pub(super) fn landing(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> O
     Some((Receiver { position, normal, isovalue, departure }, albedo, emission))
 }
 
-/// Radiance seen along `ray` of a picture, from one path; what a luminaire emits is seen.
-pub fn path_radiance<T: Tracer>(
+/// A picture of hyperplane `isovalue` by `samples` paths per pixel; luminaires are seen.
+///
+/// # Errors
+/// `Invalid` for an impossible camera.
+pub fn path_picture<T: Tracer>(
     scene: &Scene,
     tracer: &T,
-    ray: &FlattenedRay,
-    hit: FlattenedHit,
-    rng: &mut Rng,
-) -> DVec3 {
+    isovalue: f32,
+    camera: &Camera,
+    samples: u32,
+) -> Result<Picture> {
+    // Paths are told apart by their ray: the same picture on any number of threads.
+    let shade = |ray: &FlattenedRay, hit, direction: DVec3| {
+        let key = direction.to_array().iter().fold(0u64, |k, x| (k ^ x.to_bits()).wrapping_mul(0x9e37_79b9_7f4a_7c15));
+        path_radiance(scene, tracer, ray, hit, &mut Rng::stream(1, Stage::Path, key))
+    };
+    trace_picture(scene, tracer, isovalue, camera, samples, &shade)
+}
+
+/// Radiance seen along `ray` of a picture, from one path; what a luminaire emits is seen.
+fn path_radiance<T: Tracer>(scene: &Scene, tracer: &T, ray: &FlattenedRay, hit: FlattenedHit, rng: &mut Rng) -> DVec3 {
     let Some((receiver, albedo, mut emission)) = landing(scene, ray, hit) else { return DVec3::ZERO };
     if let Target::Polygon(id) = hit.target {
         let p = &scene.polygons()[id as usize];

@@ -1,15 +1,18 @@
 //! The table of data sets: error and seconds with and without final gather, and where the error comes from.
 
 use super::{Effort, Study, Subject, Table, accuracy_of, provenance};
-use crate::accuracy::{interpolation_floor, total_floor};
-use crate::bake::{BakeOptions, BakeSettings, StrategyName};
+use crate::accuracy::{ReferenceMesh, interpolation_floor, total_floor};
+use crate::bake::{Bake, BakeOptions, BakeSettings, Engine, StrategyName};
 use crate::embree::{GraphTracer, SurfaceTracer};
 use crate::error::Result;
-use crate::reference::{Reference, ReferenceSettings, reference};
+use crate::illumination_grid::IlluminationGrid;
+use crate::reference::{Reference, ReferenceSettings, path_picture, reference};
+use crate::render::Camera;
+use crate::scene::Scene;
 use crate::surface_mesh::SurfaceMesh;
 use std::time::Instant;
 
-const COLUMNS: [&str; 21] = [
+const COLUMNS: [&str; 25] = [
     "scene",
     "mode",
     "isovalue",
@@ -21,6 +24,7 @@ const COLUMNS: [&str; 21] = [
     "ci_hi",
     "percent_rms_area",
     "percent_rms_lit",
+    "noise",
     "floor_1x",
     "floor_2x",
     "floor_3x",
@@ -29,21 +33,30 @@ const COLUMNS: [&str; 21] = [
     "build_s",
     "photons_s",
     "cache_s",
-    "samples_s",
+    "sweep_or_samples_s",
+    "total_s",
+    "cpu_s",
     "extract_s",
+    "picture_s",
 ];
 
-/// Each data set at its main isovalue: from the map (BB09's mode), with final gather, and with samples at the nodes; the
-/// interpolation floor at grid factors 1, 2, 3; the reference on triangles against the one on the trilinear surface.
+/// Each data set at its main isovalue: uniform samples straight from the map (BB09's mode), samples at the nodes with final
+/// gather, and the sweep engine; the interpolation floor at grid factors 1, 2, 3; the reference on triangles against the one on the trilinear surface.
 ///
 /// # Errors
 /// As bakes, references and tables.
 pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Result<()> {
     let mut table = Table::open(study.folder.join("datasets.csv"), &COLUMNS, 3)?;
+    let exact = |strategy, gather_rays| BakeOptions {
+        engine: Some(Engine::Photon),
+        strategy: Some(strategy),
+        gather_rays,
+        ..BakeOptions::default()
+    };
     let modes: [(&str, BakeOptions); 3] = [
-        ("map", BakeOptions { gather_rays: Some(0), ..BakeOptions::default() }),
-        ("gather", BakeOptions::default()),
-        ("nodes", BakeOptions { strategy: Some(StrategyName::Nodes), ..BakeOptions::default() }),
+        ("map", exact(StrategyName::Uniform, Some(0))),
+        ("nodes", exact(StrategyName::Nodes, None)),
+        ("sweep", BakeOptions { engine: Some(Engine::Sweep), ..BakeOptions::default() }),
     ];
     for subject in subjects {
         let scene = &subject.scene;
@@ -57,6 +70,7 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
         let begun = Instant::now();
         let mesh = SurfaceMesh::extract(scene, unit, 1)?;
         let extract_seconds = begun.elapsed().as_secs_f64();
+        let picture_seconds = reference_picture(study, scene, unit)?;
         let Some(references) = study.references(subject, c, Effort::Table)? else { continue };
         let tracer = GraphTracer::new(&study.device, scene)?;
         let (shadow, vertices) = if study.quick { (64, 300) } else { (1024, 2000) };
@@ -73,7 +87,7 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
                 continue;
             }
             let settings = BakeSettings::new(&options.clone().or(base))?;
-            let (bake, _) = study.bake(subject, &settings)?;
+            let (bake, seconds) = study.bake(subject, &settings)?;
             let a = accuracy_of(&bake, &references)?;
             let s = bake.report.seconds;
             let [nx, ny, nz] = bake.lattice.dims();
@@ -85,6 +99,7 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
                 a.confidence[1],
                 a.percent_rms_area,
                 a.percent_rms_lit,
+                noise(&bake, &references[0]),
                 floors[0],
                 floors[1],
                 floors[2],
@@ -93,8 +108,11 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
                 s.build,
                 s.photons,
                 s.cache,
-                s.samples + s.interpolate,
+                s.sweep + s.samples + s.interpolate,
+                seconds[0],
+                seconds[1],
                 extract_seconds,
+                picture_seconds,
             ];
             row.extend(numbers.map(|x| format!("{x:.4}")));
             table.push(row)?;
@@ -106,6 +124,33 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
         provenance(study)
     );
     table.write_markdown(&study.folder.join("datasets.md"), "Data sets", &notes)
+}
+
+/// Wall seconds of a path-traced reference picture of 400 × 400 pixels with 64 paths each.
+fn reference_picture(study: &Study, scene: &Scene, isovalue: f32) -> Result<f64> {
+    let begun = Instant::now();
+    let tracer = SurfaceTracer::new(&study.device, scene, isovalue, 1)?;
+    let camera = Camera { size: [400; 2], ..Camera::facing(scene, 400) };
+    let samples = if study.quick { 4 } else { 64 };
+    path_picture(scene, &tracer, isovalue, &camera, samples)?;
+    Ok(begun.elapsed().as_secs_f64())
+}
+
+/// The bake's own noise at the reference's vertices, percent RMS over three channels: what `std_error` says, interpolated
+/// as if neighbouring points erred alike, so at most this.
+fn noise(bake: &Bake, reference: &ReferenceMesh) -> f64 {
+    let grid = &bake.sides[0].1;
+    let errors = IlluminationGrid {
+        radiance: grid.std_error.iter().map(|&e| [e * e; 3]).collect(),
+        std_error: Vec::new(),
+        mask: grid.mask.clone(),
+    };
+    let (mut sum, mut count) = (0.0, 0.0);
+    for (&x, _) in reference.positions.iter().zip(&reference.sampled).filter(|(_, s)| **s) {
+        sum += errors.interpolate(&bake.lattice, bake.lattice.to_index(x)).x;
+        count += 1.0;
+    }
+    100.0 * bake.exposure * (3.0 * sum / f64::max(count, 1.0)).sqrt()
 }
 
 /// Percent RMS between references traced through triangles and through the trilinear surface, without their noise.

@@ -179,7 +179,7 @@ fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
             "SCALARS" => {
                 let n = components(&words, 3)?;
                 let before = cursor.at;
-                if !cursor.words().is_some_and(|w| w[0] == "LOOKUP_TABLE") {
+                if cursor.words().is_none_or(|w| w[0] != "LOOKUP_TABLE") {
                     cursor.at = before;
                 }
                 let array = cursor.array(word(1)?, word(2)?, count(n)?)?;
@@ -204,8 +204,12 @@ fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
                     return Ok((lattice, samples));
                 }
             }
-            "VECTORS" | "NORMALS" => drop(cursor.array(word(1)?, word(2)?, count(3)?)?),
-            "TENSORS" => drop(cursor.array(word(1)?, word(2)?, count(9)?)?),
+            "VECTORS" | "NORMALS" => {
+                cursor.array(word(1)?, word(2)?, count(3)?)?;
+            }
+            "TENSORS" => {
+                cursor.array(word(1)?, word(2)?, count(9)?)?;
+            }
             "TEXTURE_COORDINATES" => {
                 let n = components(&words, 2)?;
                 cursor.array(word(1)?, word(3)?, count(n)?)?;

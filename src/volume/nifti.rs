@@ -43,6 +43,18 @@ pub fn read(path: &Path) -> Result<Volume> {
 
     let dims = dims(path, &header)?;
     let element = element(path, &header)?;
+    // Some writers leave it 0.
+    if header.bitpix != 0 && header.bitpix as usize != 8 * element.size() {
+        return Err(Error::invalid(
+            path,
+            format!(
+                "bitpix is {}, but samples of datatype {} have {} bits",
+                header.bitpix,
+                header.datatype,
+                8 * element.size()
+            ),
+        ));
+    }
     let lattice = Lattice::new(dims, origin(&header), axes(&header)).map_err(|e| e.in_file(path))?;
     let skip = match header.vox_offset {
         0.0 => DATA,

@@ -296,7 +296,17 @@ fn occlusion_by_an_infinite_wall() {
     assert_eq!(map.irradiance(DVec3::ONE, 0.5, &mut Neighbours::default()).mean, DVec3::ZERO);
     let cases = [(0.6, 0.071_254), (2.0, 0.276_393), (10.0, 0.450_248)];
     let at: Vec<_> = cases.iter().map(|&(k, _)| local(&scene, DVec3::new(-1.0 / k, 0.0, 0.0))).collect();
-    let got = sample_radiance(&scene, &tracer, &Indirect::Map(&map), &at, Side::Lower, 1 << 15, 7, &|_| true);
+    let got = sample_radiance(
+        &scene,
+        &tracer,
+        &Indirect::Map(&map),
+        &at,
+        Side::Lower,
+        1 << 15,
+        7,
+        isolume::checkpoint::Stage::UNSAVED,
+        &|_| true,
+    );
     for ((k, expected), sample) in cases.into_iter().zip(got.samples) {
         let taken = 1.0 - f64::from(sample.unwrap().radiance.y);
         println!("k = {k}: {taken:.6}, expected {expected}");

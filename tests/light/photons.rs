@@ -153,7 +153,16 @@ fn forward_is_backward() {
         seed: 2,
     };
     let estimate = EstimateSettings::default();
-    let cache = RadianceCache::new(&scene, &tracer, &Photons::default(), estimate, &settings, true, &|_| true);
+    let cache = RadianceCache::new(
+        &scene,
+        &tracer,
+        &Photons::default(),
+        estimate,
+        &settings,
+        true,
+        [isolume::checkpoint::Stage::UNSAVED; 2],
+        &|_| true,
+    );
     let backward = |receiver: &Receiver, index: u64| {
         let direct = direct_irradiance(&scene, &tracer, receiver, 8, (2, Stage::Direct, index)).mean;
         [direct, gathered_irradiance(&scene, &tracer, &cache, receiver, 16, (2, index)).mean].map(luminance)

@@ -12,6 +12,10 @@ use std::io::Read;
 /// Blocks unpacked at once: what a damaged file can make us allocate before it is found out.
 const BATCH: usize = 64;
 
+/// What may be allocated on the word of a header alone, beyond twice the packed size; what the program itself takes and
+/// the file's own bytes leave of 64 MB.
+const TRUSTED: usize = 16 << 20;
+
 /// What the root element says about all arrays of a file.
 pub(super) struct Encoding {
     pub(super) endian: Endian,
@@ -87,6 +91,19 @@ impl Encoding {
         starts.push(head);
         for &size in sizes {
             starts.push(starts[starts.len() - 1] + size);
+        }
+        let total = (blocks - 1) * block + last;
+        if total > TRUSTED + 2 * bytes.len() {
+            // So much is not believed before it was seen: unpacked once without keeping it.
+            for b in 0..blocks {
+                let size = if b + 1 == blocks { last } else { block };
+                let mut reader = ZlibDecoder::new(&bytes[starts[b]..starts[b + 1]]).take(size as u64 + 1);
+                match std::io::copy(&mut reader, &mut std::io::sink()) {
+                    Ok(n) if n == size as u64 => {}
+                    Ok(n) => return Err(format!("zlib block {b} of {blocks}: {size} bytes promised, {n} found")),
+                    Err(e) => return Err(format!("zlib block {b} of {blocks} is damaged: {e}")),
+                }
+            }
         }
         let mut out = Vec::new();
         for first in (0..blocks).step_by(BATCH) {

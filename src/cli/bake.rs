@@ -1,0 +1,218 @@
+//! `isolume bake`: from a volume or scene to the file that holds it with its light.
+
+use super::{device, expect_extension, writable};
+use crate::bake::{BakeOptions, BakeSettings, MemoryEstimate, bake_resumable, job};
+use crate::checkpoint::Checkpoint;
+use crate::error::{Error, Result};
+use crate::export::bake_file;
+use crate::progress::Progress;
+use crate::scene_file::{SceneOptions, load};
+use glam::DVec3;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+#[derive(clap::Args, Debug)]
+#[command(after_help = "\
+The result holds point data `value` (contour on it), `rgb` (colour by it, without lighting and without a colour map),
+`radiance` (linear), `std_error` and `mask`, the walls' light as field data, and every setting.
+
+Examples:
+  isolume bake ch2.nii.gz --isovalues 15 200 -o head.vti --report head.json
+  isolume bake scene.toml -o out.vti --preset preview
+  isolume bake scan.raw --raw-dims 305,224,14 --raw-spacing 0.24,0.24,1 -o scan.vti
+  isolume bake big.nrrd -o big.vti --resume              go on where an interrupted bake stopped
+  isolume bake big.nrrd -o big.vti --max-memory 8G --dry-run   how much memory it would take")]
+pub(super) struct Bake {
+    /// Volume, or scene file (.toml)
+    input: PathBuf,
+    /// Output: .vti
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// Write seconds, rays, counts and settings as JSON
+    #[arg(long, value_name = "FILE")]
+    report: Option<PathBuf>,
+    /// Print the same JSON
+    #[arg(long)]
+    json: bool,
+    /// Where progress is kept until the bake is done (default: OUTPUT.checkpoint)
+    #[arg(long, value_name = "FILE")]
+    checkpoint: Option<PathBuf>,
+    /// Seconds between checkpoints; shorter bakes write none
+    #[arg(long, value_name = "SECONDS", default_value_t = 60.0)]
+    checkpoint_every: f64,
+    /// Go on where an interrupted bake of the same settings stopped; from the beginning if there is no checkpoint
+    #[arg(long)]
+    resume: bool,
+    /// Refuse a bake whose estimated memory exceeds this, such as 8G or 500M
+    #[arg(long, value_name = "BYTES", value_parser = bytes)]
+    max_memory: Option<u64>,
+    /// Print the memory estimate, check everything, and stop before the work
+    #[arg(long)]
+    dry_run: bool,
+    #[command(flatten)]
+    scene: SceneOptions,
+    #[command(flatten)]
+    bake: BakeOptions,
+}
+
+impl Bake {
+    pub(super) fn run(self, progress: Progress) -> Result<()> {
+        let begun = Instant::now();
+        let found = self.output.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        if ["nrrd", "npy", "exr"].contains(&found.as_str()) {
+            return Err(Error::invalid(
+                &self.output,
+                "cannot hold a bake with its walls and settings; bake to a .vti, and `isolume export` writes its arrays",
+            ));
+        }
+        expect_extension(&self.output, &["vti"])?;
+        writable(&self.output)?;
+        if let Some(report) = &self.report {
+            writable(report)?;
+        }
+        let loaded = load(&self.input, &self.scene)?;
+        let load_seconds = begun.elapsed().as_secs_f64();
+        let settings = BakeSettings::new(&self.bake.clone().or(&loaded.bake))?;
+        let sweep = loaded.scene.field.sweep();
+        if progress == Progress::Shown {
+            let [nx, ny, nz] = loaded.volume.lattice.dims();
+            eprintln!(
+                "{}: {nx}×{ny}×{nz}, isovalues {} … {}, {} luminaire(s), {} threads",
+                self.input.display(),
+                sweep.lo(),
+                sweep.hi(),
+                loaded.scene.luminaires().len(),
+                rayon::current_num_threads()
+            );
+            if loaded.scene.luminaires().is_empty() && loaded.scene.surface.emission == DVec3::ZERO {
+                eprintln!("warning: nothing emits light; everything will be black");
+            }
+        }
+        let device = device()?;
+        let memory = MemoryEstimate::new(&loaded.scene, &loaded.volume, &settings, &device)?;
+        if progress == Progress::Shown || self.dry_run {
+            eprintln!("{:>14}  {memory}", "memory");
+        }
+        if let Some(most) = self.max_memory {
+            memory.check(most)?;
+        }
+        if self.dry_run {
+            return Ok(());
+        }
+        let checkpoint = self.checkpoint(job(&loaded.scene, &settings))?;
+        let work = || -> Result<(crate::bake::Bake, Instant)> {
+            let mut result = bake_resumable(&loaded.scene, &settings, &device, progress, Some(&checkpoint))?;
+            result.report.seconds.load = load_seconds;
+            let export = Instant::now();
+            result.report.seconds.total = begun.elapsed().as_secs_f64();
+            bake_file::write(&self.output, &loaded.scene, &loaded.volume, &result)?;
+            Ok((result, export))
+        };
+        let (mut result, export) = work().inspect_err(|_| keep(&checkpoint))?;
+        checkpoint.remove();
+        result.report.seconds.export = export.elapsed().as_secs_f64();
+        result.report.seconds.total = begun.elapsed().as_secs_f64();
+        if let Some(path) = &self.report {
+            let mut file = crate::atomic::AtomicFile::create(path)?;
+            serde_json::to_writer_pretty(&mut file, &result.report).map_err(|e| Error::io(path, e.into()))?;
+            file.commit()?;
+        }
+        if self.json {
+            println!("{}", serde_json::to_string_pretty(&result.report).expect("the report is plain data"));
+        }
+        if progress == Progress::Shown {
+            let r = &result.report;
+            eprintln!(
+                "{:>14}  {:.2} s: {} rays ({:.1} M/s), {} photons stored, {} samples",
+                "total",
+                r.seconds.total,
+                r.rays,
+                r.rays_per_second / 1e6,
+                r.photons.stored,
+                r.samples
+            );
+            eprintln!(
+                "{:>14}  {} masked ({} filled), {} gather misses, {} without gradient, {} not finite",
+                "counts",
+                r.masked,
+                r.filled,
+                r.misses,
+                r.samples_without_gradient,
+                r.non_finite + r.non_finite_voxels
+            );
+            eprintln!("{:>14}  {}", "written", self.output.display());
+        }
+        Ok(())
+    }
+
+    /// The checkpoint of this bake, with what an interrupted run left if that is wanted.
+    fn checkpoint(&self, job: String) -> Result<Checkpoint> {
+        let path = self.checkpoint.clone().unwrap_or_else(|| {
+            let mut name = self.output.as_os_str().to_owned();
+            name.push(".checkpoint");
+            name.into()
+        });
+        let every = Duration::try_from_secs_f64(self.checkpoint_every).map_err(|_| {
+            Error::Invalid(format!("--checkpoint-every {}: must be seconds, 0 or more", self.checkpoint_every))
+        })?;
+        let checkpoint = Checkpoint::new(&path, job, every)?;
+        let label = if self.resume { "resumed" } else { "note" };
+        if !self.resume {
+            if path.exists() {
+                eprintln!("{label:>14}  {} holds an unfinished bake; --resume would go on with it", path.display());
+            }
+        } else if checkpoint.resume()? {
+            eprintln!("{label:>14}  {} finished blocks from {}", checkpoint.blocks(), path.display());
+        } else {
+            eprintln!("{label:>14}  nothing: there is no {}; starting from the beginning", path.display());
+        }
+        Ok(checkpoint)
+    }
+}
+
+/// Saves what is finished and says so.
+fn keep(checkpoint: &Checkpoint) {
+    match checkpoint.save() {
+        Ok(true) => {
+            eprintln!("progress is kept in {}; the same command with --resume goes on", checkpoint.path().display())
+        }
+        Ok(false) => {}
+        Err(e) => eprintln!("warning: the last progress could not be kept: {e}"),
+    }
+}
+
+/// A number of bytes with an optional K, M, G or T (powers of 1024).
+fn bytes(text: &str) -> std::result::Result<u64, String> {
+    let upper = text.to_ascii_uppercase();
+    let upper = upper.strip_suffix('B').unwrap_or(&upper);
+    let upper = upper.strip_suffix('I').unwrap_or(upper);
+    let (number, shift) = match upper.chars().last() {
+        Some('K') => (&upper[..upper.len() - 1], 10),
+        Some('M') => (&upper[..upper.len() - 1], 20),
+        Some('G') => (&upper[..upper.len() - 1], 30),
+        Some('T') => (&upper[..upper.len() - 1], 40),
+        _ => (upper, 0),
+    };
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "positive and below 2⁶⁴ by the check")]
+    match number.trim().parse::<f64>() {
+        Ok(n) if n > 0.0 && n < 2f64.powi(63 - shift) => Ok((n * 2f64.powi(shift)) as u64),
+        _ => Err(format!("'{text}' is no size; write bytes, or a number with K, M, G or T, such as 8G")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_have_units() {
+        for (text, n) in
+            [("1000", 1000), ("8G", 8 << 30), ("1.5k", 1536), ("500M", 500 << 20), ("2GiB", 2 << 30), ("1tb", 1 << 40)]
+        {
+            assert_eq!(bytes(text), Ok(n), "{text}");
+        }
+        for bad in ["", "G", "-1G", "x", "1e30", "nan", "0"] {
+            assert!(bytes(bad).is_err(), "{bad}");
+        }
+    }
+}

@@ -1,0 +1,265 @@
+//! What a bake survives: kills, interrupts, full disks, folders that cannot be written, too little memory.
+
+#![cfg(target_os = "linux")]
+
+use isolume::rng::{Rng, Stage};
+use isolume::volume::Samples;
+use isolume::volume::vti::VtiFile;
+use std::fs;
+use std::path::Path;
+use std::process::{Child, Command, Output, Stdio};
+use std::time::Duration;
+
+const PROGRAM: &str = env!("CARGO_BIN_EXE_isolume");
+
+/// A bake of a second or two, with checkpoints many times a second.
+const BAKE: [&str; 16] = [
+    "bake",
+    "b.vti",
+    "--isovalues",
+    "3.6",
+    "95",
+    "--photons",
+    "20000",
+    "--gather",
+    "48",
+    "--shadow-rays",
+    "64",
+    "--wall-resolution",
+    "8",
+    "--checkpoint-every",
+    "0.02",
+    "--sides=both",
+];
+
+fn volume(dir: &Path, size: &str) {
+    let mut command = Command::new(PROGRAM);
+    command.current_dir(dir).args(["generate", "bumps", "--size", size, "-o", "b.vti", "-q"]);
+    assert!(command.status().unwrap().success());
+}
+
+fn bake(dir: &Path, output: &str, more: &[&str]) -> Child {
+    let mut command = Command::new(PROGRAM);
+    command.current_dir(dir).args(BAKE).args(["-o", output]).args(more);
+    command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().expect("the program starts")
+}
+
+fn finish(child: Child) -> (Output, String) {
+    let output = child.wait_with_output().unwrap();
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    (output, text)
+}
+
+/// Every bit of light and every count.
+fn light(path: &Path) -> Vec<u64> {
+    let file = VtiFile::read(path).unwrap();
+    let counts = ["rays", "samples", "masked", "filled", "misses", "photons.stored", "samples_without_gradient"];
+    let fields = file.field_data.iter().filter(|a| a.name.starts_with("wall_") || counts.contains(&a.name.as_str()));
+    let mut bits = Vec::new();
+    for array in file.point_data.iter().chain(fields) {
+        match &array.samples {
+            Samples::F32(v) => bits.extend(v.iter().map(|x| u64::from(x.to_bits()))),
+            Samples::F64(v) => bits.extend(v.iter().map(|x| x.to_bits())),
+            Samples::U8(v) => bits.extend(v.iter().map(|&x| u64::from(x))),
+            other => panic!("{}: {:?}", array.name, other.element_type()),
+        }
+    }
+    bits
+}
+
+#[test]
+fn twenty_kills_leave_no_trace_in_the_result() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    volume(dir, "33");
+    let (output, text) = finish(bake(dir, "whole.vti", &[]));
+    assert!(output.status.success(), "{text}");
+    assert!(!dir.join("whole.vti.checkpoint").exists(), "a finished bake needs no checkpoint");
+    let whole = light(&dir.join("whole.vti"));
+    let mut rng = Rng::stream(1, Stage::Test, 0);
+    let (mut killed, mut blocks, mut early) = (0, vec![0], 0);
+    let checkpoint = dir.join("cut.vti.checkpoint");
+    let length = || fs::metadata(&checkpoint).map_or(0, |m| m.len());
+    while killed < 20 {
+        let before = length();
+        let mut child = bake(dir, "cut.vti", &["--resume"]);
+        // Every other kill comes at any time; the rest at any time after some progress, however busy the machine is.
+        if killed % 2 == 1 {
+            for _ in 0..3000 {
+                if length() > before || child.try_wait().unwrap().is_some() {
+                    break;
+                }
+                std::thread::sleep(Duration::from_millis(5));
+            }
+        }
+        std::thread::sleep(Duration::from_millis(rng.bits() % 150));
+        let running = child.try_wait().unwrap().is_none();
+        // SIGKILL.
+        child.kill().unwrap();
+        let (output, text) = finish(child);
+        if !running {
+            // The last kills left little to do: check it, and begin again.
+            assert!(output.status.success(), "{text}");
+            assert!(light(&dir.join("cut.vti")) == whole, "the same bits");
+            fs::remove_file(dir.join("cut.vti")).unwrap();
+            (early, blocks) = (early + 1, vec![0]);
+            continue;
+        }
+        assert!(!output.status.success());
+        assert!(!dir.join("cut.vti").exists(), "no half result");
+        let resumed = text.lines().find(|l| l.contains("finished blocks"));
+        let found = resumed.map_or(0, |l| l.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap());
+        assert!(blocks.last() <= Some(&found) || resumed.is_none(), "progress is lost: {blocks:?}, then {found}");
+        blocks.extend(resumed.map(|_| found));
+        killed += 1;
+    }
+    let (output, text) = finish(bake(dir, "cut.vti", &["--resume", "--threads", "3"]));
+    assert!(output.status.success(), "{text}");
+    println!("{killed} kills, {early} runs that came through, blocks found: {blocks:?}");
+    assert!(blocks.iter().max() >= Some(&8), "kills came too early to test anything: {blocks:?}");
+    assert!(light(&dir.join("cut.vti")) == whole, "the same bits");
+    let left: Vec<_> = fs::read_dir(dir).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+    assert!(!left.iter().any(|n| n.contains("checkpoint")), "{left:?}");
+}
+
+#[test]
+fn an_interrupt_keeps_progress_and_the_old_result() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    volume(dir, "33");
+    fs::write(dir.join("out.vti"), "precious").unwrap();
+    for (signal, n) in [("-INT", 0), ("-TERM", 1)] {
+        let child = bake(dir, "out.vti", if n == 0 { &[] } else { &["--resume"] });
+        let checkpoint = dir.join("out.vti.checkpoint");
+        for _ in 0..500 {
+            if checkpoint.exists() {
+                break;
+            }
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        std::thread::sleep(Duration::from_millis(100));
+        assert!(Command::new("kill").args([signal, &child.id().to_string()]).status().unwrap().success());
+        let (output, text) = finish(child);
+        assert_eq!(output.status.code(), Some(130), "{text}");
+        assert!(text.contains("--resume") && text.contains("interrupted"), "{text}");
+        assert!(checkpoint.exists());
+        assert_eq!(fs::read(dir.join("out.vti")).unwrap(), b"precious");
+    }
+    // Other settings must not take these blocks.
+    let (output, text) = finish(bake(dir, "out.vti", &["--resume", "--seed", "7"]));
+    assert_eq!(output.status.code(), Some(2), "{text}");
+    assert!(text.contains("another bake") && text.contains("seed: 1") && text.contains("seed: 7"), "{text}");
+    // A file that is no checkpoint is not overwritten.
+    let (output, text) = finish(bake(dir, "out.vti", &["--checkpoint", "b.vti"]));
+    assert_eq!(output.status.code(), Some(2), "{text}");
+    assert!(text.contains("no checkpoint"), "{text}");
+    // A damaged one is refused.
+    let mut bytes = fs::read(dir.join("out.vti.checkpoint")).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    fs::write(dir.join("out.vti.checkpoint"), bytes).unwrap();
+    let (output, text) = finish(bake(dir, "out.vti", &["--resume"]));
+    assert_eq!(output.status.code(), Some(2), "{text}");
+    assert!(text.contains("damaged"), "{text}");
+}
+
+/// Runs a bake that may write files of so many blocks of 512 bytes: a full disk, as far as a process can tell.
+fn with_small_files(dir: &Path, blocks: u32, more: &[&str]) -> (Output, String) {
+    let script = format!("trap '' XFSZ; ulimit -f {blocks}; exec \"$0\" \"$@\"");
+    let mut command = Command::new("sh");
+    command.current_dir(dir).args(["-c", &script, PROGRAM]).args(BAKE).args(["-o", "out.vti"]).args(more);
+    finish(command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap())
+}
+
+#[test]
+fn a_full_disk_is_one_clear_line_and_keeps_the_last_checkpoint() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    volume(dir, "17");
+    fs::write(dir.join("out.vti"), "precious").unwrap();
+    // Room for no checkpoint at all.
+    let (output, text) = with_small_files(dir, 16, &[]);
+    assert_eq!(output.status.code(), Some(1), "{text}");
+    assert!(text.contains("out.vti") && text.contains("arge"), "{text}");
+    assert_eq!(text.matches("no checkpoint could be written").count(), 1, "warned once: {text}");
+    // Room for some checkpoints, not for all nor for the result.
+    let (output, text) = with_small_files(dir, 300, &[]);
+    assert_eq!(output.status.code(), Some(1), "{text}");
+    assert_eq!(fs::read(dir.join("out.vti")).unwrap(), b"precious");
+    let left: Vec<_> = fs::read_dir(dir).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+    assert!(!left.iter().any(|n| n.ends_with(".tmp")), "{left:?}");
+    let (output, text) = finish(bake(dir, "out.vti", &["--resume"]));
+    assert!(output.status.success() && text.contains("finished blocks"), "{text}");
+    let (output, text) = finish(bake(dir, "whole.vti", &[]));
+    assert!(output.status.success(), "{text}");
+    assert!(light(&dir.join("out.vti")) == light(&dir.join("whole.vti")));
+}
+
+#[test]
+fn output_that_cannot_be_written_is_refused_at_once() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    volume(dir, "101");
+    // Not writable for anybody, nor an existing folder.
+    for output in ["/sys/out.vti", "nowhere/out.vti"] {
+        let begun = std::time::Instant::now();
+        let (done, text) = finish(bake(dir, output, &[]));
+        assert_eq!(done.status.code(), Some(2), "{text}");
+        assert!(text.lines().count() == 1 && text.contains(output), "{text}");
+        assert!(begun.elapsed() < Duration::from_secs(2), "before the work, not behind it");
+    }
+}
+
+/// Peak resident memory of a bake, bytes; and the estimate it printed.
+fn memory(dir: &Path, more: &[&str]) -> (f64, f64) {
+    let mut command = Command::new(PROGRAM);
+    command.current_dir(dir).args(["bake", "b.vti", "-o", "m.vti", "--isovalues", "3.6", "95", "--threads", "2"]);
+    let mut child = command.args(more).stderr(Stdio::piped()).spawn().unwrap();
+    let status = format!("/proc/{}/status", child.id());
+    let mut peak = 0f64;
+    while child.try_wait().unwrap().is_none() {
+        let text = fs::read_to_string(&status).unwrap_or_default();
+        let line = text.lines().find(|l| l.starts_with("VmHWM:"));
+        if let Some(kb) = line.and_then(|l| l.split_whitespace().nth(1)?.parse::<f64>().ok()) {
+            peak = peak.max(1024.0 * kb);
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    let (output, text) = finish(child);
+    assert!(output.status.success(), "{text}");
+    let line = text.lines().find(|l| l.contains("at its peak")).expect("the estimate is printed");
+    let mut words = line.split_whitespace().skip_while(|w| *w != "about").skip(1);
+    let number: f64 = words.next().unwrap().parse().unwrap();
+    let unit = if words.next() == Some("GB") { 1e9 } else { 1e6 };
+    (peak, number * unit)
+}
+
+#[test]
+fn the_memory_estimate_is_near_the_peak() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let few = ["--gather", "1", "--shadow-rays", "1", "--wall-resolution", "8"];
+    let mut measured = Vec::new();
+    for (size, more) in [
+        ("33", &["--photons", "1000000"][..]),
+        ("101", &["--photons", "200000"]),
+        ("101", &["--photons", "20000", "--engine", "sweep", "--directions", "8", "--light-points", "1"]),
+    ] {
+        volume(dir, size);
+        let (peak, estimate) = memory(dir, &[&few[..], more].concat());
+        println!("{size}³ {more:?}: peak {:.0} MB, estimate {:.0} MB", peak / 1e6, estimate / 1e6);
+        measured.push(peak / estimate);
+    }
+    assert!(measured.iter().all(|r| (0.5..1.3).contains(r)), "peak over estimate: {measured:?}");
+    let refused = |most: &str| {
+        let mut command = Command::new(PROGRAM);
+        command.current_dir(dir).args(["bake", "b.vti", "-o", "x.vti", "--isovalues", "3.6", "95"]);
+        finish(command.args(["--max-memory", most, "--dry-run"]).stderr(Stdio::piped()).spawn().unwrap())
+    };
+    let (output, text) = refused("20M");
+    assert_eq!(output.status.code(), Some(2), "{text}");
+    assert!(text.contains("--max-memory") && text.contains("at its peak"), "{text}");
+    let (output, text) = refused("64G");
+    assert!(output.status.success() && text.contains("at its peak"), "{text}");
+    assert!(!dir.join("x.vti").exists(), "a dry run writes nothing");
+}
