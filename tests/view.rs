@@ -258,6 +258,16 @@ fn the_browser_shows_what_render_draws() {
         const states = [];
         for (const k of [']', 'ArrowLeft', 'ArrowUp', '+', 'g', 'w', 'c', 'h', 'r']) { key(k); states.push(JSON.stringify(isolume.state)); }
         await post('keys', JSON.stringify(states));
+        const canvas = document.getElementById('view');
+        canvas.setPointerCapture = () => {};
+        const finger = (type, id, x, y) => canvas.dispatchEvent(new PointerEvent(type, { pointerId: id, clientX: x, clientY: y, buttons: 1 }));
+        finger('pointerdown', 1, 200, 200); finger('pointermove', 1, 220, 210);
+        const dragged = { ...isolume.state };
+        finger('pointerdown', 2, 300, 210); finger('pointermove', 2, 380, 210);
+        const pinched = { ...isolume.state };
+        finger('pointerup', 1, 0, 0); finger('pointerup', 2, 0, 0); finger('pointermove', 2, 0, 0);
+        canvas.dispatchEvent(new WheelEvent('wheel', { deltaY: 100, cancelable: true }));
+        await post('hands', JSON.stringify([dragged, pinched, isolume.state]));
         await post('milliseconds', String(isolume.time(5, 640, 480)));
         dispatchEvent(new Event('resize'));
         await new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)));
@@ -278,6 +288,11 @@ fn the_browser_shows_what_render_draws() {
     assert!(states.windows(2).enumerate().all(|(i, w)| (w[0] != w[1]) == (i != 6)), "{states:?}");
     let first: serde_json::Value = serde_json::from_str(states.last().unwrap()).unwrap();
     assert_eq!((first["iso"].as_f64(), first["zoom"].as_f64()), (Some(0.5), Some(1.0)));
+    let hands: Vec<serde_json::Value> = serde_json::from_slice(get("hands")).unwrap();
+    let number = |i: usize, key: &str| hands[i][key].as_f64().unwrap();
+    assert!((number(0, "azimuth") - 7.0).abs() < 1e-9 && (number(0, "elevation") - 3.5).abs() < 1e-9, "{hands:?}");
+    assert!((number(1, "zoom") - 2.0).abs() < 1e-9 && number(1, "azimuth") == number(0, "azimuth"), "{hands:?}");
+    assert!(number(2, "zoom") < number(1, "zoom") && number(2, "azimuth") == number(1, "azimuth"), "{hands:?}");
     println!("{} ms per frame of 640×480", String::from_utf8_lossy(get("milliseconds")));
 }
 

@@ -83,18 +83,18 @@ void main() {
   if (t0 >= t1) discard;
   vec3 length3 = abs(d);
   float stride = 0.5 / max(length3.x, max(length3.y, length3.z));
-  float t = t0, found = -1.0;
-  bool inside = value(o + d * t) >= u_iso, lower = true;
+  float t = t0, found = -1.0, leaves_block = t0;
+  bool inside = value(o + d * t) >= u_iso, lower = true, empty = false;
   if (u_capped && inside && faced) discard; // a cap, drawn as a wall
   for (int i = 0; i < u_most_steps; ++i) {
-    ivec3 block = clamp(ivec3((o + d * (t + 0.01 * stride)) / 8.0), ivec3(0), u_block_count - 1);
-    vec2 range = texelFetch(u_blocks, block, 0).rg;
-    float next = t + stride;
-    if (u_iso < range.x || u_iso > range.y) {
+    if (t >= leaves_block) {
+      ivec3 block = clamp(ivec3((o + d * (t + 0.01 * stride)) / 8.0), ivec3(0), u_block_count - 1);
+      vec2 range = texelFetch(u_blocks, block, 0).rg;
       vec3 leave = ((vec3(block) + vec3(greaterThan(d, vec3(0.0)))) * 8.0 - o) * inverse;
-      next = max(min(leave.x, min(leave.y, leave.z)), t) + 0.02 * stride;
+      empty = u_iso < range.x || u_iso > range.y;
+      leaves_block = max(min(leave.x, min(leave.y, leave.z)), t) + 0.02 * stride;
     }
-    next = min(next, t1);
+    float next = min(empty ? leaves_block : t + stride, t1);
     if ((value(o + d * next) >= u_iso) != inside) {
       float low = t, high = next;
       for (int k = 0; k < 9; ++k) {

@@ -14,7 +14,7 @@ const initial = () => ({
   walls: true, clip: "", cut: 0.5,
 });
 let state = initial();
-let gl, programs, textures = {}, flats = [], pending = false, quality = 1, busy = 0, last = 0, settle = 0, size = null;
+let gl, programs, textures = {}, flats = [], pending = false, quality = 1, busy = 0, last = 0, settle = 0, timer = 0, size = null;
 
 function fail(text) {
   for (const id of ["bar", "settings", "title", "help"]) $(id).hidden = true;
@@ -221,7 +221,8 @@ function frame(now) {
   if (now < settle) {
     const elapsed = now - last;
     if (busy++ > 1) quality = clamp(quality * (elapsed > 70 ? 0.75 : elapsed < 25 ? 1.15 : 1), 0.2, 1);
-    setTimeout(invalidate, Math.max(settle - performance.now(), 0) + 1);
+    clearTimeout(timer);
+    timer = setTimeout(invalidate, Math.max(settle - performance.now(), 0) + 1);
   } else busy = 0;
   last = now;
   draw();
