@@ -120,7 +120,7 @@ fn generate_info_bake_render() {
     }
     let output = isolume(dir, &["render", "out.vti", "--isovalue", "99", "-o", "x.png"]);
     assert_eq!(output.status.code(), Some(2));
-    assert!(text(&output.stderr).contains("outside the baked sweep"));
+    assert!(text(&output.stderr).contains("outside the sweep"));
 }
 
 #[test]

@@ -96,7 +96,7 @@ fn the_page_holds_the_bake_and_nothing_from_elsewhere() {
 }
 
 #[test]
-fn a_bake_too_large_for_a_browser_is_refused_and_volumes_are_no_bakes() {
+fn what_is_no_bake_or_no_page_is_refused() {
     let dir = tempfile::tempdir().unwrap();
     isolume(dir.path(), &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
     for (args, word) in [(["view", "b.vti", "-o", "p.html"], "is no bake"), (["view", "b.vti", "-o", "p.png"], ".html")]

@@ -29,7 +29,8 @@ const digits = (v) => String(Number(v.toPrecision(5)));
 async function unpack() {
   const text = $("data").textContent;
   $("data").textContent = "";
-  const packed = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  const binary = atob(text), packed = new Uint8Array(binary.length);
+  for (let i = 0; i < packed.length; ++i) packed[i] = binary.charCodeAt(i);
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
   const bytes = new Uint8Array(await new Response(stream).arrayBuffer());
   if (bytes.length !== scene.length) throw new Error(`the data hold ${bytes.length} bytes instead of ${scene.length}`);
