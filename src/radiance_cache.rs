@@ -292,8 +292,8 @@ fn passes(photons_per_texel: f64) -> [usize; 3] {
 
 /// Passes of ¼ ½ ¼ along each axis.
 fn smooth(mut image: Vec<DVec3>, dims: [usize; 3], passes: [usize; 3]) -> Vec<DVec3> {
-    for axis in 0..3 {
-        for _ in 0..passes[axis] {
+    for (axis, &count) in passes.iter().enumerate() {
+        for _ in 0..count {
             image = smooth_along(&image, dims, axis);
         }
     }
