@@ -198,7 +198,7 @@ fn compare(dir: &Path, program: &Path, views: &[View], driver: &str) -> Vec<(Str
                 picture.write_png(Path::new(&folder).join(format!("{}-{kind}.png", view.name)), 1.0).unwrap();
             }
         }
-        assert!(share > 0.6 && mean < 0.02 && beyond < 0.02, "{}", view.name);
+        assert!(share > 0.6 && mean < 0.005 && beyond < 0.003, "{}", view.name);
     }
     posted
 }
