@@ -18,6 +18,7 @@ mod directions;
 mod flats;
 mod gather;
 mod grid;
+mod half;
 mod pack;
 #[allow(unsafe_code, reason = "vector instructions: measured to pay, chosen at run time")]
 mod simd;
@@ -29,9 +30,11 @@ use crate::scene::{Boundary, Scene};
 use flats::Flats;
 use gather::Pass;
 use grid::{Geometry, Planes};
+use half::Half4;
 use rayon::prelude::*;
 use simd::Isa;
 use std::f32::consts::PI;
+use std::sync::Mutex;
 
 /// How to sweep.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -236,11 +239,12 @@ impl Run<'_> {
             inside: self.inside,
             primary: self.sides[0],
             isa: self.isa,
+            workspaces: Mutex::default(),
         };
         let nothing = flats.open();
         flats.close(nothing);
         flats.reflect([1.0; 3], false);
-        let mut b: Vec<Planes> = direct.iter().map(|d| self.reflect(d, None, [1.0; 3])).collect();
+        let (mut b, mut unit) = self.halves(flats, direct.iter().map(|d| self.reflect(d, None, [1.0; 3])).collect());
         let fixed = s.max_bounces < 6;
         let mut monitor = Monitor::default();
         let mut averaged = 0;
@@ -261,7 +265,7 @@ impl Run<'_> {
             };
             let mut fresh = Vec::new();
             for (&side, b) in self.sides.iter().zip(&b) {
-                let (e, complete) = pass.gather(side, &lines, b, flats, &mut incoming, &mut ask);
+                let (e, complete) = pass.gather(side, &lines, b, unit, flats, &mut incoming, &mut ask);
                 stopped |= !complete;
                 fresh.push(e);
             }
@@ -284,12 +288,11 @@ impl Run<'_> {
             averaged += usize::from(last_coarse && !fixed);
             let scale = if fixed { [1.0; 3] } else { monitor.push(mean) };
             flats.reflect(scale, true);
-            for ((b, d), e) in b.iter_mut().zip(&direct).zip(&indirect) {
-                *b = self.reflect(d, Some(e), scale);
-            }
-            if !fixed && averaged == FULL_PASSES {
+            if bounce == s.max_bounces || (!fixed && averaged == FULL_PASSES) {
                 break;
             }
+            let planes = direct.iter().zip(&indirect).map(|(d, e)| self.reflect(d, Some(e), scale)).collect();
+            (b, unit) = self.halves(flats, planes);
         }
         out.bounces = out.bounces.max(bounce);
         out.residual = monitor.missing(0).unwrap_or(f64::NAN).max(out.residual);
@@ -315,6 +318,14 @@ impl Run<'_> {
         });
         self.geometry.fill(&mut b);
         b
+    }
+
+    /// The sides' B and the flats', as lines read them, and what they are scaled by.
+    fn halves(&self, flats: &mut Flats, planes: Vec<Planes>) -> (Vec<Vec<Half4>>, f32) {
+        let greatest = |p: &Vec<f32>| p.par_iter().with_min_len(1 << 14).copied().reduce(|| 0.0, f32::max);
+        let unit = half::scale(planes.iter().flatten().map(greatest).fold(flats.greatest(), f32::max));
+        flats.pack(unit);
+        (planes.iter().map(|p| grid::halves(p, unit)).collect(), unit)
     }
 
     /// Indirect irradiance summed over valid nodes and sides, per channel.

@@ -3,13 +3,14 @@
 
 use super::flats::{Arrivals, Ends, Flats, Stop, fill_column};
 use super::gather::{Pass, local_bounds};
+use super::half::decode;
 use super::pack::{LANES, OUTSIDE, Pack, Plan};
 use crate::flattened::Side;
 use crate::rng::{Rng, Stage};
 use glam::DVec3;
 
 /// Lines per texel edge that report to walls: more would only cost.
-const LINES_PER_TEXEL: f64 = 2.0;
+const LINES_PER_TEXEL: f64 = 1.0;
 
 /// The walls' part of one family of lines.
 pub(super) struct Walls<'a> {
@@ -29,6 +30,8 @@ pub(super) struct Walls<'a> {
     /// Whether the box is wider than Ω, so that lines may miss Ω.
     margin: bool,
     caps: u32,
+    /// What packed radiance is multiplied by.
+    unit: f32,
 }
 
 impl<'a> Walls<'a> {
@@ -40,6 +43,7 @@ impl<'a> Walls<'a> {
         flats: &'a Flats,
         side: Side,
         families: usize,
+        unit: f32,
     ) -> Self {
         let shear = &plan.shear;
         let [lo, hi] = local_bounds(pass.scene);
@@ -74,6 +78,7 @@ impl<'a> Walls<'a> {
             primary: side == pass.primary,
             margin,
             caps: pass.scene.polygons().len() as u32,
+            unit,
         }
     }
 
@@ -175,8 +180,13 @@ impl<'a> Walls<'a> {
         let mut t = 0;
         let mut first = None;
         let mut before: Option<(usize, f32)> = None;
-        for step in 0..hi.saturating_sub(lo) {
-            let row = if forward { lo + step } else { hi - 1 - step };
+        // Rows that were not read hold nothing at these isovalues.
+        let count = pack.awake.len();
+        for step in 0..count {
+            let row = pack.awake[if forward { step } else { count - 1 - step }] as usize;
+            if row < lo || row >= hi {
+                continue;
+            }
             let h = pack.h[row][lane];
             if h == OUTSIDE || h.is_nan() {
                 continue;
@@ -194,9 +204,10 @@ impl<'a> Walls<'a> {
                 Some((old, h_old)) => {
                     while t < nc && height(t) <= h {
                         let f = ((height(t) - h_old) / (h - h_old)).clamp(0.0, 1.0);
+                        let [b0, b1] = [old, row].map(|r| pack.radiance[r * LANES + lane]);
                         for c in 0..3 {
-                            let b = &pack.b[c];
-                            values[c * nc + ordinal(t)] = (1.0 - f) * b[old][lane] + f * b[row][lane];
+                            values[c * nc + ordinal(t)] =
+                                self.unit * ((1.0 - f) * decode(b0[c]) + f * decode(b1[c]));
                         }
                         t += 1;
                     }

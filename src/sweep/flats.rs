@@ -3,6 +3,7 @@
 #![allow(clippy::needless_range_loop, reason = "a channel indexes several planes at once")]
 
 use super::directions::Shear;
+use super::half::{Half4, REBIAS, encode, raw};
 use crate::flat::{self, FlatTexture};
 use crate::scene::{Boundary, Scene};
 use glam::DVec3;
@@ -24,6 +25,8 @@ pub(super) struct Texture {
     pub indirect: Vec<f32>,
     /// Reflected radiance B.
     pub radiance: Vec<f32>,
+    /// B times the pass's scale, as lines read it: isovalues fastest.
+    packed: Vec<Half4>,
     /// ∫cos dω as the pass has seen it, per texel and isovalue: π where no part of it is inside the solid.
     weight: Vec<f32>,
 }
@@ -125,6 +128,7 @@ impl Flats {
                     direct: vec![0.0; n],
                     indirect: vec![0.0; n],
                     radiance: vec![0.0; n],
+                    packed: vec![[0; 4]; texels * isovalues],
                     weight: vec![0.0; texels * isovalues],
                 })
             })
@@ -135,6 +139,41 @@ impl Flats {
     /// Whether nothing reflects.
     pub(super) fn none(&self) -> bool {
         self.textures.iter().all(Option::is_none)
+    }
+
+    /// The greatest B.
+    pub(super) fn greatest(&self) -> f32 {
+        self.textures.iter().flatten().flat_map(|t| &t.radiance).fold(0.0, |m, x| m.max(*x))
+    }
+
+    /// Makes B times `scale` what lines read.
+    pub(super) fn pack(&mut self, scale: f32) {
+        for t in self.textures.iter_mut().flatten() {
+            let nc = t.dims[2];
+            let radiance = &t.radiance;
+            t.packed.par_chunks_mut(nc).enumerate().for_each(|(texel, out)| {
+                let b = &radiance[3 * texel * nc..][..3 * nc];
+                for (i, o) in out.iter_mut().enumerate() {
+                    *o = [encode(scale * b[i]), encode(scale * b[nc + i]), encode(scale * b[2 * nc + i]), 0];
+                }
+            });
+        }
+    }
+
+    /// Writes the packed B of a stop over isovalues; black where it shows none.
+    #[inline(always)]
+    pub(super) fn shine(&self, stop: Option<Stop>, out: &mut [Half4]) {
+        let texture = stop.and_then(|s| Some((self.textures[s.flat? as usize].as_ref()?, s.uv)));
+        let Some((texture, uv)) = texture else {
+            out.fill([0; 4]);
+            return;
+        };
+        let n = 4 * out.len();
+        let packed = texture.packed.as_flattened();
+        let [a, b, c, d] = around(texture.dims, uv).map(|(t, w)| (&packed[t * n..][..n], w * REBIAS));
+        for (i, o) in out.as_flattened_mut().iter_mut().enumerate() {
+            *o = encode((a.1 * raw(a.0[i]) + b.1 * raw(b.0[i])) + (c.1 * raw(c.0[i]) + d.1 * raw(d.0[i])));
+        }
     }
 
     /// Takes the sums of a pass out, empty, so that lines can read while walls receive.

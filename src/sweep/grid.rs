@@ -2,14 +2,16 @@
 //! of nodes without a surface.
 
 use super::directions::Layout;
+use super::half::{Half4, encode};
 use crate::field::Field;
+use crate::flattened::Side;
 use glam::DVec3;
 use rayon::prelude::*;
 
 /// Normals are stored in units of 1/32767.
 pub(super) const NORMAL_SCALE: f32 = 32767.0;
 
-/// Nodes this far outside the sweep, in its units, are still lit.
+/// Nodes this far outside the sweep, in its units, are still lit if a neighbour is in it.
 const OVERSHOOT: f32 = 0.1;
 
 /// Red, green and blue, a plane each, so that neighbouring lines load neighbouring numbers.
@@ -33,6 +35,80 @@ pub(super) struct Geometry<'a> {
     /// interpolate with than a copy.
     pub lit: Vec<bool>,
     rings: Vec<Vec<u32>>,
+    /// Per memory order, the blocks of lit nodes.
+    lit_blocks: [Blocks; 2],
+    /// Per side and memory order, the blocks of nodes within one node of those that reach the sweep.
+    awake: [[Blocks; 2]; 2],
+}
+
+/// For every row of nodes in memory, which blocks of [`Blocks::size`] nodes hold something.
+pub(super) struct Blocks {
+    /// Nodes in a block.
+    pub size: usize,
+    /// A bit per block of a row.
+    pub rows: Vec<u64>,
+}
+
+impl Blocks {
+    /// The blocks of nodes that `is` holds, in rows of `nu`; with `reach` neighbours along the row count too.
+    fn new(nu: usize, rows: usize, reach: usize, is: impl Fn(usize) -> bool + Sync) -> Self {
+        let size = nu.div_ceil(64).next_multiple_of(16);
+        let rows = (0..rows)
+            .into_par_iter()
+            .with_min_len(64)
+            .map(|row| {
+                let mut bits = 0u64;
+                for i in (0..nu).filter(|i| is(row * nu + i)) {
+                    bits |= 1 << (i.saturating_sub(reach) / size) | 1 << ((i + reach).min(nu - 1) / size);
+                }
+                bits
+            })
+            .collect();
+        Self { size, rows }
+    }
+
+    /// Joins every row with its neighbours along both other axes, the faster of which has `inner` rows.
+    fn joined(self, inner: usize) -> Self {
+        let outer = self.rows.len() / inner;
+        let rows = (0..self.rows.len())
+            .map(|row| {
+                let (i, o) = (row % inner, row / inner);
+                let mut bits = 0;
+                for o in o.saturating_sub(1)..(o + 2).min(outer) {
+                    for i in i.saturating_sub(1)..(i + 2).min(inner) {
+                        bits |= self.rows[o * inner + i];
+                    }
+                }
+                bits
+            })
+            .collect();
+        Self { size: self.size, rows }
+    }
+
+    /// Whether a block of `bits` meets nodes from..to.
+    #[inline(always)]
+    fn meets(&self, bits: u64, from: usize, to: usize) -> bool {
+        let (a, b) = (from / self.size, (to - 1) / self.size);
+        bits & (u64::MAX << a) & (u64::MAX >> (63 - b)) != 0
+    }
+}
+
+/// What lines read: h and B in one memory order.
+pub(super) struct Source<'a> {
+    pub h: &'a [f32],
+    pub b: &'a [Half4],
+    awake: &'a Blocks,
+    /// Rows of nodes from one v or slice to the next.
+    step: [usize; 2],
+}
+
+impl Source<'_> {
+    /// Whether nodes from..to of rows j and j + 1 in slice k may reach the sweep.
+    #[inline(always)]
+    pub(super) fn awake(&self, k: usize, j: usize, from: usize, to: usize) -> bool {
+        let row = j * self.step[0] + k * self.step[1];
+        self.awake.meets(self.awake.rows[row] | self.awake.rows[row + self.step[0]], from, to)
+    }
 }
 
 impl<'a> Geometry<'a> {
@@ -54,10 +130,44 @@ impl<'a> Geometry<'a> {
         let valid: Vec<bool> = h.iter().zip(&encoded).map(|(h, n)| (0.0..=1.0).contains(h) && *n != [0; 3]).collect();
         let normals: [Vec<i16>; 3] = std::array::from_fn(|a| encoded.iter().map(|n| n[a]).collect());
         let normals_transposed = std::array::from_fn(|a| transposed(&normals[a], dims));
-        let lit: Vec<bool> =
-            h.iter().zip(&encoded).map(|(h, n)| (-OVERSHOOT..=1.0 + OVERSHOOT).contains(h) && *n != [0; 3]).collect();
+        drop(encoded);
+        let near = |at: usize| (-OVERSHOOT..=1.0 + OVERSHOOT).contains(&h[at]) && (0..3).any(|a| normals[a][at] != 0);
+        let mut lit = valid.clone();
+        ring(dims, &valid).into_iter().filter(|at| near(*at as usize)).for_each(|at| lit[at as usize] = true);
         let rings = rings(dims, &lit);
-        Self { dims, h, h_transposed: transposed(h, dims), normals, normals_transposed, valid, lit, rings }
+        let h_transposed = transposed(h, dims);
+        let [nx, ny, nz] = dims;
+        // From y, z, x order.
+        let place = |at: usize| {
+            let (row, y) = (at / ny, at % ny);
+            (row % nz * ny + y) * nx + row / nz
+        };
+        let lit_blocks =
+            [Blocks::new(nx, ny * nz, 0, |at| lit[at]), Blocks::new(ny, nz * nx, 0, |at| lit[place(at)])];
+        let awake = [Side::Lower, Side::Higher].map(|side| {
+            let reaches = |h: f32| if side == Side::Lower { !(h < 0.0) } else { !(h > 1.0) };
+            [
+                Blocks::new(nx, ny * nz, 1, |at| reaches(h[at])).joined(ny),
+                Blocks::new(ny, nz * nx, 1, |at| reaches(h_transposed[at])).joined(nz),
+            ]
+        });
+        Self { dims, h, h_transposed, normals, normals_transposed, valid, lit, rings, lit_blocks, awake }
+    }
+
+    /// What lines of `side` read, with B in the memory order of `layout`.
+    pub(super) fn source<'s>(&'s self, layout: &Layout, side: Side, b: &'s [Half4]) -> Source<'s> {
+        let nu = layout.dims[0];
+        Source {
+            h: self.h(layout),
+            b,
+            awake: &self.awake[side.index()][usize::from(layout.transposed)],
+            step: layout.stride.map(|s| s / nu),
+        }
+    }
+
+    /// The lit nodes of rows in the memory order of `layout`.
+    pub(super) fn lit_blocks(&self, layout: &Layout) -> &Blocks {
+        &self.lit_blocks[usize::from(layout.transposed)]
     }
 
     /// h in the memory order of `layout`.
@@ -118,27 +228,42 @@ fn neighbours([nx, ny, nz]: [usize; 3], at: usize, mut visit: impl FnMut(usize))
     }
 }
 
-/// Nodes without surface that share a cell with a valid node, then those that share a cell with these.
+/// Nodes that are not known but share a cell with one that is.
 #[allow(clippy::cast_possible_truncation, reason = "nodes are numbered in 32 bits")]
-fn rings(dims: [usize; 3], valid: &[bool]) -> Vec<Vec<u32>> {
-    let mut known = valid.to_vec();
+fn ring(dims: [usize; 3], known: &[bool]) -> Vec<u32> {
+    (0..known.len())
+        .into_par_iter()
+        .with_min_len(1 << 12)
+        .filter(|&at| {
+            let mut any = false;
+            if !known[at] {
+                neighbours(dims, at, |n| any |= known[n]);
+            }
+            any
+        })
+        .map(|at| at as u32)
+        .collect()
+}
+
+/// Nodes without light that share a cell with a lit node, then those that share a cell with these.
+fn rings(dims: [usize; 3], lit: &[bool]) -> Vec<Vec<u32>> {
+    let mut known = lit.to_vec();
     (0..2)
         .map(|_| {
-            let ring: Vec<u32> = (0..known.len())
-                .into_par_iter()
-                .with_min_len(1 << 12)
-                .filter(|&at| {
-                    let mut any = false;
-                    if !known[at] {
-                        neighbours(dims, at, |n| any |= known[n]);
-                    }
-                    any
-                })
-                .map(|at| at as u32)
-                .collect();
+            let ring = ring(dims, &known);
             ring.iter().for_each(|&at| known[at as usize] = true);
             ring
         })
+        .collect()
+}
+
+/// Radiance times `scale` in half precision.
+pub(super) fn halves(planes: &Planes, scale: f32) -> Vec<Half4> {
+    let [r, g, b] = planes;
+    (r, g, b)
+        .into_par_iter()
+        .with_min_len(1 << 12)
+        .map(|(r, g, b)| [encode(scale * r), encode(scale * g), encode(scale * b), 0])
         .collect()
 }
 

@@ -3,8 +3,9 @@
 #![allow(clippy::needless_range_loop, reason = "a channel indexes several planes at once")]
 
 use super::directions::Shear;
-use super::flats::{Ends, Flats, Stop, fill_column};
-use super::grid::Planes;
+use super::flats::{Ends, Flats, Stop};
+use super::grid::Source;
+use super::half::{Half4, REBIAS, decode, encode, raw};
 
 /// Lines in a pack.
 pub(super) const LANES: usize = 16;
@@ -12,6 +13,8 @@ pub(super) const LANES: usize = 16;
 pub(super) type Lanes = [f32; LANES];
 /// h where a line is outside Ω.
 pub(super) const OUTSIDE: f32 = f32::NEG_INFINITY;
+/// h where it was not read, since nothing there reaches the sweep: below everything, so that no ray ends there.
+pub(super) const ASLEEP: f32 = f32::MIN;
 
 /// Everything about one family of lines that its rows share.
 pub(super) struct Plan {
@@ -68,37 +71,27 @@ impl Plan {
     }
 }
 
-/// Numbers at four samples and their weights: any point of a face of a cell.
+/// Weights of the four samples around a line, at those offsets.
 #[derive(Clone, Copy)]
 struct Taps {
     at: [isize; 4],
     weight: [f32; 4],
 }
 
-impl Taps {
-    #[inline(always)]
-    fn one(&self, plane: &[f32], lane: isize) -> f32 {
-        let s = |t: usize| self.weight[t] * plane[(self.at[t] + lane).unsigned_abs()];
-        (s(0) + s(1)) + (s(2) + s(3))
-    }
+/// Σ weight · x over four rows.
+#[inline(always)]
+fn mix<const N: usize>(weight: [f32; 4], rows: [&[f32; N]; 4]) -> [f32; N] {
+    let [a, b, c, d] = rows;
+    std::array::from_fn(|l| (weight[0] * a[l] + weight[1] * b[l]) + (weight[2] * c[l] + weight[3] * d[l]))
+}
 
-    /// Lanes `lo..hi` of a pack that starts at memory position `at + 0`.
-    #[inline(always)]
-    fn many(&self, plane: &[f32], lo: usize, hi: usize, out: &mut Lanes) {
-        if lo == 0 && hi == LANES {
-            let lanes = |t: usize| -> &[f32; LANES] {
-                plane[self.at[t].unsigned_abs()..][..LANES].try_into().expect("sixteen lanes")
-            };
-            let (a, b, c, d) = (lanes(0), lanes(1), lanes(2), lanes(3));
-            let w = self.weight;
-            for l in 0..LANES {
-                out[l] = (w[0] * a[l] + w[1] * b[l]) + (w[2] * c[l] + w[3] * d[l]);
-            }
-        } else {
-            for (l, o) in out.iter_mut().enumerate().take(hi).skip(lo) {
-                *o = self.one(plane, l as isize);
-            }
-        }
+/// [`mix`] of halves, as a half.
+#[inline(always)]
+fn mix_halves(weight: [f32; 4], rows: [&[u16; 4 * LANES]; 4], out: &mut [u16; 4 * LANES]) {
+    let [a, b, c, d] = rows;
+    let w = weight.map(|w| w * REBIAS);
+    for l in 0..4 * LANES {
+        out[l] = encode((w[0] * raw(a[l]) + w[1] * raw(b[l])) + (w[2] * raw(c[l]) + w[3] * raw(d[l])));
     }
 }
 
@@ -113,8 +106,6 @@ pub(super) struct Cut {
 /// How to scan.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Way {
-    /// Rays run towards +τ.
-    pub forward: bool,
     /// The next value must be greater, not only as great: the higher side.
     pub strict: bool,
     /// The sign h was read with.
@@ -125,107 +116,154 @@ pub(super) struct Way {
 /// line's entry and exit through Ω's sides stand in the rows before its first and after its last slice.
 pub(super) struct Pack {
     pub h: Vec<Lanes>,
-    pub b: [Vec<Lanes>; 3],
-    pub next: Vec<[u32; LANES]>,
-    pub h_next: Vec<Lanes>,
-    /// Rows that hold samples.
-    pub rows: (usize, usize),
+    /// B of sample (row, lane) at 16 · row + lane, then that of ends over isovalues: slot = lane for + ends, 16 + lane for
+    /// − ends, then cuts.
+    pub radiance: Vec<Half4>,
+    /// Per direction (+, −), the place in `radiance` of the sample or end that the ray from each sample meets, and h there.
+    pub next: [Vec<[u32; LANES]>; 2],
+    pub h_next: [Vec<Lanes>; 2],
+    /// The rows that were read, ascending: all that reach the sweep.
+    pub awake: Vec<u32>,
+    is_awake: Vec<bool>,
     pub cuts: Vec<Cut>,
-    /// Radiance of ends over isovalues: slot = lane for + ends, 16 + lane for − ends, then cuts.
-    pub columns: Vec<f32>,
     pub isovalues: usize,
-    pub dark: bool,
+    dark: bool,
     scratch: Vec<[Stop; 2]>,
 }
 
 impl Pack {
-    pub(super) fn new(slices: usize, flats: &Flats) -> Self {
-        Self { dark: flats.none(), ..Self::with_rows(slices + 2, flats.isovalues) }
+    /// Makes room for lines through so many slices.
+    pub(super) fn fit(&mut self, slices: usize, flats: &Flats) {
+        if (self.h.len(), self.isovalues) != (slices + 2, flats.isovalues) {
+            *self = Self::with_rows(slices + 2, flats.isovalues);
+        }
+        self.dark = flats.none();
     }
 
-    /// Nothing, in so many rows, with ends that shine over `isovalues`.
+    /// Nothing, in so many rows, with black ends over `isovalues`.
     pub(super) fn with_rows(rows: usize, isovalues: usize) -> Self {
-        let zero = || vec![[0.0; LANES]; rows];
+        let next = || vec![[0; LANES]; rows];
+        let h_next = || vec![[0.0; LANES]; rows];
         Self {
             h: vec![[OUTSIDE; LANES]; rows],
-            b: [zero(), zero(), zero()],
-            next: vec![[0; LANES]; rows],
-            h_next: zero(),
-            rows: (0, 0),
+            radiance: vec![[0; 4]; rows * LANES + 2 * LANES * isovalues],
+            next: [next(), next()],
+            h_next: [h_next(), h_next()],
+            awake: Vec::new(),
+            is_awake: vec![false; rows],
             cuts: Vec::new(),
-            columns: vec![0.0; 2 * LANES * 3 * isovalues],
             isovalues,
             dark: false,
             scratch: Vec::new(),
         }
     }
 
-    /// Reads h and B along lines (first + lane, q). Returns whether any of them meets Ω.
+    /// Where the ends' radiance starts.
+    pub(super) fn ends(&self) -> usize {
+        self.h.len() * LANES
+    }
+
+    /// Reads h and B along lines (first + lane, q), where they reach the sweep. Returns whether any does.
     #[inline(always)]
-    pub(super) fn read(&mut self, plan: &Plan, h: &[f32], b: &Planes, first: isize, q: isize) -> bool {
+    pub(super) fn read(&mut self, plan: &Plan, source: &Source, first: isize, q: isize) -> bool {
         let [nu, nv, na] = plan.shear.layout.dims;
         let [sv, sa] = plan.shear.layout.stride;
-        let mut range = (usize::MAX, 0);
-        let mut before: Option<(usize, usize)> = None;
+        let h = source.h;
+        let b = source.b.as_flattened();
+        self.is_awake.fill(false);
         self.h[0] = [OUTSIDE; LANES];
         self.h[na + 1] = [OUTSIDE; LANES];
+        let mut any = false;
+        let mut before: Option<(usize, usize, bool)> = None;
         for k in 0..na {
             let (uk, fu) = plan.shift[0][k];
             let (vk, fv) = plan.shift[1][k];
             let (i, j) = (first + uk, q + vk);
             // Lanes whose cell lies in Ω.
             #[allow(clippy::cast_sign_loss, reason = "clamped")]
-            let mut lanes = ((-i).clamp(0, 16) as usize, (nu as isize - 1 - i).clamp(0, 16) as usize);
-            if j < 0 || j > nv as isize - 2 || lanes.0 >= lanes.1 {
-                lanes = (0, 0);
+            let (mut lo, mut hi) = ((-i).clamp(0, 16) as usize, (nu as isize - 1 - i).clamp(0, 16) as usize);
+            if j < 0 || j > nv as isize - 2 || lo >= hi {
+                (lo, hi) = (0, 0);
             }
             let row = k + 1;
-            let (lo, hi) = lanes;
-            if lo < hi {
-                let at = k as isize * sa as isize + j * sv as isize + i;
+            let at = k as isize * sa as isize + j * sv as isize + i;
+            let awake = lo < hi && {
+                let node = (i + lo as isize).unsigned_abs();
+                source.awake(k, j.unsigned_abs(), node, node + hi - lo + 1)
+            };
+            if awake {
                 let taps = Taps {
                     at: [at, at + 1, at + sv as isize, at + sv as isize + 1],
                     weight: [(1.0 - fu) * (1.0 - fv), fu * (1.0 - fv), (1.0 - fu) * fv, fu * fv],
                 };
-                // Whole packs wherever memory allows: lanes outside Ω read a neighbouring row and are blanked.
-                let whole = at >= 0 && at.unsigned_abs() + sv + 1 + LANES <= h.len();
-                let (l0, l1) = if whole { (0, LANES) } else { (lo, hi) };
-                let line = &mut self.h[row];
-                Taps { weight: taps.weight.map(|w| w * plan.sign), ..taps }.many(h, l0, l1, line);
-                for (l, x) in line.iter_mut().enumerate() {
-                    *x = if lo <= l && l < hi { *x } else { OUTSIDE };
-                }
-                for c in 0..3 {
-                    taps.many(&b[c], l0, l1, &mut self.b[c][row]);
-                }
-                range = (range.0.min(row), row);
+                self.take(&taps, plan.sign, h, b, row, (lo, hi));
+                self.is_awake[row] = true;
+                any = true;
             } else {
-                self.h[row] = [OUTSIDE; LANES];
+                let line = &mut self.h[row];
+                for l in 0..LANES {
+                    line[l] = if lo <= l && l < hi { ASLEEP } else { OUTSIDE };
+                }
             }
             // Lanes that entered through a side get their entry point in the row before, those that left theirs here.
-            let old = before.unwrap_or((0, 0));
-            if lanes != old && k > 0 {
+            let old = before.unwrap_or((0, 0, false));
+            if (lo, hi) != (old.0, old.1) && k > 0 && (awake || old.2) {
                 for lane in 0..LANES {
                     let (was, is) = (old.0 <= lane && lane < old.1, lo <= lane && lane < hi);
-                    if is && !was {
-                        self.side(plan, h, b, (first + lane as isize, q), lane, k, false);
-                        range.0 = range.0.min(row - 1);
-                    } else if was && !is {
-                        self.side(plan, h, b, (first + lane as isize, q), lane, k - 1, true);
-                        range.1 = range.1.max(row);
+                    if is && !was && awake {
+                        self.side(plan, source, (first + lane as isize, q), lane, k, false);
+                    } else if was && !is && old.2 {
+                        self.side(plan, source, (first + lane as isize, q), lane, k - 1, true);
                     }
                 }
             }
-            before = Some(lanes);
+            before = Some((lo, hi, awake));
         }
-        self.rows = if range.0 == usize::MAX { (0, 0) } else { (range.0, range.1 + 1) };
-        self.rows.1 > 0
+        self.awake.clear();
+        #[allow(clippy::cast_possible_truncation, reason = "rows of a pack")]
+        self.awake.extend(self.is_awake.iter().enumerate().filter(|(_, a)| **a).map(|(row, _)| row as u32));
+        any
+    }
+
+    /// Reads one row, lanes `lo..hi` of which lie in Ω.
+    #[inline(always)]
+    fn take(&mut self, taps: &Taps, sign: f32, h: &[f32], b: &[u16], row: usize, (lo, hi): (usize, usize)) {
+        let line = &mut self.h[row];
+        let weight = taps.weight.map(|w| w * sign);
+        let out = self.radiance[row * LANES..][..LANES].as_flattened_mut();
+        let out: &mut [u16; 4 * LANES] = out.try_into().expect("sixteen lanes");
+        // Whole packs wherever memory allows: lanes outside Ω read a neighbouring row and are blanked.
+        if taps.at[0] >= 0 && taps.at[3].unsigned_abs() + LANES <= h.len() {
+            let at = taps.at.map(isize::unsigned_abs);
+            let lanes = at.map(|t| -> &[f32; LANES] { h[t..][..LANES].try_into().expect("sixteen lanes") });
+            let mixed = mix(weight, lanes);
+            if hi - lo == LANES {
+                *line = mixed;
+            } else {
+                for l in 0..LANES {
+                    line[l] = if lo <= l && l < hi { mixed[l] } else { OUTSIDE };
+                }
+            }
+            let rows = at.map(|t| -> &[u16; 4 * LANES] { b[4 * t..][..4 * LANES].try_into().expect("as above") });
+            mix_halves(taps.weight, rows, out);
+        } else {
+            *line = [OUTSIDE; LANES];
+            for l in lo..hi {
+                let at = taps.at.map(|t| (t + l as isize).unsigned_abs());
+                let w = weight;
+                line[l] = (w[0] * h[at[0]] + w[1] * h[at[1]]) + (w[2] * h[at[2]] + w[3] * h[at[3]]);
+                let w = taps.weight.map(|w| w * REBIAS);
+                for c in 0..4 {
+                    let x = at.map(|t| raw(b[4 * t + c]));
+                    out[4 * l + c] = encode((w[0] * x[0] + w[1] * x[1]) + (w[2] * x[2] + w[3] * x[3]));
+                }
+            }
+        }
     }
 
     /// Adds the point where a line whose first or last slice is `k` meets Ω's side.
-    #[allow(clippy::too_many_arguments, reason = "one caller")]
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
-    fn side(&mut self, plan: &Plan, h: &[f32], b: &Planes, pq: (isize, isize), lane: usize, k: usize, leaves: bool) {
+    fn side(&mut self, plan: &Plan, source: &Source, pq: (isize, isize), lane: usize, k: usize, leaves: bool) {
         let [nu, nv, na] = plan.shear.layout.dims;
         let [sv, sa] = plan.shear.layout.stride;
         let span = plan.span(pq.0 as f64, pq.1 as f64);
@@ -238,28 +276,29 @@ impl Pack {
         let (i, j, l) = (cell(x, nu), cell(y, nv), cell(tau.clamp(0.0, na as f64 - 1.0), na));
         let f = [x - i as f64, y - j as f64, tau - l as f64].map(|f| f as f32);
         let at = l * sa + j * sv + i;
-        let value = |plane: &[f32]| {
+        let value = |plane: &dyn Fn(usize) -> f32| {
             let lerp = |t: f32, a: f32, b: f32| a + t * (b - a);
-            let edge = |o: usize| lerp(f[0], plane[o], plane[o + 1]);
+            let edge = |o: usize| lerp(f[0], plane(o), plane(o + 1));
             let face = |o: usize| lerp(f[1], edge(o), edge(o + sv));
             lerp(f[2], face(at), face(at + sa))
         };
         let row = if leaves { k + 2 } else { k };
-        self.h[row][lane] = plan.sign * value(h);
-        for c in 0..3 {
-            self.b[c][row][lane] = value(&b[c]);
-        }
+        self.is_awake[row] = true;
+        self.h[row][lane] = plan.sign * value(&|o| source.h[o]);
+        self.radiance[row * LANES + lane] =
+            std::array::from_fn(|c| encode(value(&|o| decode(source.b[o][c])).max(0.0)));
     }
 
     /// Finds what the lines end on and reads the radiance there. `first` and `q` as in [`Pack::read`].
     #[inline(always)]
     pub(super) fn end(&mut self, plan: &Plan, ends: &Ends, flats: &Flats, first: isize, q: isize) {
         self.cuts.clear();
-        let n = 3 * self.isovalues;
+        let n = self.isovalues;
         if self.dark && !ends.cut() {
             return;
         }
-        self.columns.truncate(2 * LANES * n);
+        let base = self.ends();
+        self.radiance.truncate(base + 2 * LANES * n);
         for lane in 0..LANES {
             let (p, q) = ((first + lane as isize) as f64, q as f64);
             let span = plan.span(p, q);
@@ -268,16 +307,16 @@ impl Pack {
             }
             for (slot, from, forward) in [(lane, span[1], true), (LANES + lane, span[0], false)] {
                 let stop = ends.stop(p, q, from, forward, None);
-                fill_column(flats, stop, &mut self.columns[slot * n..][..n]);
+                flats.shine(stop, &mut self.radiance[base + slot * n..][..n]);
             }
             if ends.cut() {
                 let mut scratch = std::mem::take(&mut self.scratch);
                 ends.cuts(p, q, span[0], span[1], &mut scratch);
                 for &[before, behind] in &scratch {
-                    let slot = self.columns.len() / n;
-                    self.columns.resize((slot + 2) * n, 0.0);
-                    fill_column(flats, Some(before), &mut self.columns[slot * n..][..n]);
-                    fill_column(flats, Some(behind), &mut self.columns[(slot + 1) * n..][..n]);
+                    let slot = (self.radiance.len() - base) / n;
+                    self.radiance.resize(base + (slot + 2) * n, [0; 4]);
+                    flats.shine(Some(before), &mut self.radiance[base + slot * n..][..n]);
+                    flats.shine(Some(behind), &mut self.radiance[base + (slot + 1) * n..][..n]);
                     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a row of the pack")]
                     let (row, slot) = (before.tau.floor() as usize + 1, slot as u32);
                     self.cuts.push(Cut { row, lane, slots: [slot, slot + 1] });
@@ -287,88 +326,128 @@ impl Pack {
         }
     }
 
-    /// For every sample, the radiance its ray towards +τ (`forward`) or −τ meets: B where h is first back at the sample's
+    /// The end that a lane's rays meet which meet nothing else.
+    #[inline(always)]
+    #[allow(clippy::cast_possible_truncation, reason = "places in a pack")]
+    pub(super) fn last(&self, lane: usize, forward: bool) -> u32 {
+        (self.ends() + (lane + if forward { 0 } else { LANES }) * self.isovalues) as u32
+    }
+
+    /// The place of a slot's radiance.
+    #[inline(always)]
+    #[allow(clippy::cast_possible_truncation, reason = "places in a pack")]
+    pub(super) fn slot(&self, slot: u32) -> u32 {
+        (self.ends() + slot as usize * self.isovalues) as u32
+    }
+
+    /// For every sample, the radiance that its ray meets which leaves downhill: B where h is first back at the sample's
     /// value, or what stands at the end. \[BSV93: all nearest greater values, one line per lane\]
     ///
-    /// Writes slice k to `out` at k · width + start. With `strict` the next value must be greater.
-    #[allow(clippy::cast_possible_truncation, reason = "rows of a pack")]
-    pub(super) fn scan(&mut self, way: Way, out: &mut [Vec<f32>], (width, start): (usize, usize)) {
-        let Way { forward, strict, sign } = way;
-        let rows = self.h.len();
-        let end = rows as u32;
-        let default = |lane: usize| end + (lane + if forward { 0 } else { LANES }) as u32;
-        let mut at: [u32; LANES] = std::array::from_fn(default);
-        let mut top = [f32::INFINITY; LANES];
-        let (from, to) = self.rows;
-        for step in 0..to - from {
-            let row = if forward { to - 1 - step } else { from + step };
-            // Cuts behind this row close what lies beyond them; the nearest comes last.
-            let cut_row = if forward { row } else { row.wrapping_sub(1) };
-            let mut reset = |cut: &Cut| {
-                if cut.row == cut_row {
-                    at[cut.lane] = end + cut.slots[usize::from(!forward)];
-                    top[cut.lane] = f32::INFINITY;
-                }
-            };
-            if forward {
-                self.cuts.iter().rev().for_each(&mut reset);
-            } else {
-                self.cuts.iter().for_each(&mut reset);
-            }
-            let h = self.h[row];
-            let mut light = [[0f32; LANES]; 3];
+    /// Uphill the ray of the same line runs inside the solid; which way is downhill tells the neighbouring samples, as the
+    /// receiver normal does. Writes slice k to `out` at k · width + start.
+    pub(super) fn scan(&mut self, way: Way, out: &mut [Vec<f32>], place: (usize, usize)) {
+        self.link(way, true);
+        self.link(way, false);
+        self.look(way, out, place);
+    }
+
+    /// Finds for every sample the next value ≥ its own towards +τ (`forward`) or −τ; with `strict` it must be greater.
+    #[allow(clippy::cast_possible_truncation, reason = "places in a pack")]
+    fn link(&mut self, way: Way, forward: bool) {
+        let default: [u32; LANES] = std::array::from_fn(|lane| self.last(lane, forward));
+        let (mut at, mut top) = (default, [f32::INFINITY; LANES]);
+        let d = usize::from(!forward);
+        for step in 0..self.awake.len() {
+            let row = self.awake[if forward { self.awake.len() - 1 - step } else { step }] as usize;
+            self.close(row, forward, |lane, place| (at[lane], top[lane]) = (place, f32::INFINITY));
             for lane in 0..LANES {
-                let value = h[lane];
+                let value = self.h[row][lane];
                 if value == OUTSIDE {
-                    at[lane] = default(lane);
-                    top[lane] = f32::INFINITY;
+                    (at[lane], top[lane]) = (default[lane], f32::INFINITY);
                     continue;
                 }
                 if value.is_nan() {
                     continue;
                 }
                 let (mut j, mut t) = (at[lane], top[lane]);
-                while t < value || (strict && t == value) {
-                    t = self.h_next[j as usize][lane];
-                    j = self.next[j as usize][lane];
+                while t < value || (way.strict && t == value) {
+                    t = self.h_next[d].as_flattened()[j as usize];
+                    j = self.next[d].as_flattened()[j as usize];
                 }
-                self.next[row][lane] = j;
-                self.h_next[row][lane] = t;
-                (at[lane], top[lane]) = (row as u32, value);
-                if j >= end {
-                    if !self.dark {
-                        let column = &self.columns[(j - end) as usize * 3 * self.isovalues..][..3 * self.isovalues];
-                        let rgb = at_isovalue(column, self.isovalues, sign * value);
-                        (0..3).for_each(|c| light[c][lane] = rgb[c]);
-                    }
-                } else {
-                    let j = j as usize;
-                    let before = if forward { j - 1 } else { j + 1 };
-                    let f = (value - self.h[before][lane]) / (t - self.h[before][lane]);
-                    // Also where the sample before is missing (NaN): then the later one counts alone.
-                    let f = if f < 1.0 { f.max(0.0) } else { 1.0 };
-                    for c in 0..3 {
-                        let b = &self.b[c];
-                        light[c][lane] = (1.0 - f) * b[before][lane] + f * b[j][lane];
-                    }
-                }
+                self.next[d][row][lane] = j;
+                self.h_next[d][row][lane] = t;
+                (at[lane], top[lane]) = ((row * LANES + lane) as u32, value);
             }
-            if row > 0 && row < rows - 1 {
+        }
+    }
+
+    /// Calls `close` with the lanes of which cuts close what lies beyond them when a scan comes to `row`, and the place of
+    /// what they show. Rows between that were not read count.
+    #[inline(always)]
+    pub(super) fn close(&self, row: usize, forward: bool, mut close: impl FnMut(usize, u32)) {
+        if self.cuts.is_empty() {
+            return;
+        }
+        let position = self.awake.binary_search(&u32::try_from(row).expect("a row")).expect("a row that was read");
+        // Cuts after row r lie between r and r + 1; the nearest comes last.
+        let (from, to) = if forward {
+            (row, self.awake.get(position + 1).map_or(usize::MAX, |r| *r as usize))
+        } else {
+            (position.checked_sub(1).map_or(0, |p| self.awake[p] as usize), row)
+        };
+        let mut each = |cut: &Cut| {
+            if (from..to).contains(&cut.row) {
+                close(cut.lane, self.slot(cut.slots[usize::from(!forward)]));
+            }
+        };
+        if forward {
+            self.cuts.iter().rev().for_each(&mut each);
+        } else {
+            self.cuts.iter().for_each(&mut each);
+        }
+    }
+
+    /// Reads the radiance that the samples' downhill rays meet.
+    fn look(&self, way: Way, out: &mut [Vec<f32>], (width, start): (usize, usize)) {
+        let (rows, ends) = (self.h.len(), self.ends());
+        for &row in &self.awake {
+            let row = row as usize;
+            if row == 0 || row == rows - 1 {
+                continue;
+            }
+            for lane in 0..LANES {
+                let value = self.h[row][lane];
+                let mut light = [0f32; 3];
+                if value.is_finite() {
+                    let forward = self.h[row + 1][lane] < self.h[row - 1][lane];
+                    let d = usize::from(!forward);
+                    let (j, t) = (self.next[d][row][lane] as usize, self.h_next[d][row][lane]);
+                    let (a, b, f) = if j < ends {
+                        let near = if forward { j - LANES } else { j + LANES };
+                        let h0 = self.h.as_flattened()[near];
+                        let f = (value - h0) / (t - h0);
+                        // Also where the sample before is missing (NaN): then the later one counts alone.
+                        (near, j, if f < 1.0 { f.max(0.0) } else { 1.0 })
+                    } else {
+                        let (i, f) = isovalue(self.isovalues, way.sign * value);
+                        (j + i, j + i + 1, f)
+                    };
+                    let (a, b) = (self.radiance[a], self.radiance[b]);
+                    light = std::array::from_fn(|c| (1.0 - f) * decode(a[c]) + f * decode(b[c]));
+                }
                 for c in 0..3 {
-                    out[c][(row - 1) * width + start..][..LANES].copy_from_slice(&light[c]);
+                    out[c][(row - 1) * width + start + lane] = light[c];
                 }
             }
         }
     }
 }
 
-/// A column of radiance at isovalue c: linear between texel centres.
+/// Between which texels of n ≥ 2 isovalue c lies, and how far: linear between texel centres.
 #[inline]
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the texture")]
-fn at_isovalue(column: &[f32], n: usize, c: f32) -> [f32; 3] {
-    let x = (c * n as f32 - 0.5).clamp(0.0, (n - 1) as f32);
-    let i = (x as usize).min(n.saturating_sub(2));
-    let f = x - i as f32;
-    let next = (i + 1).min(n - 1);
-    std::array::from_fn(|ch| (1.0 - f) * column[ch * n + i] + f * column[ch * n + next])
+fn isovalue(n: usize, c: f32) -> (usize, f32) {
+    let x = (c * n as f32 - 0.5).max(0.0).min((n - 1) as f32);
+    let i = (x as usize).min(n - 2);
+    (i, x - i as f32)
 }
