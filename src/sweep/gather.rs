@@ -185,10 +185,10 @@ impl Pass<'_> {
         let plan = family.plan;
         let size = plan.shear.layout.dims[2] * plan.width;
         let mut work = self.workspaces.lock().expect("no thread panics").pop().unwrap_or_else(|| Workspace {
-            pack: Pack::with_rows(0, 0),
+            pack: Pack::with_rows(0),
             light: Default::default(),
         });
-        work.pack.fit(plan.shear.layout.dims[2], family.flats);
+        work.pack.fit(plan.shear.layout.dims[2]);
         work.light.iter_mut().flatten().for_each(|l| l.resize(size, 0.0));
         // Nodes of the first row need the lines before.
         if !rows[0].0.is_empty() {
@@ -221,7 +221,8 @@ impl Pass<'_> {
             let p = plan.first[0] + start as isize;
             if self.isa.read(pack, plan, &family.source, p, q) {
                 self.isa.end(pack, plan, family.ends, family.flats, p, q);
-                self.isa.scan(pack, family.way, &mut work.light[which], (plan.width, start));
+                let flats = (&family.flats.packed[..], family.flats.isovalues);
+                self.isa.scan(pack, family.way, flats, &mut work.light[which], (plan.width, start));
             }
             if let Some(arrivals) = &mut arrivals {
                 family.walls.through(pack, p, q, arrivals);

@@ -5,7 +5,7 @@ use super::directions::Layout;
 use super::half::{Half4, encode};
 use crate::field::Field;
 use crate::flattened::Side;
-use glam::DVec3;
+use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 /// Normals are stored in units of 1/32767.
@@ -85,6 +85,15 @@ impl Blocks {
         Self { size: self.size, rows }
     }
 
+    /// The least range of nodes that holds the blocks of a row and the one `step` rows on; `None` if there are none.
+    #[inline]
+    pub(super) fn extent(&self, row: usize, step: usize, nu: usize) -> Option<(usize, usize)> {
+        let bits = self.rows[row] | self.rows[row + step];
+        let (a, b) = (bits.trailing_zeros() as usize, 64 - bits.leading_zeros() as usize);
+        // A line beyond a block's last node still meets its cell.
+        (bits != 0).then(|| ((a * self.size).saturating_sub(1), (b * self.size + 1).min(nu)))
+    }
+
     /// Whether a block of `bits` meets nodes from..to.
     #[inline(always)]
     fn meets(&self, bits: u64, from: usize, to: usize) -> bool {
@@ -160,9 +169,34 @@ impl<'a> Geometry<'a> {
         Source {
             h: self.h(layout),
             b,
-            awake: &self.awake[side.index()][usize::from(layout.transposed)],
+            awake: self.awake(layout, side),
             step: layout.stride.map(|s| s / nu),
         }
+    }
+
+    /// The blocks where lines of `side` read, in the memory order of `layout`.
+    pub(super) fn awake(&self, layout: &Layout, side: Side) -> &Blocks {
+        &self.awake[side.index()][usize::from(layout.transposed)]
+    }
+
+    /// Calls `visit` with the lit nodes of a row along x.
+    #[inline(always)]
+    pub(super) fn lit_nodes(&self, row: usize, mut visit: impl FnMut(usize)) {
+        let blocks = &self.lit_blocks[0];
+        let nx = self.dims[0];
+        let mut bits = blocks.rows[row];
+        while bits != 0 {
+            let a = bits.trailing_zeros() as usize * blocks.size;
+            bits &= bits - 1;
+            let b = (a + blocks.size).min(nx);
+            self.lit[row * nx + a..row * nx + b].iter().zip(a..b).filter(|(lit, _)| **lit).for_each(|(_, i)| visit(i));
+        }
+    }
+
+    /// The normal of a lit node towards the lower side, a unit vector to 3·10⁻⁵.
+    #[inline(always)]
+    pub(super) fn normal_f32(&self, at: usize) -> Vec3 {
+        Vec3::from_array(std::array::from_fn(|a| f32::from(self.normals[a][at]))) / NORMAL_SCALE
     }
 
     /// The lit nodes of rows in the memory order of `layout`.
@@ -230,19 +264,19 @@ fn neighbours([nx, ny, nz]: [usize; 3], at: usize, mut visit: impl FnMut(usize))
 
 /// Nodes that are not known but share a cell with one that is.
 #[allow(clippy::cast_possible_truncation, reason = "nodes are numbered in 32 bits")]
-fn ring(dims: [usize; 3], known: &[bool]) -> Vec<u32> {
-    (0..known.len())
-        .into_par_iter()
-        .with_min_len(1 << 12)
-        .filter(|&at| {
-            let mut any = false;
-            if !known[at] {
-                neighbours(dims, at, |n| any |= known[n]);
-            }
-            any
-        })
-        .map(|at| at as u32)
-        .collect()
+fn ring([nx, ny, nz]: [usize; 3], known: &[bool]) -> Vec<u32> {
+    // One axis at a time.
+    let along = |from: &[bool], stride: usize, n: usize| -> Vec<bool> {
+        let mut to = from.to_vec();
+        to.par_chunks_mut(stride * n).zip(from.par_chunks(stride * n)).for_each(|(to, from)| {
+            let inner = stride * (n - 1);
+            to[stride..].iter_mut().zip(&from[..inner]).for_each(|(t, f)| *t |= f);
+            to[..inner].iter_mut().zip(&from[stride..]).for_each(|(t, f)| *t |= f);
+        });
+        to
+    };
+    let wide = along(&along(&along(known, 1, nx), nx, ny), nx * ny, nz);
+    (0..known.len()).filter(|&at| wide[at] && !known[at]).map(|at| at as u32).collect()
 }
 
 /// Nodes without light that share a cell with a lit node, then those that share a cell with these.

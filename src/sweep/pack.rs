@@ -51,6 +51,15 @@ impl Plan {
         Self { shear, shift, first, count, width, sign }
     }
 
+    /// Differs from pack to pack and family to family.
+    #[inline(always)]
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "any bits do")]
+    fn noise(&self, first: isize, q: f64) -> u32 {
+        let family = (self.shear.offset[0].to_bits() ^ self.shear.offset[1].to_bits() >> 7) >> 12;
+        let pack = (first as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ (q as i64 as u64).wrapping_mul(0xc2b2_ae3d_27d4_eb4f);
+        ((family ^ pack).wrapping_mul(0xff51_afd7_ed55_8ccd) >> 32) as u32
+    }
+
     /// τ at which line (p, q) enters and leaves Ω; empty if it misses.
     pub(super) fn span(&self, p: f64, q: f64) -> [f64; 2] {
         let [nu, nv, na] = self.shear.layout.dims;
@@ -100,7 +109,7 @@ fn mix_halves(weight: [f32; 4], rows: [&[u16; 4 * LANES]; 4], out: &mut [u16; 4 
 pub(super) struct Cut {
     pub row: usize,
     pub lane: usize,
-    pub slots: [u32; 2],
+    pub places: [u32; 2],
 }
 
 /// How to scan.
@@ -116,49 +125,47 @@ pub(super) struct Way {
 /// line's entry and exit through Ω's sides stand in the rows before its first and after its last slice.
 pub(super) struct Pack {
     pub h: Vec<Lanes>,
-    /// B of sample (row, lane) at 16 · row + lane, then that of ends over isovalues: slot = lane for + ends, 16 + lane for
-    /// − ends, then cuts.
+    /// B of sample (row, lane) at 16 · row + lane.
     pub radiance: Vec<Half4>,
-    /// Per direction (+, −), the place in `radiance` of the sample or end that the ray from each sample meets, and h there.
+    /// Per direction (+, −), the place in `radiance` of the sample that the ray from each sample meets, and h there; beyond
+    /// [`Pack::ends`] that of an end in [`Flats::packed`], and ∞.
     pub next: [Vec<[u32; LANES]>; 2],
     pub h_next: [Vec<Lanes>; 2],
     /// The rows that were read, ascending: all that reach the sweep.
     pub awake: Vec<u32>,
     is_awake: Vec<bool>,
     pub cuts: Vec<Cut>,
-    pub isovalues: usize,
-    dark: bool,
+    /// Where in [`Flats::packed`] the ends of lines are, per direction (+, −).
+    pub lasts: [[u32; LANES]; 2],
     scratch: Vec<[Stop; 2]>,
 }
 
 impl Pack {
     /// Makes room for lines through so many slices.
-    pub(super) fn fit(&mut self, slices: usize, flats: &Flats) {
-        if (self.h.len(), self.isovalues) != (slices + 2, flats.isovalues) {
-            *self = Self::with_rows(slices + 2, flats.isovalues);
+    pub(super) fn fit(&mut self, slices: usize) {
+        if self.h.len() != slices + 2 {
+            *self = Self::with_rows(slices + 2);
         }
-        self.dark = flats.none();
     }
 
-    /// Nothing, in so many rows, with black ends over `isovalues`.
-    pub(super) fn with_rows(rows: usize, isovalues: usize) -> Self {
+    /// Nothing, in so many rows, with black ends.
+    pub(super) fn with_rows(rows: usize) -> Self {
         let next = || vec![[0; LANES]; rows];
         let h_next = || vec![[0.0; LANES]; rows];
         Self {
             h: vec![[OUTSIDE; LANES]; rows],
-            radiance: vec![[0; 4]; rows * LANES + 2 * LANES * isovalues],
+            radiance: vec![[0; 4]; rows * LANES],
             next: [next(), next()],
             h_next: [h_next(), h_next()],
             awake: Vec::new(),
             is_awake: vec![false; rows],
             cuts: Vec::new(),
-            isovalues,
-            dark: false,
+            lasts: [[0; LANES]; 2],
             scratch: Vec::new(),
         }
     }
 
-    /// Where the ends' radiance starts.
+    /// Places from here on are ends.
     pub(super) fn ends(&self) -> usize {
         self.h.len() * LANES
     }
@@ -293,51 +300,38 @@ impl Pack {
     #[inline(always)]
     pub(super) fn end(&mut self, plan: &Plan, ends: &Ends, flats: &Flats, first: isize, q: isize) {
         self.cuts.clear();
-        let n = self.isovalues;
-        if self.dark && !ends.cut() {
+        if flats.none() && !ends.cut() {
+            self.lasts = [[0; LANES]; 2];
             return;
         }
-        let base = self.ends();
-        self.radiance.truncate(base + 2 * LANES * n);
-        for lane in 0..LANES {
-            let (p, q) = ((first + lane as isize) as f64, q as f64);
-            let span = plan.span(p, q);
-            if !(span[0] <= span[1]) {
-                continue;
-            }
-            for (slot, from, forward) in [(lane, span[1], true), (LANES + lane, span[0], false)] {
-                let stop = ends.stop(p, q, from, forward, None);
-                flats.shine(stop, &mut self.radiance[base + slot * n..][..n]);
-            }
-            if ends.cut() {
-                let mut scratch = std::mem::take(&mut self.scratch);
-                ends.cuts(p, q, span[0], span[1], &mut scratch);
-                for &[before, behind] in &scratch {
-                    let slot = (self.radiance.len() - base) / n;
-                    self.radiance.resize(base + (slot + 2) * n, [0; 4]);
-                    flats.shine(Some(before), &mut self.radiance[base + slot * n..][..n]);
-                    flats.shine(Some(behind), &mut self.radiance[base + (slot + 1) * n..][..n]);
+        let (p, q) = (first as f64, q as f64);
+        let spans: [[f64; 2]; LANES] = std::array::from_fn(|lane| plan.span(p + lane as f64, q));
+        let seed = plan.noise(first, q);
+        for (d, forward) in [(0, true), (1, false)] {
+            let from = spans.map(|s| if s[0] <= s[1] { s[1 - d] } else { 0.0 });
+            let random = std::array::from_fn(|lane| dither(seed, lane + d * LANES));
+            ends.stops(flats, (p, q), &from, forward, &random, &mut self.lasts[d]);
+        }
+        if ends.cut() {
+            let mut scratch = std::mem::take(&mut self.scratch);
+            for (lane, span) in spans.iter().enumerate().filter(|(_, s)| s[0] <= s[1]) {
+                ends.cuts(p + lane as f64, q, span[0], span[1], &mut scratch);
+                for &stops in &scratch {
                     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a row of the pack")]
-                    let (row, slot) = (before.tau.floor() as usize + 1, slot as u32);
-                    self.cuts.push(Cut { row, lane, slots: [slot, slot + 1] });
+                    let row = stops[0].tau.floor() as usize + 1;
+                    let places = stops.map(|s| flats.place(Some(s), dither(seed, lane)));
+                    self.cuts.push(Cut { row, lane, places });
                 }
-                self.scratch = scratch;
             }
+            self.scratch = scratch;
         }
     }
 
-    /// The end that a lane's rays meet which meet nothing else.
+    /// The place of what a lane's rays meet that meet nothing else.
     #[inline(always)]
     #[allow(clippy::cast_possible_truncation, reason = "places in a pack")]
     pub(super) fn last(&self, lane: usize, forward: bool) -> u32 {
-        (self.ends() + (lane + if forward { 0 } else { LANES }) * self.isovalues) as u32
-    }
-
-    /// The place of a slot's radiance.
-    #[inline(always)]
-    #[allow(clippy::cast_possible_truncation, reason = "places in a pack")]
-    pub(super) fn slot(&self, slot: u32) -> u32 {
-        (self.ends() + slot as usize * self.isovalues) as u32
+        self.ends() as u32 + self.lasts[usize::from(!forward)][lane]
     }
 
     /// For every sample, the radiance that its ray meets which leaves downhill: B where h is first back at the sample's
@@ -345,10 +339,10 @@ impl Pack {
     ///
     /// Uphill the ray of the same line runs inside the solid; which way is downhill tells the neighbouring samples, as the
     /// receiver normal does. Writes slice k to `out` at k · width + start.
-    pub(super) fn scan(&mut self, way: Way, out: &mut [Vec<f32>], place: (usize, usize)) {
+    pub(super) fn scan(&mut self, way: Way, flats: (&[Half4], usize), out: &mut [Vec<f32>], place: (usize, usize)) {
         self.link(way, true);
         self.link(way, false);
-        self.look(way, out, place);
+        self.look(way, flats, out, place);
     }
 
     /// Finds for every sample the next value ≥ its own towards +τ (`forward`) or −τ; with `strict` it must be greater.
@@ -397,7 +391,7 @@ impl Pack {
         };
         let mut each = |cut: &Cut| {
             if (from..to).contains(&cut.row) {
-                close(cut.lane, self.slot(cut.slots[usize::from(!forward)]));
+                close(cut.lane, self.ends() as u32 + cut.places[usize::from(!forward)]);
             }
         };
         if forward {
@@ -408,7 +402,13 @@ impl Pack {
     }
 
     /// Reads the radiance that the samples' downhill rays meet.
-    fn look(&self, way: Way, out: &mut [Vec<f32>], (width, start): (usize, usize)) {
+    fn look(
+        &self,
+        way: Way,
+        (flats, isovalues): (&[Half4], usize),
+        out: &mut [Vec<f32>],
+        (width, start): (usize, usize),
+    ) {
         let (rows, ends) = (self.h.len(), self.ends());
         for &row in &self.awake {
             let row = row as usize;
@@ -427,12 +427,11 @@ impl Pack {
                         let h0 = self.h.as_flattened()[near];
                         let f = (value - h0) / (t - h0);
                         // Also where the sample before is missing (NaN): then the later one counts alone.
-                        (near, j, if f < 1.0 { f.max(0.0) } else { 1.0 })
+                        (self.radiance[near], self.radiance[j], if f < 1.0 { f.max(0.0) } else { 1.0 })
                     } else {
-                        let (i, f) = isovalue(self.isovalues, way.sign * value);
-                        (j + i, j + i + 1, f)
+                        let (i, f) = isovalue(isovalues, way.sign * value);
+                        (flats[j - ends + i], flats[j - ends + i + 1], f)
                     };
-                    let (a, b) = (self.radiance[a], self.radiance[b]);
                     light = std::array::from_fn(|c| (1.0 - f) * decode(a[c]) + f * decode(b[c]));
                 }
                 for c in 0..3 {
@@ -441,6 +440,15 @@ impl Pack {
             }
         }
     }
+}
+
+/// A number in [0, 1) for a lane of a pack.
+#[inline(always)]
+fn dither(seed: u32, lane: usize) -> f32 {
+    #[allow(clippy::cast_possible_truncation, reason = "lanes")]
+    let x = (seed ^ lane as u32).wrapping_mul(0x9e37_79b1);
+    let x = (x ^ x >> 15).wrapping_mul(0x85eb_ca77);
+    ((x ^ x >> 13) >> 8) as f32 / (1 << 24) as f32
 }
 
 /// Between which texels of n ≥ 2 isovalue c lies, and how far: linear between texel centres.

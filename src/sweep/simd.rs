@@ -4,9 +4,11 @@
 
 #![allow(clippy::needless_range_loop, reason = "a channel indexes several planes at once")]
 
+use super::direct::march_row;
 use super::flats::{Ends, Flats};
 use super::gather::{COSINES, accumulate_row, sum_cosines};
 use super::grid::Source;
+use super::half::Half4;
 use super::pack::{Pack, Plan, Way};
 
 /// An instruction set that this machine was found to have.
@@ -85,26 +87,50 @@ impl Isa {
         f: [f32; 2], range: (usize, usize)
     ));
 
+    /// [`march_row`].
+    pub(super) fn march(self, row: &[f32], place: [f32; 2], most: &mut [f32], least: &mut [f32], out: &mut [u8]) {
+        match self.0 {
+            // SAFETY: `detect` made this kind on a machine with the features that `march` enables.
+            #[cfg(target_arch = "x86_64")]
+            Kind::Avx512 => unsafe { avx512::march(row, place, most, least, out) },
+            _ => march_row(row, place, most, least, out),
+        }
+    }
+
     /// [`Pack::scan`].
-    pub(super) fn scan(self, pack: &mut Pack, way: Way, out: &mut [Vec<f32>], place: (usize, usize)) {
+    pub(super) fn scan(
+        self,
+        pack: &mut Pack,
+        way: Way,
+        flats: (&[Half4], usize),
+        out: &mut [Vec<f32>],
+        place: (usize, usize),
+    ) {
         match self.0 {
             // SAFETY: `detect` made this kind on a machine with the features that `scan` enables.
             #[cfg(target_arch = "x86_64")]
-            Kind::Avx512 => unsafe { avx512::scan(pack, way, out, place) },
-            _ => pack.scan(way, out, place),
+            Kind::Avx512 => unsafe { avx512::scan(pack, way, flats, out, place) },
+            _ => pack.scan(way, flats, out, place),
         }
     }
 }
 
 #[cfg(target_arch = "x86_64")]
 mod avx512 {
+    use super::super::direct::{HIGHER, LOWER, SAMPLED};
     use super::super::half::Half4;
     use super::super::pack::{LANES, OUTSIDE, Pack, Way};
     use std::arch::x86_64::*;
 
     /// [`Pack::scan`] with a line per lane.
     #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
-    pub(super) fn scan(pack: &mut Pack, way: Way, out: &mut [Vec<f32>], place: (usize, usize)) {
+    pub(super) fn scan(
+        pack: &mut Pack,
+        way: Way,
+        flats: (&[Half4], usize),
+        out: &mut [Vec<f32>],
+        place: (usize, usize),
+    ) {
         if way.strict {
             link::<true, true>(pack);
             link::<true, false>(pack);
@@ -112,7 +138,45 @@ mod avx512 {
             link::<false, true>(pack);
             link::<false, false>(pack);
         }
-        look(pack, way, out, place);
+        look(pack, way, flats, out, place);
+    }
+
+    /// [`super::march_row`].
+    #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
+    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, reason = "places in a row")]
+    pub(super) fn march(row: &[f32], [u0, du]: [f32; 2], most: &mut [f32], least: &mut [f32], out: &mut [u8]) {
+        let count = out.len();
+        assert!(most.len() == count && least.len() == count && row.len() >= 2);
+        let last = _mm512_set1_epi32(row.len() as i32 - 2);
+        let (u0, du) = (_mm512_set1_ps(u0), _mm512_set1_ps(du));
+        let zero = _mm512_setzero_ps();
+        let lane = _mm512_setr_ps(0., 1., 2., 3., 4., 5., 6., 7., 8., 9., 10., 11., 12., 13., 14., 15.);
+        let [sampled, lower, higher] = [SAMPLED, LOWER, HIGHER].map(|b| _mm_set1_epi8(b as i8));
+        for start in (0..count).step_by(LANES) {
+            let mask: __mmask16 = if count - start >= LANES { u16::MAX } else { (1 << (count - start)) - 1 };
+            let n = _mm512_add_ps(lane, _mm512_set1_ps(start as f32));
+            let u = _mm512_max_ps(_mm512_add_ps(u0, _mm512_mul_ps(n, du)), zero);
+            let i = _mm512_min_epi32(_mm512_cvttps_epi32(u), last);
+            // SAFETY: 0 ≤ i ≤ row.len() − 2 in every lane of the mask; the others are not touched, nor are most, least and out
+            // beyond `count`, their common length.
+            unsafe {
+                let a = _mm512_mask_i32gather_ps::<4>(zero, mask, i, row.as_ptr());
+                let b = _mm512_mask_i32gather_ps::<4>(zero, mask, i, row.as_ptr().add(1));
+                let f = _mm512_sub_ps(u, _mm512_cvtepi32_ps(i));
+                let x = _mm512_add_ps(a, _mm512_mul_ps(f, _mm512_sub_ps(b, a)));
+                let m = _mm512_maskz_loadu_ps(mask, most.as_ptr().add(start));
+                let l = _mm512_maskz_loadu_ps(mask, least.as_ptr().add(start));
+                let there = _mm512_cmp_ps_mask::<_CMP_ORD_Q>(x, x) & mask;
+                let above = _mm512_mask_cmp_ps_mask::<_CMP_GT_OQ>(there, x, m);
+                let below = _mm512_mask_cmp_ps_mask::<_CMP_LE_OQ>(there, x, l);
+                _mm512_mask_storeu_ps(most.as_mut_ptr().add(start), above, x);
+                _mm512_mask_storeu_ps(least.as_mut_ptr().add(start), below, x);
+                let seen = _mm_maskz_mov_epi8(there, sampled);
+                let seen = _mm_or_si128(seen, _mm_maskz_mov_epi8(above, lower));
+                let seen = _mm_or_si128(seen, _mm_maskz_mov_epi8(below, higher));
+                _mm_mask_storeu_epi8(out.as_mut_ptr().cast::<i8>().add(start), mask, seen);
+            }
+        }
     }
 
     /// [`Pack::link`].
@@ -209,8 +273,14 @@ mod avx512 {
     /// [`Pack::look`].
     #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
     #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, reason = "places in a pack")]
-    fn look(pack: &Pack, way: Way, out: &mut [Vec<f32>], (width, start): (usize, usize)) {
-        let (rows, n) = (pack.h.len(), pack.isovalues);
+    fn look(
+        pack: &Pack,
+        way: Way,
+        (flats, n): (&[Half4], usize),
+        out: &mut [Vec<f32>],
+        (width, start): (usize, usize),
+    ) {
+        let rows = pack.h.len();
         let ends = _mm512_set1_epi32(pack.ends() as i32);
         let one = _mm512_set1_ps(1.0);
         let zero = _mm512_setzero_ps();
@@ -246,35 +316,45 @@ mod avx512 {
             let t = _mm512_mask_mov_ps(load(&pack.h_next[1][row]), forward, load(&pack.h_next[0][row]));
             let ended = _mm512_cmp_epi32_mask::<_MM_CMPINT_NLT>(j, ends) & active;
             let hits = active & !ended;
-            let (mut a, mut b, mut f) = (j, j, zero);
+            let mut light = [zero; 3];
             if hits != 0 {
-                a = _mm512_add_epi32(j, _mm512_mask_mov_epi32(on, forward, back));
+                let near = _mm512_add_epi32(j, _mm512_mask_mov_epi32(on, forward, back));
                 // SAFETY: a hit's j is a sample in a row beyond this one in the order of the scan, so its neighbour towards
                 // this row is a sample too.
-                let h0 = unsafe { _mm512_mask_i32gather_ps::<4>(zero, hits, a, pack.h.as_ptr().cast()) };
-                let x = _mm512_div_ps(_mm512_sub_ps(h, h0), _mm512_sub_ps(t, h0));
-                let part = _mm512_cmp_ps_mask::<_CMP_LT_OQ>(x, one);
-                f = _mm512_mask_max_ps(one, part, x, zero);
+                unsafe {
+                    let h0 = _mm512_mask_i32gather_ps::<4>(zero, hits, near, pack.h.as_ptr().cast());
+                    let f = _mm512_div_ps(_mm512_sub_ps(h, h0), _mm512_sub_ps(t, h0));
+                    let part = _mm512_cmp_ps_mask::<_CMP_LT_OQ>(f, one);
+                    let f = _mm512_mask_max_ps(one, part, f, zero);
+                    let g = _mm512_sub_ps(one, f);
+                    let x = fetch(&pack.radiance, near, hits, order);
+                    let y = fetch(&pack.radiance, j, hits, order);
+                    for c in 0..3 {
+                        light[c] = _mm512_maskz_add_ps(hits, _mm512_mul_ps(g, x[c]), _mm512_mul_ps(f, y[c]));
+                    }
+                }
             }
             if ended != 0 {
                 let c = _mm512_mul_ps(h, _mm512_set1_ps(way.sign));
                 let x = _mm512_sub_ps(_mm512_mul_ps(c, _mm512_set1_ps(n as f32)), _mm512_set1_ps(0.5));
                 let x = _mm512_min_ps(_mm512_max_ps(x, zero), last);
                 let i = _mm512_min_epi32(_mm512_cvttps_epi32(x), _mm512_set1_epi32(n as i32 - 2));
-                a = _mm512_mask_add_epi32(a, ended, j, i);
-                b = _mm512_mask_add_epi32(j, ended, a, _mm512_set1_epi32(1));
-                f = _mm512_mask_sub_ps(f, ended, x, _mm512_cvtepi32_ps(i));
+                let f = _mm512_sub_ps(x, _mm512_cvtepi32_ps(i));
+                let g = _mm512_sub_ps(one, f);
+                let place = _mm512_add_epi32(_mm512_sub_epi32(j, ends), i);
+                // SAFETY: ends are places of n numbers in `flats`, of which i + 1 < n.
+                let (x, y) = unsafe {
+                    let next = _mm512_add_epi32(place, _mm512_set1_epi32(1));
+                    (fetch(flats, place, ended, order), fetch(flats, next, ended, order))
+                };
+                for c in 0..3 {
+                    light[c] = _mm512_mask_add_ps(light[c], ended, _mm512_mul_ps(g, x[c]), _mm512_mul_ps(f, y[c]));
+                }
             }
-            // SAFETY: hits are samples, as above; ends are those of lanes (slots below 32) or of cuts, each with n places in
-            // `radiance`, of which i + 1 < n.
-            let (x, y) =
-                unsafe { (fetch(&pack.radiance, a, active, order), fetch(&pack.radiance, b, active, order)) };
-            let g = _mm512_sub_ps(one, f);
             for c in 0..3 {
-                let light = _mm512_maskz_add_ps(active, _mm512_mul_ps(g, x[c]), _mm512_mul_ps(f, y[c]));
                 let to = &mut out[c][(row - 1) * width + start..][..LANES];
                 // SAFETY: `to` is sixteen f32.
-                unsafe { _mm512_storeu_ps(to.as_mut_ptr(), light) };
+                unsafe { _mm512_storeu_ps(to.as_mut_ptr(), light[c]) };
             }
         }
     }
@@ -290,8 +370,8 @@ mod tests {
     /// A pack of noise with plateaus, gaps, rows that were not read, ends outside and cuts.
     fn noise(seed: u64) -> Pack {
         let mut rng = Rng::stream(seed, Stage::Test, 0);
-        let (rows, n) = (50, 4);
-        let mut pack = Pack::with_rows(rows, n);
+        let rows = 50;
+        let mut pack = Pack::with_rows(rows);
         for row in 0..rows {
             if row % 11 != 7 {
                 pack.awake.push(row as u32);
@@ -312,13 +392,17 @@ mod tests {
                 pack.radiance[row * LANES + lane] = std::array::from_fn(|_| encode(rng.unit() as f32));
             }
         }
-        let ends = pack.ends();
-        pack.radiance.resize(ends + (2 * LANES + 4) * n, [0; 4]);
-        pack.radiance[ends..].iter_mut().for_each(|b| *b = std::array::from_fn(|_| encode(rng.unit() as f32)));
+        pack.lasts = std::array::from_fn(|_| std::array::from_fn(|_| (rng.unit() * 17.0) as u32));
         pack.cuts = (0..2)
-            .map(|i| super::super::pack::Cut { row: 17 + i, lane: 3, slots: [32 + 2 * i as u32, 33 + 2 * i as u32] })
+            .map(|i| super::super::pack::Cut { row: 17 + i, lane: 3, places: [3 + 2 * i as u32, 4 + 2 * i as u32] })
             .collect();
         pack
+    }
+
+    /// Ends over four isovalues.
+    fn ends() -> Vec<Half4> {
+        let mut rng = Rng::stream(9, Stage::Test, 0);
+        (0..20).map(|_| std::array::from_fn(|_| encode(rng.unit() as f32))).collect()
     }
 
     #[test]
@@ -328,11 +412,27 @@ mod tests {
                 let way = Way { strict: way & 2 == 2, sign: if way & 1 == 1 { 1.0 } else { -1.0 } };
                 let scan = |isa: Isa| {
                     let mut out = vec![vec![0f32; 48 * LANES]; 3];
-                    isa.scan(&mut noise(seed), way, &mut out, (LANES, 0));
+                    isa.scan(&mut noise(seed), way, (&ends(), 4), &mut out, (LANES, 0));
                     out.iter().flatten().map(|x| x.to_bits()).collect::<Vec<_>>()
                 };
                 assert_eq!(scan(Isa::PLAIN), scan(Isa::detect()), "{way:?}");
             }
+        }
+    }
+
+    #[test]
+    fn every_instruction_set_marches_to_the_same_bits() {
+        let mut rng = Rng::stream(5, Stage::Test, 0);
+        for count in [1, 15, 16, 17, 100] {
+            let mut row: Vec<f32> = (0..40).map(|_| rng.unit() as f32).collect();
+            row[13] = f32::NAN;
+            let start: Vec<f32> = (0..count).map(|_| rng.unit() as f32).collect();
+            let run = |isa: Isa| {
+                let (mut most, mut least, mut out) = (start.clone(), start.clone(), vec![9u8; count]);
+                isa.march(&row, [-0.3, 0.371], &mut most, &mut least, &mut out);
+                (most.iter().chain(&least).map(|x| x.to_bits()).collect::<Vec<_>>(), out)
+            };
+            assert_eq!(run(Isa::PLAIN), run(Isa::detect()), "{count} lines");
         }
     }
 
@@ -343,7 +443,7 @@ mod tests {
         pack.cuts.clear();
         let reference = noise(7);
         let mut out = vec![vec![0f32; 48 * LANES]; 3];
-        Isa::detect().scan(&mut pack, Way { strict: false, sign: 1.0 }, &mut out, (LANES, 0));
+        Isa::detect().scan(&mut pack, Way { strict: false, sign: 1.0 }, (&ends(), 4), &mut out, (LANES, 0));
         let mut found = [0; 2];
         let h = |row: usize, lane: usize| reference.h[row][lane];
         for lane in 0..LANES {
