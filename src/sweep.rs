@@ -244,7 +244,7 @@ impl Run<'_> {
         let nothing = flats.open();
         flats.close(nothing);
         flats.reflect([1.0; 3], false);
-        let (mut b, mut unit) = self.halves(flats, direct.iter().map(|d| self.reflect(d, None, [1.0; 3])).collect());
+        let (mut b, mut unit) = self.reflect(flats, &direct, None, [1.0; 3]);
         let fixed = s.max_bounces < 6;
         let mut monitor = Monitor::default();
         let mut averaged = 0;
@@ -291,8 +291,7 @@ impl Run<'_> {
             if bounce == s.max_bounces || (!fixed && averaged == FULL_PASSES) {
                 break;
             }
-            let planes = direct.iter().zip(&indirect).map(|(d, e)| self.reflect(d, Some(e), scale)).collect();
-            (b, unit) = self.halves(flats, planes);
+            (b, unit) = self.reflect(flats, &direct, Some(&indirect), scale);
         }
         out.bounces = out.bounces.max(bounce);
         out.residual = monitor.missing(0).unwrap_or(f64::NAN).max(out.residual);
@@ -300,32 +299,56 @@ impl Run<'_> {
         Replicate { direct, indirect }
     }
 
-    /// B = Le + ρ/π (direct + scale · indirect), filled where no surface is.
-    fn reflect(&self, direct: &Planes, indirect: Option<&Planes>, scale: [f32; 3]) -> Planes {
+    /// B = Le + ρ/π (direct + scale · indirect) of the sides, filled where no surface is, as lines read it; packs the flats
+    /// too. Returns what all was multiplied by.
+    #[allow(clippy::cast_possible_truncation, reason = "albedo and emission")]
+    fn reflect(
+        &self,
+        flats: &mut Flats,
+        direct: &[Planes],
+        indirect: Option<&[Planes]>,
+        scale: [f32; 3],
+    ) -> (Vec<Vec<Half4>>, f32) {
         let surface = &self.scene.surface;
-        let mut b: Planes = std::array::from_fn(|c| {
-            #[allow(clippy::cast_possible_truncation, reason = "albedo and emission")]
-            let (rho, emission) = ((surface.albedo[c] / std::f64::consts::PI) as f32, surface.emission[c] as f32);
-            let lit = &self.geometry.lit;
-            (0..direct[c].len())
-                .into_par_iter()
-                .with_min_len(1 << 12)
-                .map(|i| {
-                    let e = direct[c][i] + indirect.map_or(0.0, |e| scale[c] * e[c][i]);
-                    if lit[i] { emission + rho * e } else { 0.0 }
-                })
-                .collect()
-        });
-        self.geometry.fill(&mut b);
-        b
-    }
-
-    /// The sides' B and the flats', as lines read them, and what they are scaled by.
-    fn halves(&self, flats: &mut Flats, planes: Vec<Planes>) -> (Vec<Vec<Half4>>, f32) {
-        let greatest = |p: &Vec<f32>| p.par_iter().with_min_len(1 << 14).copied().reduce(|| 0.0, f32::max);
-        let unit = half::scale(planes.iter().flatten().map(greatest).fold(flats.greatest(), f32::max));
+        let rho: [f32; 3] = std::array::from_fn(|c| (surface.albedo[c] / std::f64::consts::PI) as f32);
+        let emission = surface.emission.as_vec3().to_array();
+        let mut most = flats.greatest();
+        for (s, direct) in direct.iter().enumerate() {
+            for c in 0..3 {
+                let indirect = indirect.map_or(0.0, |e| scale[c] * grid::greatest(&e[s][c]));
+                most = most.max(emission[c] + rho[c] * (grid::greatest(&direct[c]) + indirect));
+            }
+        }
+        let unit = half::scale(most);
         flats.pack(unit);
-        (planes.iter().map(|p| grid::halves(p, unit)).collect(), unit)
+        let b = (0..direct.len()).map(|s| {
+            let n = direct[s][0].len();
+            let mut b = vec![[0; 4]; n];
+            b.par_chunks_mut(1 << 12).enumerate().for_each(|(chunk, b)| {
+                let range = chunk << 12..(chunk << 12) + b.len();
+                let lit = &self.geometry.lit[range.clone()];
+                for c in 0..3 {
+                    let (le, rho) = (unit * emission[c], unit * rho[c]);
+                    let direct = &direct[s][c][range.clone()];
+                    match indirect {
+                        Some(e) => {
+                            let e = &e[s][c][range.clone()];
+                            for (((b, d), e), lit) in b.iter_mut().zip(direct).zip(e).zip(lit) {
+                                b[c] = half::encode(if *lit { le + rho * (d + scale[c] * e) } else { 0.0 });
+                            }
+                        }
+                        None => {
+                            for ((b, d), lit) in b.iter_mut().zip(direct).zip(lit) {
+                                b[c] = half::encode(if *lit { le + rho * d } else { 0.0 });
+                            }
+                        }
+                    }
+                }
+            });
+            self.geometry.fill(&mut b);
+            b
+        });
+        (b.collect(), unit)
     }
 
     /// Indirect irradiance summed over valid nodes and sides, per channel.

@@ -464,7 +464,6 @@ impl Ends {
         random: &[f32; LANES],
         places: &mut [u32; LANES],
     ) {
-        let lane: [f64; LANES] = std::array::from_fn(|l| l as f64);
         let mut best = [if forward { f64::INFINITY } else { f64::NEG_INFINITY }; LANES];
         let mut which = [u32::MAX; LANES];
         let sign = if forward { 1.0 } else { -1.0 };
@@ -473,24 +472,27 @@ impl Ends {
                 continue;
             }
             let (t0, dt) = (at(&m.tau, first, q), m.tau[1]);
-            // 1e-6 of a slice, as in `stop`.
-            let mut ok: [bool; LANES] = std::array::from_fn(|l| {
-                let tau = t0 + lane[l] * dt;
-                sign * (tau - from[l]) >= -1e-6 && sign * tau < sign * best[l]
-            });
+            let mut tau = [0f64; LANES];
+            let mut slack = [f64::INFINITY; LANES];
+            for l in 0..LANES {
+                tau[l] = t0 + l as f64 * dt;
+            }
             for e in &m.edges {
                 let (e0, de) = (at(e, first, q), e[1]);
                 for l in 0..LANES {
-                    ok[l] &= e0 + lane[l] * de >= -m.slack;
+                    slack[l] = slack[l].min(e0 + l as f64 * de);
                 }
             }
             for l in 0..LANES {
-                best[l] = if ok[l] { t0 + lane[l] * dt } else { best[l] };
-                which[l] = if ok[l] { number as u32 } else { which[l] };
+                // 1e-6 of a slice, as in `stop`.
+                let beyond = (sign * (tau[l] - from[l]) >= -1e-6) & (sign * tau[l] < sign * best[l]);
+                let ok = beyond & (slack[l] >= -m.slack);
+                best[l] = if ok { tau[l] } else { best[l] };
+                which[l] = if ok { number as u32 } else { which[l] };
             }
         }
         for l in 0..LANES {
-            let stop = self.met.get(which[l] as usize).map(|m| m.stop(first + lane[l], q, best[l], forward));
+            let stop = self.met.get(which[l] as usize).map(|m| m.stop(first + l as f64, q, best[l], forward));
             places[l] = flats.place(stop, random[l]);
         }
     }

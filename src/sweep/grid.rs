@@ -2,7 +2,7 @@
 //! of nodes without a surface.
 
 use super::directions::Layout;
-use super::half::{Half4, encode};
+use super::half::{Half4, decode, encode};
 use crate::field::Field;
 use crate::flattened::Side;
 use glam::{DVec3, Vec3};
@@ -224,27 +224,29 @@ impl<'a> Geometry<'a> {
 
     /// Gives nodes without a surface the mean of their neighbours that have one (or were filled before), so that
     /// interpolation near the sweep's ends meets no black.
-    pub(super) fn fill(&self, planes: &mut Planes) {
+    pub(super) fn fill(&self, b: &mut [Half4]) {
         let mut known = self.lit.clone();
         let [nx, ny, nz] = self.dims;
         for ring in &self.rings {
             let known_before = &known;
-            let values: Vec<[f32; 3]> = ring
+            let old = &*b;
+            let values: Vec<Half4> = ring
                 .par_iter()
                 .with_min_len(1 << 10)
                 .map(|&at| {
                     let (mut sum, mut count) = ([0f32; 3], 0f32);
                     neighbours([nx, ny, nz], at as usize, |n| {
                         if known_before[n] {
-                            (0..3).for_each(|c| sum[c] += planes[c][n]);
+                            (0..3).for_each(|c| sum[c] += decode(old[n][c]));
                             count += 1.0;
                         }
                     });
-                    sum.map(|s| s / count.max(1.0))
+                    let [r, g, b] = sum.map(|s| encode(s / count.max(1.0)));
+                    [r, g, b, 0]
                 })
                 .collect();
             for (&at, v) in ring.iter().zip(values) {
-                (0..3).for_each(|c| planes[c][at as usize] = v[c]);
+                b[at as usize] = v;
             }
             ring.iter().for_each(|&at| known[at as usize] = true);
         }
@@ -291,14 +293,11 @@ fn rings(dims: [usize; 3], lit: &[bool]) -> Vec<Vec<u32>> {
         .collect()
 }
 
-/// Radiance times `scale` in half precision.
-pub(super) fn halves(planes: &Planes, scale: f32) -> Vec<Half4> {
-    let [r, g, b] = planes;
-    (r, g, b)
-        .into_par_iter()
-        .with_min_len(1 << 12)
-        .map(|(r, g, b)| [encode(scale * r), encode(scale * g), encode(scale * b), 0])
-        .collect()
+/// The greatest of numbers that are not negative.
+pub(super) fn greatest(plane: &[f32]) -> f32 {
+    // Their bits compare as they do, and integers in vectors.
+    let most = |x: &[f32]| x.iter().fold(0, |m, x| x.to_bits().max(m));
+    f32::from_bits(plane.par_chunks(1 << 14).map(most).max().unwrap_or(0))
 }
 
 /// Columns of x are moved this many at a time: a cache line of f32.

@@ -87,18 +87,19 @@ struct Taps {
     weight: [f32; 4],
 }
 
-/// Σ weight · x over four rows.
+/// Σ weight · x over four rows. (Loops, since closures given to the library are not compiled for the instruction set.)
 #[inline(always)]
-fn mix<const N: usize>(weight: [f32; 4], rows: [&[f32; N]; 4]) -> [f32; N] {
-    let [a, b, c, d] = rows;
-    std::array::from_fn(|l| (weight[0] * a[l] + weight[1] * b[l]) + (weight[2] * c[l] + weight[3] * d[l]))
+fn mix<const N: usize>(weight: [f32; 4], [a, b, c, d]: [&[f32; N]; 4], out: &mut [f32; N]) {
+    for l in 0..N {
+        out[l] = (weight[0] * a[l] + weight[1] * b[l]) + (weight[2] * c[l] + weight[3] * d[l]);
+    }
 }
 
 /// [`mix`] of halves, as a half.
 #[inline(always)]
 fn mix_halves(weight: [f32; 4], rows: [&[u16; 4 * LANES]; 4], out: &mut [u16; 4 * LANES]) {
     let [a, b, c, d] = rows;
-    let w = weight.map(|w| w * REBIAS);
+    let w = [weight[0] * REBIAS, weight[1] * REBIAS, weight[2] * REBIAS, weight[3] * REBIAS];
     for l in 0..4 * LANES {
         out[l] = encode((w[0] * raw(a[l]) + w[1] * raw(b[l])) + (w[2] * raw(c[l]) + w[3] * raw(d[l])));
     }
@@ -236,23 +237,26 @@ impl Pack {
     #[inline(always)]
     fn take(&mut self, taps: &Taps, sign: f32, h: &[f32], b: &[u16], row: usize, (lo, hi): (usize, usize)) {
         let line = &mut self.h[row];
-        let weight = taps.weight.map(|w| w * sign);
+        let [w0, w1, w2, w3] = taps.weight;
+        let weight = [w0 * sign, w1 * sign, w2 * sign, w3 * sign];
         let out = self.radiance[row * LANES..][..LANES].as_flattened_mut();
         let out: &mut [u16; 4 * LANES] = out.try_into().expect("sixteen lanes");
         // Whole packs wherever memory allows: lanes outside Ω read a neighbouring row and are blanked.
         if taps.at[0] >= 0 && taps.at[3].unsigned_abs() + LANES <= h.len() {
-            let at = taps.at.map(isize::unsigned_abs);
-            let lanes = at.map(|t| -> &[f32; LANES] { h[t..][..LANES].try_into().expect("sixteen lanes") });
-            let mixed = mix(weight, lanes);
-            if hi - lo == LANES {
-                *line = mixed;
-            } else {
+            let [t0, t1, t2, t3] = taps.at;
+            let lanes = |t: isize| -> &[f32; LANES] {
+                h[t.unsigned_abs()..][..LANES].try_into().expect("sixteen lanes")
+            };
+            mix(weight, [lanes(t0), lanes(t1), lanes(t2), lanes(t3)], line);
+            if hi - lo < LANES {
                 for l in 0..LANES {
-                    line[l] = if lo <= l && l < hi { mixed[l] } else { OUTSIDE };
+                    line[l] = if lo <= l && l < hi { line[l] } else { OUTSIDE };
                 }
             }
-            let rows = at.map(|t| -> &[u16; 4 * LANES] { b[4 * t..][..4 * LANES].try_into().expect("as above") });
-            mix_halves(taps.weight, rows, out);
+            let lanes = |t: isize| -> &[u16; 4 * LANES] {
+                b[4 * t.unsigned_abs()..][..4 * LANES].try_into().expect("sixteen lanes")
+            };
+            mix_halves(taps.weight, [lanes(t0), lanes(t1), lanes(t2), lanes(t3)], out);
         } else {
             *line = [OUTSIDE; LANES];
             for l in lo..hi {
@@ -305,17 +309,24 @@ impl Pack {
             return;
         }
         let (p, q) = (first as f64, q as f64);
-        let spans: [[f64; 2]; LANES] = std::array::from_fn(|lane| plan.span(p + lane as f64, q));
+        let mut from = [[0.0; LANES]; 2];
+        let mut random = [[0.0; LANES]; 2];
         let seed = plan.noise(first, q);
+        for lane in 0..LANES {
+            let span = plan.span(p + lane as f64, q);
+            let hit = span[0] <= span[1];
+            for d in 0..2 {
+                from[d][lane] = if hit { span[1 - d] } else { 0.0 };
+                random[d][lane] = dither(seed, lane + d * LANES);
+            }
+        }
         for (d, forward) in [(0, true), (1, false)] {
-            let from = spans.map(|s| if s[0] <= s[1] { s[1 - d] } else { 0.0 });
-            let random = std::array::from_fn(|lane| dither(seed, lane + d * LANES));
-            ends.stops(flats, (p, q), &from, forward, &random, &mut self.lasts[d]);
+            ends.stops(flats, (p, q), &from[d], forward, &random[d], &mut self.lasts[d]);
         }
         if ends.cut() {
             let mut scratch = std::mem::take(&mut self.scratch);
-            for (lane, span) in spans.iter().enumerate().filter(|(_, s)| s[0] <= s[1]) {
-                ends.cuts(p + lane as f64, q, span[0], span[1], &mut scratch);
+            for lane in 0..LANES {
+                ends.cuts(p + lane as f64, q, from[1][lane], from[0][lane], &mut scratch);
                 for &stops in &scratch {
                     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a row of the pack")]
                     let row = stops[0].tau.floor() as usize + 1;
