@@ -3,7 +3,7 @@
 
 use super::flats::{Arrivals, Ends, Flats, Stop, fill_column};
 use super::gather::{Pass, local_bounds};
-use super::half::decode;
+use super::half::{Half4, decode};
 use super::pack::{LANES, OUTSIDE, Pack, Plan};
 use crate::flattened::Side;
 use crate::rng::{Rng, Stage};
@@ -89,13 +89,13 @@ impl<'a> Walls<'a> {
     }
 
     /// Reports of lines (first + lane, q), whose samples are in `pack`.
-    pub(super) fn through(&self, pack: &Pack, first: isize, q: isize, out: &mut Arrivals) {
+    pub(super) fn through(&self, pack: &Pack, b: &[Half4], first: isize, q: isize, out: &mut Arrivals) {
         for lane in 0..LANES {
             let p = first + lane as isize;
             if self.reports(p, q) {
                 let span = self.plan.span(p as f64, q as f64);
                 if span[0] <= span[1] && pack.h.iter().any(|h| h[lane] != OUTSIDE) {
-                    self.line(Some((pack, lane, span)), p, q, out);
+                    self.line(Some((pack, b, lane, span)), p, q, out);
                     if self.capped && self.plan.sign > 0.0 {
                         self.caps(pack, lane, span, (p as f64, q as f64), out);
                     }
@@ -120,7 +120,7 @@ impl<'a> Walls<'a> {
     }
 
     /// What every front on one line sees along it.
-    fn line(&self, samples: Option<(&Pack, usize, [f64; 2])>, p: isize, q: isize, out: &mut Arrivals) {
+    fn line(&self, samples: Option<(&Pack, &[Half4], usize, [f64; 2])>, p: isize, q: isize, out: &mut Arrivals) {
         let nc = self.flats.isovalues;
         let mut values = vec![0f32; 3 * nc];
         let (pf, qf) = (p as f64, q as f64);
@@ -130,8 +130,8 @@ impl<'a> Walls<'a> {
             fill_column(self.flats, next, &mut values);
             let reach = next.map_or(if forward { f64::INFINITY } else { f64::NEG_INFINITY }, |s| s.tau);
             let range = match samples {
-                Some((pack, lane, span)) if self.meets(wall.tau, reach, span) => {
-                    self.staircase(pack, lane, span, (wall.tau, reach), (pf, qf), &mut values)
+                Some((pack, b, lane, span)) if self.meets(wall.tau, reach, span) => {
+                    self.staircase((pack, b), lane, span, (wall.tau, reach), (pf, qf), &mut values)
                 }
                 _ if self.primary => (0, nc),
                 _ => (0, 0),
@@ -151,7 +151,7 @@ impl<'a> Walls<'a> {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to rows and texels")]
     fn staircase(
         &self,
-        pack: &Pack,
+        (pack, b): (&Pack, &[Half4]),
         lane: usize,
         span: [f64; 2],
         (from, to): (f64, f64),
@@ -204,10 +204,9 @@ impl<'a> Walls<'a> {
                 Some((old, h_old)) => {
                     while t < nc && height(t) <= h {
                         let f = ((height(t) - h_old) / (h - h_old)).clamp(0.0, 1.0);
-                        let [b0, b1] = [old, row].map(|r| pack.radiance[r * LANES + lane]);
+                        let node = pack.node[if f < 0.5 { old } else { row }][lane];
                         for c in 0..3 {
-                            values[c * nc + ordinal(t)] =
-                                self.unit * ((1.0 - f) * decode(b0[c]) + f * decode(b1[c]));
+                            values[c * nc + ordinal(t)] = self.unit * decode(b[node as usize][c]);
                         }
                         t += 1;
                     }

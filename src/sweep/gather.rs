@@ -5,7 +5,7 @@ use super::directions::{Layout, Shear};
 use super::flats::{Arrivals, Ends, Flats, Incoming};
 use super::grid::{Geometry, NORMAL_SCALE, Planes, Source, transposed, untransposed};
 use super::half::Half4;
-use super::pack::{LANES, Pack, Plan, Way};
+use super::pack::{LANES, Light, Pack, Plan, Way};
 use super::simd::Isa;
 use crate::flattened::Side;
 use crate::scene::Scene;
@@ -221,11 +221,12 @@ impl Pass<'_> {
             let p = plan.first[0] + start as isize;
             if self.isa.read(pack, plan, &family.source, p, q) {
                 self.isa.end(pack, plan, family.ends, family.flats, p, q);
-                let flats = (&family.flats.packed[..], family.flats.isovalues);
-                self.isa.scan(pack, family.way, flats, &mut work.light[which], (plan.width, start));
+                let flats = family.flats;
+                let light = Light { b: family.source.b, flats: &flats.packed, isovalues: flats.isovalues };
+                self.isa.scan(pack, family.way, light, &mut work.light[which], (plan.width, start));
             }
             if let Some(arrivals) = &mut arrivals {
-                family.walls.through(pack, p, q, arrivals);
+                family.walls.through(pack, family.source.b, p, q, arrivals);
             }
         }
         if let Some(arrivals) = arrivals {

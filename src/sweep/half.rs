@@ -5,7 +5,7 @@
 pub(super) type Half4 = [u16; 4];
 
 /// 2¹¹²: the distance of the exponents' offsets.
-pub(super) const REBIAS: f32 = f32::from_bits((112 + 127) << 23);
+const REBIAS: f32 = f32::from_bits((112 + 127) << 23);
 /// The least number that is not 0.
 const LEAST: f32 = f32::from_bits((127 - 14) << 23);
 /// What the greatest number is scaled to.
@@ -20,16 +20,10 @@ pub(super) fn encode(x: f32) -> u16 {
     if x >= LEAST { rounded.wrapping_sub(112 << 10) as u16 } else { 0 }
 }
 
-/// The number over 2¹¹²: what weights that carry [`REBIAS`] are for.
-#[inline(always)]
-pub(super) fn raw(x: u16) -> f32 {
-    f32::from_bits(u32::from(x) << 13)
-}
-
 /// The number.
 #[inline(always)]
 pub(super) fn decode(x: u16) -> f32 {
-    raw(x) * REBIAS
+    f32::from_bits(u32::from(x) << 13) * REBIAS
 }
 
 /// The power of two that brings `greatest` near the top of the range.

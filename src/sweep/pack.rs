@@ -5,7 +5,7 @@
 use super::directions::Shear;
 use super::flats::{Ends, Flats, Stop};
 use super::grid::Source;
-use super::half::{Half4, REBIAS, decode, encode, raw};
+use super::half::{Half4, decode};
 
 /// Lines in a pack.
 pub(super) const LANES: usize = 16;
@@ -95,22 +95,22 @@ fn mix<const N: usize>(weight: [f32; 4], [a, b, c, d]: [&[f32; N]; 4], out: &mut
     }
 }
 
-/// [`mix`] of halves, as a half.
-#[inline(always)]
-fn mix_halves(weight: [f32; 4], rows: [&[u16; 4 * LANES]; 4], out: &mut [u16; 4 * LANES]) {
-    let [a, b, c, d] = rows;
-    let w = [weight[0] * REBIAS, weight[1] * REBIAS, weight[2] * REBIAS, weight[3] * REBIAS];
-    for l in 0..4 * LANES {
-        out[l] = encode((w[0] * raw(a[l]) + w[1] * raw(b[l])) + (w[2] * raw(c[l]) + w[3] * raw(d[l])));
-    }
-}
-
 /// A cut of one lane by a luminaire inside Ω: after which row, and what it shows to lines from before and behind.
 #[derive(Clone, Copy)]
 pub(super) struct Cut {
     pub row: usize,
     pub lane: usize,
     pub places: [u32; 2],
+}
+
+/// What rays meet.
+#[derive(Clone, Copy)]
+pub(super) struct Light<'a> {
+    /// B of the nodes.
+    pub b: &'a [Half4],
+    /// [`Flats::packed`], and its isovalues.
+    pub flats: &'a [Half4],
+    pub isovalues: usize,
 }
 
 /// How to scan.
@@ -126,10 +126,12 @@ pub(super) struct Way {
 /// line's entry and exit through Ω's sides stand in the rows before its first and after its last slice.
 pub(super) struct Pack {
     pub h: Vec<Lanes>,
-    /// B of sample (row, lane) at 16 · row + lane.
-    pub radiance: Vec<Half4>,
-    /// Per direction (+, −), the place in `radiance` of the sample that the ray from each sample meets, and h there; beyond
-    /// [`Pack::ends`] that of an end in [`Flats::packed`], and ∞.
+    /// Which node's B stands for that of each sample: per row one of the four around the line, each as likely as bilinear
+    /// interpolation weighs it. Neighbouring nodes differ little and every ray meets others, so that the mean is what
+    /// interpolation gives at a quarter of the work.
+    pub node: Vec<[u32; LANES]>,
+    /// Per direction (+, −), the number 16 · row + lane of the sample that the ray from each sample meets, and h there; from
+    /// [`Pack::ends`] on the place of an end in [`Flats::packed`], and ∞.
     pub next: [Vec<[u32; LANES]>; 2],
     pub h_next: [Vec<Lanes>; 2],
     /// The rows that were read, ascending: all that reach the sweep.
@@ -155,7 +157,7 @@ impl Pack {
         let h_next = || vec![[0.0; LANES]; rows];
         Self {
             h: vec![[OUTSIDE; LANES]; rows],
-            radiance: vec![[0; 4]; rows * LANES],
+            node: next(),
             next: [next(), next()],
             h_next: [h_next(), h_next()],
             awake: Vec::new(),
@@ -177,7 +179,7 @@ impl Pack {
         let [nu, nv, na] = plan.shear.layout.dims;
         let [sv, sa] = plan.shear.layout.stride;
         let h = source.h;
-        let b = source.b.as_flattened();
+        let seed = plan.noise(first, q as f64);
         self.is_awake.fill(false);
         self.h[0] = [OUTSIDE; LANES];
         self.h[na + 1] = [OUTSIDE; LANES];
@@ -204,7 +206,8 @@ impl Pack {
                     at: [at, at + 1, at + sv as isize, at + sv as isize + 1],
                     weight: [(1.0 - fu) * (1.0 - fv), fu * (1.0 - fv), (1.0 - fu) * fv, fu * fv],
                 };
-                self.take(&taps, plan.sign, h, b, row, (lo, hi));
+                self.take(&taps, plan.sign, h, row, (lo, hi));
+                self.choose(&taps, dither(seed, 2 * LANES + k), row);
                 self.is_awake[row] = true;
                 any = true;
             } else {
@@ -235,15 +238,13 @@ impl Pack {
 
     /// Reads one row, lanes `lo..hi` of which lie in Ω.
     #[inline(always)]
-    fn take(&mut self, taps: &Taps, sign: f32, h: &[f32], b: &[u16], row: usize, (lo, hi): (usize, usize)) {
+    fn take(&mut self, taps: &Taps, sign: f32, h: &[f32], row: usize, (lo, hi): (usize, usize)) {
         let line = &mut self.h[row];
         let [w0, w1, w2, w3] = taps.weight;
         let weight = [w0 * sign, w1 * sign, w2 * sign, w3 * sign];
-        let out = self.radiance[row * LANES..][..LANES].as_flattened_mut();
-        let out: &mut [u16; 4 * LANES] = out.try_into().expect("sixteen lanes");
+        let [t0, t1, t2, t3] = taps.at;
         // Whole packs wherever memory allows: lanes outside Ω read a neighbouring row and are blanked.
-        if taps.at[0] >= 0 && taps.at[3].unsigned_abs() + LANES <= h.len() {
-            let [t0, t1, t2, t3] = taps.at;
+        if t0 >= 0 && t3.unsigned_abs() + LANES <= h.len() {
             let lanes = |t: isize| -> &[f32; LANES] {
                 h[t.unsigned_abs()..][..LANES].try_into().expect("sixteen lanes")
             };
@@ -253,22 +254,25 @@ impl Pack {
                     line[l] = if lo <= l && l < hi { line[l] } else { OUTSIDE };
                 }
             }
-            let lanes = |t: isize| -> &[u16; 4 * LANES] {
-                b[4 * t.unsigned_abs()..][..4 * LANES].try_into().expect("sixteen lanes")
-            };
-            mix_halves(taps.weight, [lanes(t0), lanes(t1), lanes(t2), lanes(t3)], out);
         } else {
             *line = [OUTSIDE; LANES];
             for l in lo..hi {
-                let at = taps.at.map(|t| (t + l as isize).unsigned_abs());
-                let w = weight;
-                line[l] = (w[0] * h[at[0]] + w[1] * h[at[1]]) + (w[2] * h[at[2]] + w[3] * h[at[3]]);
-                let w = taps.weight.map(|w| w * REBIAS);
-                for c in 0..4 {
-                    let x = at.map(|t| raw(b[4 * t + c]));
-                    out[4 * l + c] = encode((w[0] * x[0] + w[1] * x[1]) + (w[2] * x[2] + w[3] * x[3]));
-                }
+                let at = |t: isize| h[(t + l as isize).unsigned_abs()];
+                line[l] = (weight[0] * at(t0) + weight[1] * at(t1)) + (weight[2] * at(t2) + weight[3] * at(t3));
             }
+        }
+    }
+
+    /// Picks the nodes whose B the samples of a row have.
+    #[inline(always)]
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "lanes in Ω meet nodes in Ω")]
+    fn choose(&mut self, taps: &Taps, random: f32, row: usize) {
+        let [w0, w1, w2, _] = taps.weight;
+        let tap = usize::from(random >= w0) + usize::from(random >= w0 + w1) + usize::from(random >= w0 + w1 + w2);
+        let at = taps.at[tap] as i32;
+        for l in 0..LANES {
+            // Lanes outside Ω, whose place may be anything, are not asked.
+            self.node[row][l] = (at + l as i32).max(0) as u32;
         }
     }
 
@@ -287,17 +291,15 @@ impl Pack {
         let (i, j, l) = (cell(x, nu), cell(y, nv), cell(tau.clamp(0.0, na as f64 - 1.0), na));
         let f = [x - i as f64, y - j as f64, tau - l as f64].map(|f| f as f32);
         let at = l * sa + j * sv + i;
-        let value = |plane: &dyn Fn(usize) -> f32| {
-            let lerp = |t: f32, a: f32, b: f32| a + t * (b - a);
-            let edge = |o: usize| lerp(f[0], plane(o), plane(o + 1));
-            let face = |o: usize| lerp(f[1], edge(o), edge(o + sv));
-            lerp(f[2], face(at), face(at + sa))
-        };
+        let h = source.h;
+        let lerp = |t: f32, a: f32, b: f32| a + t * (b - a);
+        let edge = |o: usize| lerp(f[0], h[o], h[o + 1]);
+        let face = |o: usize| lerp(f[1], edge(o), edge(o + sv));
+        let nearest = |x: f32| usize::from(x >= 0.5);
         let row = if leaves { k + 2 } else { k };
         self.is_awake[row] = true;
-        self.h[row][lane] = plan.sign * value(&|o| source.h[o]);
-        self.radiance[row * LANES + lane] =
-            std::array::from_fn(|c| encode(value(&|o| decode(source.b[o][c])).max(0.0)));
+        self.h[row][lane] = plan.sign * lerp(f[2], face(at), face(at + sa));
+        self.node[row][lane] = (at + nearest(f[0]) + nearest(f[1]) * sv + nearest(f[2]) * sa) as u32;
     }
 
     /// Finds what the lines end on and reads the radiance there. `first` and `q` as in [`Pack::read`].
@@ -350,10 +352,10 @@ impl Pack {
     ///
     /// Uphill the ray of the same line runs inside the solid; which way is downhill tells the neighbouring samples, as the
     /// receiver normal does. Writes slice k to `out` at k · width + start.
-    pub(super) fn scan(&mut self, way: Way, flats: (&[Half4], usize), out: &mut [Vec<f32>], place: (usize, usize)) {
+    pub(super) fn scan(&mut self, way: Way, light: Light, out: &mut [Vec<f32>], place: (usize, usize)) {
         self.link(way, true);
         self.link(way, false);
-        self.look(way, flats, out, place);
+        self.look(way, light, out, place);
     }
 
     /// Finds for every sample the next value ≥ its own towards +τ (`forward`) or −τ; with `strict` it must be greater.
@@ -416,7 +418,7 @@ impl Pack {
     fn look(
         &self,
         way: Way,
-        (flats, isovalues): (&[Half4], usize),
+        light: Light,
         out: &mut [Vec<f32>],
         (width, start): (usize, usize),
     ) {
@@ -428,25 +430,26 @@ impl Pack {
             }
             for lane in 0..LANES {
                 let value = self.h[row][lane];
-                let mut light = [0f32; 3];
+                let mut rgb = [0f32; 3];
                 if value.is_finite() {
                     let forward = self.h[row + 1][lane] < self.h[row - 1][lane];
                     let d = usize::from(!forward);
                     let (j, t) = (self.next[d][row][lane] as usize, self.h_next[d][row][lane]);
-                    let (a, b, f) = if j < ends {
+                    if j < ends {
                         let near = if forward { j - LANES } else { j + LANES };
                         let h0 = self.h.as_flattened()[near];
-                        let f = (value - h0) / (t - h0);
-                        // Also where the sample before is missing (NaN): then the later one counts alone.
-                        (self.radiance[near], self.radiance[j], if f < 1.0 { f.max(0.0) } else { 1.0 })
+                        // The nearer of the two samples around the hit; the later one if that before is missing (NaN).
+                        let first = (value - h0) < 0.5 * (t - h0);
+                        let node = self.node.as_flattened()[if first { near } else { j }];
+                        rgb = std::array::from_fn(|c| decode(light.b[node as usize][c]));
                     } else {
-                        let (i, f) = isovalue(isovalues, way.sign * value);
-                        (flats[j - ends + i], flats[j - ends + i + 1], f)
-                    };
-                    light = std::array::from_fn(|c| (1.0 - f) * decode(a[c]) + f * decode(b[c]));
+                        let (i, f) = isovalue(light.isovalues, way.sign * value);
+                        let (a, b) = (light.flats[j - ends + i], light.flats[j - ends + i + 1]);
+                        rgb = std::array::from_fn(|c| (1.0 - f) * decode(a[c]) + f * decode(b[c]));
+                    }
                 }
                 for c in 0..3 {
-                    out[c][(row - 1) * width + start + lane] = light[c];
+                    out[c][(row - 1) * width + start + lane] = rgb[c];
                 }
             }
         }

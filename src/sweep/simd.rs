@@ -8,8 +8,7 @@ use super::direct::march_row;
 use super::flats::{Ends, Flats};
 use super::gather::{COSINES, accumulate_row, sum_cosines};
 use super::grid::Source;
-use super::half::Half4;
-use super::pack::{Pack, Plan, Way};
+use super::pack::{Light, Pack, Plan, Way};
 
 /// An instruction set that this machine was found to have.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -102,15 +101,15 @@ impl Isa {
         self,
         pack: &mut Pack,
         way: Way,
-        flats: (&[Half4], usize),
+        light: Light,
         out: &mut [Vec<f32>],
         place: (usize, usize),
     ) {
         match self.0 {
             // SAFETY: `detect` made this kind on a machine with the features that `scan` enables.
             #[cfg(target_arch = "x86_64")]
-            Kind::Avx512 => unsafe { avx512::scan(pack, way, flats, out, place) },
-            _ => pack.scan(way, flats, out, place),
+            Kind::Avx512 => unsafe { avx512::scan(pack, way, light, out, place) },
+            _ => pack.scan(way, light, out, place),
         }
     }
 }
@@ -119,7 +118,7 @@ impl Isa {
 mod avx512 {
     use super::super::direct::{HIGHER, LOWER, SAMPLED};
     use super::super::half::Half4;
-    use super::super::pack::{LANES, OUTSIDE, Pack, Way};
+    use super::super::pack::{LANES, Light, OUTSIDE, Pack, Way};
     use std::arch::x86_64::*;
 
     /// [`Pack::scan`] with a line per lane.
@@ -127,7 +126,7 @@ mod avx512 {
     pub(super) fn scan(
         pack: &mut Pack,
         way: Way,
-        flats: (&[Half4], usize),
+        light: Light,
         out: &mut [Vec<f32>],
         place: (usize, usize),
     ) {
@@ -138,7 +137,7 @@ mod avx512 {
             link::<false, true>(pack);
             link::<false, false>(pack);
         }
-        look(pack, way, flats, out, place);
+        look(pack, way, light, out, place);
     }
 
     /// [`super::march_row`].
@@ -276,13 +275,13 @@ mod avx512 {
     fn look(
         pack: &Pack,
         way: Way,
-        (flats, n): (&[Half4], usize),
+        Light { b, flats, isovalues: n }: Light,
         out: &mut [Vec<f32>],
         (width, start): (usize, usize),
     ) {
         let rows = pack.h.len();
         let ends = _mm512_set1_epi32(pack.ends() as i32);
-        let one = _mm512_set1_ps(1.0);
+        let (one, half) = (_mm512_set1_ps(1.0), _mm512_set1_ps(0.5));
         let zero = _mm512_setzero_ps();
         let infinity = _mm512_set1_ps(f32::INFINITY);
         let last = _mm512_set1_ps((n - 1) as f32);
@@ -320,18 +319,16 @@ mod avx512 {
             if hits != 0 {
                 let near = _mm512_add_epi32(j, _mm512_mask_mov_epi32(on, forward, back));
                 // SAFETY: a hit's j is a sample in a row beyond this one in the order of the scan, so its neighbour towards
-                // this row is a sample too.
+                // this row is a sample too. The nodes of samples in Ω are nodes of the lattice, whose B is all in `b`; a hit
+                // and, if it is finite, the sample before are such; if it is not, `first` does not hold.
                 unsafe {
                     let h0 = _mm512_mask_i32gather_ps::<4>(zero, hits, near, pack.h.as_ptr().cast());
-                    let f = _mm512_div_ps(_mm512_sub_ps(h, h0), _mm512_sub_ps(t, h0));
-                    let part = _mm512_cmp_ps_mask::<_CMP_LT_OQ>(f, one);
-                    let f = _mm512_mask_max_ps(one, part, f, zero);
-                    let g = _mm512_sub_ps(one, f);
-                    let x = fetch(&pack.radiance, near, hits, order);
-                    let y = fetch(&pack.radiance, j, hits, order);
-                    for c in 0..3 {
-                        light[c] = _mm512_maskz_add_ps(hits, _mm512_mul_ps(g, x[c]), _mm512_mul_ps(f, y[c]));
-                    }
+                    let (above, step) = (_mm512_sub_ps(h, h0), _mm512_sub_ps(t, h0));
+                    let first = _mm512_mask_cmp_ps_mask::<_CMP_LT_OQ>(hits, above, _mm512_mul_ps(half, step));
+                    let at = _mm512_mask_mov_epi32(j, first, near);
+                    let zeros = _mm512_setzero_si512();
+                    let node = _mm512_mask_i32gather_epi32::<4>(zeros, hits, at, pack.node.as_ptr().cast());
+                    light = fetch(b, node, hits, order);
                 }
             }
             if ended != 0 {
@@ -363,6 +360,7 @@ mod avx512 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sweep::half::Half4;
     use crate::rng::{Rng, Stage};
     use crate::sweep::half::{decode, encode};
     use crate::sweep::pack::{ASLEEP, LANES, OUTSIDE};
@@ -389,7 +387,7 @@ mod tests {
                 } else {
                     x
                 };
-                pack.radiance[row * LANES + lane] = std::array::from_fn(|_| encode(rng.unit() as f32));
+                pack.node[row][lane] = (rng.unit() * 30.0) as u32;
             }
         }
         pack.lasts = std::array::from_fn(|_| std::array::from_fn(|_| (rng.unit() * 17.0) as u32));
@@ -399,10 +397,10 @@ mod tests {
         pack
     }
 
-    /// Ends over four isovalues.
-    fn ends() -> Vec<Half4> {
-        let mut rng = Rng::stream(9, Stage::Test, 0);
-        (0..20).map(|_| std::array::from_fn(|_| encode(rng.unit() as f32))).collect()
+    /// Numbers for thirty nodes, or five ends over four isovalues and more.
+    fn random(seed: u64) -> Vec<Half4> {
+        let mut rng = Rng::stream(seed, Stage::Test, 0);
+        (0..30).map(|_| std::array::from_fn(|_| encode(rng.unit() as f32))).collect()
     }
 
     #[test]
@@ -412,7 +410,8 @@ mod tests {
                 let way = Way { strict: way & 2 == 2, sign: if way & 1 == 1 { 1.0 } else { -1.0 } };
                 let scan = |isa: Isa| {
                     let mut out = vec![vec![0f32; 48 * LANES]; 3];
-                    isa.scan(&mut noise(seed), way, (&ends(), 4), &mut out, (LANES, 0));
+                    let light = Light { b: &random(9), flats: &random(10), isovalues: 4 };
+                    isa.scan(&mut noise(seed), way, light, &mut out, (LANES, 0));
                     out.iter().flatten().map(|x| x.to_bits()).collect::<Vec<_>>()
                 };
                 assert_eq!(scan(Isa::PLAIN), scan(Isa::detect()), "{way:?}");
@@ -443,7 +442,9 @@ mod tests {
         pack.cuts.clear();
         let reference = noise(7);
         let mut out = vec![vec![0f32; 48 * LANES]; 3];
-        Isa::detect().scan(&mut pack, Way { strict: false, sign: 1.0 }, (&ends(), 4), &mut out, (LANES, 0));
+        let b = random(9);
+        let light = Light { b: &b, flats: &random(10), isovalues: 4 };
+        Isa::detect().scan(&mut pack, Way { strict: false, sign: 1.0 }, light, &mut out, (LANES, 0));
         let mut found = [0; 2];
         let h = |row: usize, lane: usize| reference.h[row][lane];
         for lane in 0..LANES {
@@ -458,11 +459,10 @@ mod tests {
                 if let (true, Some(r)) = (value.is_finite(), next) {
                     let before = if forward { r - 1 } else { r + 1 };
                     let h0 = h(before, lane);
-                    let f = if h0.is_nan() { 1.0 } else { ((value - h0) / (h(r, lane) - h0)).min(1.0) };
-                    let f = if f.is_nan() { 1.0 } else { f.max(0.0) };
-                    let [b0, b1] = [before, r].map(|r| decode(reference.radiance[r * LANES + lane][1]));
-                    let expected = (1.0 - f) * b0 + f * b1;
-                    assert!((out[1][(row - 1) * LANES + lane] - expected).abs() < 1e-6, "lane {lane} row {row}");
+                    let first = !h0.is_nan() && (value - h0) < 0.5 * (h(r, lane) - h0);
+                    let node = reference.node[if first { before } else { r }][lane];
+                    let expected = decode(b[node as usize][1]);
+                    assert_eq!(out[1][(row - 1) * LANES + lane], expected, "lane {lane} row {row}");
                     found[usize::from(forward)] += 1;
                 }
             }
