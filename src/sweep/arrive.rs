@@ -9,8 +9,8 @@ use crate::flattened::Side;
 use crate::rng::{Rng, Stage};
 use glam::DVec3;
 
-/// Lines per texel edge that report to walls: more would only cost.
-const LINES_PER_TEXEL: f64 = 1.0;
+/// Lines per texel edge that report to walls. Each reports to four texels; more would only cost.
+const LINES_PER_TEXEL: f64 = 0.5;
 
 /// The walls' part of one family of lines.
 pub(super) struct Walls<'a> {

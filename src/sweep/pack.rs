@@ -95,6 +95,16 @@ fn mix<const N: usize>(weight: [f32; 4], [a, b, c, d]: [&[f32; N]; 4], out: &mut
     }
 }
 
+/// Marks the lanes that are not in lo..hi.
+#[inline(always)]
+#[allow(clippy::cast_possible_truncation, reason = "lanes")]
+fn blank(line: &mut Lanes, lo: usize, hi: usize) {
+    let (lo, width) = (lo as u32, (hi - lo) as u32);
+    for l in 0..LANES {
+        line[l] = if (l as u32).wrapping_sub(lo) < width { line[l] } else { OUTSIDE };
+    }
+}
+
 /// A cut of one lane by a luminaire inside Ω: after which row, and what it shows to lines from before and behind.
 #[derive(Clone, Copy)]
 pub(super) struct Cut {
@@ -212,8 +222,9 @@ impl Pack {
                 any = true;
             } else {
                 let line = &mut self.h[row];
-                for l in 0..LANES {
-                    line[l] = if lo <= l && l < hi { ASLEEP } else { OUTSIDE };
+                *line = [ASLEEP; LANES];
+                if hi - lo < LANES {
+                    blank(line, lo, hi);
                 }
             }
             // Lanes that entered through a side get their entry point in the row before, those that left theirs here.
@@ -250,9 +261,7 @@ impl Pack {
             };
             mix(weight, [lanes(t0), lanes(t1), lanes(t2), lanes(t3)], line);
             if hi - lo < LANES {
-                for l in 0..LANES {
-                    line[l] = if lo <= l && l < hi { line[l] } else { OUTSIDE };
-                }
+                blank(line, lo, hi);
             }
         } else {
             *line = [OUTSIDE; LANES];
