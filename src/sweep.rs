@@ -228,8 +228,14 @@ impl Run<'_> {
             step += 1;
             progress(0.2 * f64::from(step) / lights as f64)
         };
-        let (direct, complete) =
-            direct::direct(self.scene, (self.geometry, self.isa), flats, self.sides, (s.seed, number, points), &mut ask);
+        let (direct, complete) = direct::direct(
+            self.scene,
+            (self.geometry, self.isa),
+            flats,
+            self.sides,
+            (s.seed, number, points),
+            &mut ask,
+        );
         stopped |= !complete;
         out.counts.shadow_rays += out.counts.valid * lights as u64;
         let mut indirect: Vec<Planes> = self.sides.iter().map(|_| grid::black(n)).collect();

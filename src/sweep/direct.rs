@@ -63,12 +63,10 @@ impl Fan {
         let mut seen = std::mem::take(&mut fan.seen);
         let h = geometry.h(&layout);
         let awake: Vec<&Blocks> = sides.iter().map(|s| geometry.awake(&layout, *s)).collect();
-        seen.par_chunks_mut(count[0] * slices.1)
-            .enumerate()
-            .for_each_init(
-                || [const { Vec::new() }; 3],
-                |scratch, (row, out)| fan.march(isa, h, &awake, start, row, scratch, out),
-            );
+        seen.par_chunks_mut(count[0] * slices.1).enumerate().for_each_init(
+            || [const { Vec::new() }; 3],
+            |scratch, (row, out)| fan.march(isa, h, &awake, start, row, scratch, out),
+        );
         fan.seen = seen;
         Some(fan)
     }
@@ -108,7 +106,8 @@ impl Fan {
             }
             let j = (v as usize).min(nv - 2);
             let fv = (v - j as f64) as f32;
-            let Some((n0, n1)) = awake.iter().filter_map(|a| a.extent((k * sa + j * sv) / nu, sv / nu, nu)).reduce(join)
+            let Some((n0, n1)) =
+                awake.iter().filter_map(|a| a.extent((k * sa + j * sv) / nu, sv / nu, nu)).reduce(join)
             else {
                 continue;
             };
@@ -305,7 +304,8 @@ pub(super) fn direct(
             let inside = (0..3).all(|a| y[a] >= 0.0 && y[a] <= lattice.far()[a]);
             let start = if inside { scene.field.value(y) as f32 } else { f32::NEG_INFINITY };
             let start = if start.is_nan() { f32::NEG_INFINITY } else { start };
-            let fans: [Option<Fan>; 6] = std::array::from_fn(|f| Fan::new((geometry, isa, sides), y, start, f % 3, f >= 3));
+            let fans: [Option<Fan>; 6] =
+                std::array::from_fn(|f| Fan::new((geometry, isa, sides), y, start, f % 3, f >= 3));
             let axes = lattice.axes();
             let step = axes.x_axis.as_vec3();
             let facing = light.normal().as_vec3();
@@ -326,11 +326,8 @@ pub(super) fn direct(
                     let g = cos_x.abs() * cos_y / (r2 * r2);
                     let x = [i as f64, begin.y, begin.z];
                     let size = (x[0] - y.x).abs();
-                    let axis = if across[1] >= size && across[1] >= across[0] {
-                        2
-                    } else {
-                        usize::from(across[0] >= size)
-                    };
+                    let axis =
+                        if across[1] >= size && across[1] >= across[0] { 2 } else { usize::from(across[0] >= size) };
                     let Some(fan) = &fans[axis + if x[axis] > y[axis] { 3 } else { 0 }] else { return };
                     let Some(v) = fan.visibility(x) else { return };
                     let s = usize::from(cos_x < 0.0);

@@ -157,12 +157,14 @@ impl Flats {
         for t in self.textures.iter().flatten() {
             let nc = t.dims[2];
             let radiance = &t.radiance;
-            self.packed[t.start..][..t.dims.iter().product()].par_chunks_mut(nc).enumerate().for_each(|(texel, out)| {
-                let b = &radiance[3 * texel * nc..][..3 * nc];
-                for (i, o) in out.iter_mut().enumerate() {
-                    *o = [encode(scale * b[i]), encode(scale * b[nc + i]), encode(scale * b[2 * nc + i]), 0];
-                }
-            });
+            self.packed[t.start..][..t.dims.iter().product()].par_chunks_mut(nc).enumerate().for_each(
+                |(texel, out)| {
+                    let b = &radiance[3 * texel * nc..][..3 * nc];
+                    for (i, o) in out.iter_mut().enumerate() {
+                        *o = [encode(scale * b[i]), encode(scale * b[nc + i]), encode(scale * b[2 * nc + i]), 0];
+                    }
+                },
+            );
         }
     }
 

@@ -184,10 +184,12 @@ impl Pass<'_> {
     fn rows_of_lines(&self, family: &Family, first: isize, rows: &mut [(Vec<(usize, Row)>, Arrivals)]) {
         let plan = family.plan;
         let size = plan.shear.layout.dims[2] * plan.width;
-        let mut work = self.workspaces.lock().expect("no thread panics").pop().unwrap_or_else(|| Workspace {
-            pack: Pack::with_rows(0),
-            light: Default::default(),
-        });
+        let mut work = self
+            .workspaces
+            .lock()
+            .expect("no thread panics")
+            .pop()
+            .unwrap_or_else(|| Workspace { pack: Pack::with_rows(0), light: Default::default() });
         work.pack.fit(plan.shear.layout.dims[2]);
         work.light.iter_mut().flatten().for_each(|l| l.resize(size, 0.0));
         // Nodes of the first row need the lines before.
@@ -264,7 +266,15 @@ impl Pass<'_> {
             let run = (!(bits >> a)).trailing_zeros() as usize;
             bits = if a + run >= 64 { 0 } else { bits >> (a + run) << (a + run) };
             let (a, b) = (a * lit.size, ((a + run) * lit.size).min(nu));
-            self.isa.accumulate([&mut e0[..], &mut e1[..], &mut e2[..]], n, family.omega, light, line0, [fu, fv], (a, b));
+            self.isa.accumulate(
+                [&mut e0[..], &mut e1[..], &mut e2[..]],
+                n,
+                family.omega,
+                light,
+                line0,
+                [fu, fv],
+                (a, b),
+            );
         }
     }
 }
@@ -307,8 +317,7 @@ pub(super) fn accumulate_row(
         let cos = omega[0] * f32::from(n[0][i]) + omega[1] * f32::from(n[1][i]) + omega[2] * f32::from(n[2][i]);
         let cos = cos.abs();
         for c in 0..3 {
-            e[c][i] += cos
-                * ((w[0] * near[c].0[i] + w[1] * near[c].1[i]) + (w[2] * far[c].0[i] + w[3] * far[c].1[i]));
+            e[c][i] += cos * ((w[0] * near[c].0[i] + w[1] * near[c].1[i]) + (w[2] * far[c].0[i] + w[3] * far[c].1[i]));
         }
     }
 }

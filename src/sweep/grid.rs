@@ -151,8 +151,7 @@ impl<'a> Geometry<'a> {
             let (row, y) = (at / ny, at % ny);
             (row % nz * ny + y) * nx + row / nz
         };
-        let lit_blocks =
-            [Blocks::new(nx, ny * nz, 0, |at| lit[at]), Blocks::new(ny, nz * nx, 0, |at| lit[place(at)])];
+        let lit_blocks = [Blocks::new(nx, ny * nz, 0, |at| lit[at]), Blocks::new(ny, nz * nx, 0, |at| lit[place(at)])];
         let awake = [Side::Lower, Side::Higher].map(|side| {
             let reaches = |h: f32| if side == Side::Lower { !(h < 0.0) } else { !(h > 1.0) };
             [
@@ -166,12 +165,7 @@ impl<'a> Geometry<'a> {
     /// What lines of `side` read, with B in the memory order of `layout`.
     pub(super) fn source<'s>(&'s self, layout: &Layout, side: Side, b: &'s [Half4]) -> Source<'s> {
         let nu = layout.dims[0];
-        Source {
-            h: self.h(layout),
-            b,
-            awake: self.awake(layout, side),
-            step: layout.stride.map(|s| s / nu),
-        }
+        Source { h: self.h(layout), b, awake: self.awake(layout, side), step: layout.stride.map(|s| s / nu) }
     }
 
     /// The blocks where lines of `side` read, in the memory order of `layout`.

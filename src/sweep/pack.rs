@@ -56,7 +56,8 @@ impl Plan {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "any bits do")]
     fn noise(&self, first: isize, q: f64) -> u32 {
         let family = (self.shear.offset[0].to_bits() ^ self.shear.offset[1].to_bits() >> 7) >> 12;
-        let pack = (first as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ (q as i64 as u64).wrapping_mul(0xc2b2_ae3d_27d4_eb4f);
+        let pack =
+            (first as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ (q as i64 as u64).wrapping_mul(0xc2b2_ae3d_27d4_eb4f);
         ((family ^ pack).wrapping_mul(0xff51_afd7_ed55_8ccd) >> 32) as u32
     }
 
@@ -256,9 +257,8 @@ impl Pack {
         let [t0, t1, t2, t3] = taps.at;
         // Whole packs wherever memory allows: lanes outside Ω read a neighbouring row and are blanked.
         if t0 >= 0 && t3.unsigned_abs() + LANES <= h.len() {
-            let lanes = |t: isize| -> &[f32; LANES] {
-                h[t.unsigned_abs()..][..LANES].try_into().expect("sixteen lanes")
-            };
+            let lanes =
+                |t: isize| -> &[f32; LANES] { h[t.unsigned_abs()..][..LANES].try_into().expect("sixteen lanes") };
             mix(weight, [lanes(t0), lanes(t1), lanes(t2), lanes(t3)], line);
             if hi - lo < LANES {
                 blank(line, lo, hi);
@@ -424,13 +424,7 @@ impl Pack {
     }
 
     /// Reads the radiance that the samples' downhill rays meet.
-    fn look(
-        &self,
-        way: Way,
-        light: Light,
-        out: &mut [Vec<f32>],
-        (width, start): (usize, usize),
-    ) {
+    fn look(&self, way: Way, light: Light, out: &mut [Vec<f32>], (width, start): (usize, usize)) {
         let (rows, ends) = (self.h.len(), self.ends());
         for &row in &self.awake {
             let row = row as usize;

@@ -97,14 +97,7 @@ impl Isa {
     }
 
     /// [`Pack::scan`].
-    pub(super) fn scan(
-        self,
-        pack: &mut Pack,
-        way: Way,
-        light: Light,
-        out: &mut [Vec<f32>],
-        place: (usize, usize),
-    ) {
+    pub(super) fn scan(self, pack: &mut Pack, way: Way, light: Light, out: &mut [Vec<f32>], place: (usize, usize)) {
         match self.0 {
             // SAFETY: `detect` made this kind on a machine with the features that `scan` enables.
             #[cfg(target_arch = "x86_64")]
@@ -123,13 +116,7 @@ mod avx512 {
 
     /// [`Pack::scan`] with a line per lane.
     #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
-    pub(super) fn scan(
-        pack: &mut Pack,
-        way: Way,
-        light: Light,
-        out: &mut [Vec<f32>],
-        place: (usize, usize),
-    ) {
+    pub(super) fn scan(pack: &mut Pack, way: Way, light: Light, out: &mut [Vec<f32>], place: (usize, usize)) {
         if way.strict {
             link::<true, true>(pack);
             link::<true, false>(pack);
@@ -360,8 +347,8 @@ mod avx512 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sweep::half::Half4;
     use crate::rng::{Rng, Stage};
+    use crate::sweep::half::Half4;
     use crate::sweep::half::{decode, encode};
     use crate::sweep::pack::{ASLEEP, LANES, OUTSIDE};
 
