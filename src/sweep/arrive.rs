@@ -9,8 +9,9 @@ use crate::flattened::Side;
 use crate::rng::{Rng, Stage};
 use glam::DVec3;
 
-/// Lines per texel edge that report to walls. Each reports to four texels; more would only cost.
-const LINES_PER_TEXEL: f64 = 0.5;
+/// Lines per texel edge that report to walls. Each reports to four texels, so that one reaches every texel from every
+/// direction; half of one showed as a weave on the walls.
+const LINES_PER_TEXEL: f64 = 1.0;
 
 /// The walls' part of one family of lines.
 pub(super) struct Walls<'a> {
