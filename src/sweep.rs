@@ -18,6 +18,7 @@ mod directions;
 mod flats;
 mod gather;
 mod grid;
+mod half;
 mod pack;
 #[allow(unsafe_code, reason = "vector instructions: measured to pay, chosen at run time")]
 mod simd;
@@ -29,9 +30,11 @@ use crate::scene::{Boundary, Scene};
 use flats::Flats;
 use gather::Pass;
 use grid::{Geometry, Planes};
+use half::Half4;
 use rayon::prelude::*;
 use simd::Isa;
 use std::f32::consts::PI;
+use std::sync::Mutex;
 
 /// How to sweep.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -225,8 +228,14 @@ impl Run<'_> {
             step += 1;
             progress(0.2 * f64::from(step) / lights as f64)
         };
-        let (direct, complete) =
-            direct::direct(self.scene, self.geometry, flats, self.sides, (s.seed, number, points), &mut ask);
+        let (direct, complete) = direct::direct(
+            self.scene,
+            (self.geometry, self.isa),
+            flats,
+            self.sides,
+            (s.seed, number, points),
+            &mut ask,
+        );
         stopped |= !complete;
         out.counts.shadow_rays += out.counts.valid * lights as u64;
         let mut indirect: Vec<Planes> = self.sides.iter().map(|_| grid::black(n)).collect();
@@ -236,11 +245,12 @@ impl Run<'_> {
             inside: self.inside,
             primary: self.sides[0],
             isa: self.isa,
+            workspaces: Mutex::default(),
         };
         let nothing = flats.open();
         flats.close(nothing);
         flats.reflect([1.0; 3], false);
-        let mut b: Vec<Planes> = direct.iter().map(|d| self.reflect(d, None, [1.0; 3])).collect();
+        let (mut b, mut unit) = self.reflect(flats, &direct, None, [1.0; 3]);
         let fixed = s.max_bounces < 6;
         let mut monitor = Monitor::default();
         let mut averaged = 0;
@@ -261,7 +271,7 @@ impl Run<'_> {
             };
             let mut fresh = Vec::new();
             for (&side, b) in self.sides.iter().zip(&b) {
-                let (e, complete) = pass.gather(side, &lines, b, flats, &mut incoming, &mut ask);
+                let (e, complete) = pass.gather(side, &lines, b, unit, flats, &mut incoming, &mut ask);
                 stopped |= !complete;
                 fresh.push(e);
             }
@@ -284,12 +294,10 @@ impl Run<'_> {
             averaged += usize::from(last_coarse && !fixed);
             let scale = if fixed { [1.0; 3] } else { monitor.push(mean) };
             flats.reflect(scale, true);
-            for ((b, d), e) in b.iter_mut().zip(&direct).zip(&indirect) {
-                *b = self.reflect(d, Some(e), scale);
-            }
-            if !fixed && averaged == FULL_PASSES {
+            if bounce == s.max_bounces || (!fixed && averaged == FULL_PASSES) {
                 break;
             }
+            (b, unit) = self.reflect(flats, &direct, Some(&indirect), scale);
         }
         out.bounces = out.bounces.max(bounce);
         out.residual = monitor.missing(0).unwrap_or(f64::NAN).max(out.residual);
@@ -297,24 +305,56 @@ impl Run<'_> {
         Replicate { direct, indirect }
     }
 
-    /// B = Le + ρ/π (direct + scale · indirect), filled where no surface is.
-    fn reflect(&self, direct: &Planes, indirect: Option<&Planes>, scale: [f32; 3]) -> Planes {
+    /// B = Le + ρ/π (direct + scale · indirect) of the sides, filled where no surface is, as lines read it; packs the flats
+    /// too. Returns what all was multiplied by.
+    #[allow(clippy::cast_possible_truncation, reason = "albedo and emission")]
+    fn reflect(
+        &self,
+        flats: &mut Flats,
+        direct: &[Planes],
+        indirect: Option<&[Planes]>,
+        scale: [f32; 3],
+    ) -> (Vec<Vec<Half4>>, f32) {
         let surface = &self.scene.surface;
-        let mut b: Planes = std::array::from_fn(|c| {
-            #[allow(clippy::cast_possible_truncation, reason = "albedo and emission")]
-            let (rho, emission) = ((surface.albedo[c] / std::f64::consts::PI) as f32, surface.emission[c] as f32);
-            let lit = &self.geometry.lit;
-            (0..direct[c].len())
-                .into_par_iter()
-                .with_min_len(1 << 12)
-                .map(|i| {
-                    let e = direct[c][i] + indirect.map_or(0.0, |e| scale[c] * e[c][i]);
-                    if lit[i] { emission + rho * e } else { 0.0 }
-                })
-                .collect()
+        let rho: [f32; 3] = std::array::from_fn(|c| (surface.albedo[c] / std::f64::consts::PI) as f32);
+        let emission = surface.emission.as_vec3().to_array();
+        let mut most = flats.greatest();
+        for (s, direct) in direct.iter().enumerate() {
+            for c in 0..3 {
+                let indirect = indirect.map_or(0.0, |e| scale[c] * grid::greatest(&e[s][c]));
+                most = most.max(emission[c] + rho[c] * (grid::greatest(&direct[c]) + indirect));
+            }
+        }
+        let unit = half::scale(most);
+        flats.pack(unit);
+        let b = (0..direct.len()).map(|s| {
+            let n = direct[s][0].len();
+            let mut b = vec![[0; 4]; n];
+            b.par_chunks_mut(1 << 12).enumerate().for_each(|(chunk, b)| {
+                let range = chunk << 12..(chunk << 12) + b.len();
+                let lit = &self.geometry.lit[range.clone()];
+                for c in 0..3 {
+                    let (le, rho) = (unit * emission[c], unit * rho[c]);
+                    let direct = &direct[s][c][range.clone()];
+                    match indirect {
+                        Some(e) => {
+                            let e = &e[s][c][range.clone()];
+                            for (((b, d), e), lit) in b.iter_mut().zip(direct).zip(e).zip(lit) {
+                                b[c] = half::encode(if *lit { le + rho * (d + scale[c] * e) } else { 0.0 });
+                            }
+                        }
+                        None => {
+                            for ((b, d), lit) in b.iter_mut().zip(direct).zip(lit) {
+                                b[c] = half::encode(if *lit { le + rho * d } else { 0.0 });
+                            }
+                        }
+                    }
+                }
+            });
+            self.geometry.fill(&mut b);
+            b
         });
-        self.geometry.fill(&mut b);
-        b
+        (b.collect(), unit)
     }
 
     /// Indirect irradiance summed over valid nodes and sides, per channel.

@@ -3,13 +3,15 @@
 
 use super::flats::{Arrivals, Ends, Flats, Stop, fill_column};
 use super::gather::{Pass, local_bounds};
+use super::half::{Half4, decode};
 use super::pack::{LANES, OUTSIDE, Pack, Plan};
 use crate::flattened::Side;
 use crate::rng::{Rng, Stage};
 use glam::DVec3;
 
-/// Lines per texel edge that report to walls: more would only cost.
-const LINES_PER_TEXEL: f64 = 2.0;
+/// Lines per texel edge that report to walls. Each reports to four texels, so that one reaches every texel from every
+/// direction; half of one showed as a weave on the walls.
+const LINES_PER_TEXEL: f64 = 1.0;
 
 /// The walls' part of one family of lines.
 pub(super) struct Walls<'a> {
@@ -29,6 +31,8 @@ pub(super) struct Walls<'a> {
     /// Whether the box is wider than Ω, so that lines may miss Ω.
     margin: bool,
     caps: u32,
+    /// What packed radiance is multiplied by.
+    unit: f32,
 }
 
 impl<'a> Walls<'a> {
@@ -40,6 +44,7 @@ impl<'a> Walls<'a> {
         flats: &'a Flats,
         side: Side,
         families: usize,
+        unit: f32,
     ) -> Self {
         let shear = &plan.shear;
         let [lo, hi] = local_bounds(pass.scene);
@@ -74,6 +79,7 @@ impl<'a> Walls<'a> {
             primary: side == pass.primary,
             margin,
             caps: pass.scene.polygons().len() as u32,
+            unit,
         }
     }
 
@@ -84,13 +90,13 @@ impl<'a> Walls<'a> {
     }
 
     /// Reports of lines (first + lane, q), whose samples are in `pack`.
-    pub(super) fn through(&self, pack: &Pack, first: isize, q: isize, out: &mut Arrivals) {
+    pub(super) fn through(&self, pack: &Pack, b: &[Half4], first: isize, q: isize, out: &mut Arrivals) {
         for lane in 0..LANES {
             let p = first + lane as isize;
             if self.reports(p, q) {
                 let span = self.plan.span(p as f64, q as f64);
                 if span[0] <= span[1] && pack.h.iter().any(|h| h[lane] != OUTSIDE) {
-                    self.line(Some((pack, lane, span)), p, q, out);
+                    self.line(Some((pack, b, lane, span)), p, q, out);
                     if self.capped && self.plan.sign > 0.0 {
                         self.caps(pack, lane, span, (p as f64, q as f64), out);
                     }
@@ -115,7 +121,7 @@ impl<'a> Walls<'a> {
     }
 
     /// What every front on one line sees along it.
-    fn line(&self, samples: Option<(&Pack, usize, [f64; 2])>, p: isize, q: isize, out: &mut Arrivals) {
+    fn line(&self, samples: Option<(&Pack, &[Half4], usize, [f64; 2])>, p: isize, q: isize, out: &mut Arrivals) {
         let nc = self.flats.isovalues;
         let mut values = vec![0f32; 3 * nc];
         let (pf, qf) = (p as f64, q as f64);
@@ -125,8 +131,8 @@ impl<'a> Walls<'a> {
             fill_column(self.flats, next, &mut values);
             let reach = next.map_or(if forward { f64::INFINITY } else { f64::NEG_INFINITY }, |s| s.tau);
             let range = match samples {
-                Some((pack, lane, span)) if self.meets(wall.tau, reach, span) => {
-                    self.staircase(pack, lane, span, (wall.tau, reach), (pf, qf), &mut values)
+                Some((pack, b, lane, span)) if self.meets(wall.tau, reach, span) => {
+                    self.staircase((pack, b), lane, span, (wall.tau, reach), (pf, qf), &mut values)
                 }
                 _ if self.primary => (0, nc),
                 _ => (0, 0),
@@ -146,7 +152,7 @@ impl<'a> Walls<'a> {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to rows and texels")]
     fn staircase(
         &self,
-        pack: &Pack,
+        (pack, b): (&Pack, &[Half4]),
         lane: usize,
         span: [f64; 2],
         (from, to): (f64, f64),
@@ -175,8 +181,13 @@ impl<'a> Walls<'a> {
         let mut t = 0;
         let mut first = None;
         let mut before: Option<(usize, f32)> = None;
-        for step in 0..hi.saturating_sub(lo) {
-            let row = if forward { lo + step } else { hi - 1 - step };
+        // Rows that were not read hold nothing at these isovalues.
+        let count = pack.awake.len();
+        for step in 0..count {
+            let row = pack.awake[if forward { step } else { count - 1 - step }] as usize;
+            if row < lo || row >= hi {
+                continue;
+            }
             let h = pack.h[row][lane];
             if h == OUTSIDE || h.is_nan() {
                 continue;
@@ -194,9 +205,9 @@ impl<'a> Walls<'a> {
                 Some((old, h_old)) => {
                     while t < nc && height(t) <= h {
                         let f = ((height(t) - h_old) / (h - h_old)).clamp(0.0, 1.0);
+                        let node = pack.node[if f < 0.5 { old } else { row }][lane];
                         for c in 0..3 {
-                            let b = &pack.b[c];
-                            values[c * nc + ordinal(t)] = (1.0 - f) * b[old][lane] + f * b[row][lane];
+                            values[c * nc + ordinal(t)] = self.unit * decode(b[node as usize][c]);
                         }
                         t += 1;
                     }

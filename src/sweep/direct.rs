@@ -3,7 +3,8 @@
 
 use super::directions::Layout;
 use super::flats::{Flats, capped};
-use super::grid::{Geometry, Planes};
+use super::grid::{Blocks, Geometry, Planes};
+use super::simd::Isa;
 use crate::flat;
 use crate::flattened::{Departure, Side};
 use crate::luminaire::{point_term, unoccluded};
@@ -14,9 +15,9 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 /// A sample of a fan that lies in Ω; what it sees of its source on either side.
-const SAMPLED: u8 = 1;
-const LOWER: u8 = 2;
-const HIGHER: u8 = 4;
+pub(super) const SAMPLED: u8 = 1;
+pub(super) const LOWER: u8 = 2;
+pub(super) const HIGHER: u8 = 4;
 
 /// The lines from a point through the unit lattice of the farthest slice of one of the six pyramids around it.
 struct Fan {
@@ -36,7 +37,13 @@ struct Fan {
 
 impl Fan {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
-    fn new(geometry: &Geometry, y: DVec3, start: f32, axis: usize, up: bool) -> Option<Self> {
+    fn new(
+        (geometry, isa, sides): (&Geometry, Isa, &[Side]),
+        y: DVec3,
+        start: f32,
+        axis: usize,
+        up: bool,
+    ) -> Option<Self> {
         let layout = Layout::new(geometry.dims, axis);
         let [u, v, a] = layout.axes;
         let source = [y[u], y[v], y[a]];
@@ -55,9 +62,11 @@ impl Fan {
         let mut fan = Self { layout, source, depth, slices, first, count, seen };
         let mut seen = std::mem::take(&mut fan.seen);
         let h = geometry.h(&layout);
-        seen.par_chunks_mut(count[0] * slices.1)
-            .enumerate()
-            .for_each_init(|| [const { Vec::new() }; 3], |scratch, (row, out)| fan.march(h, start, row, scratch, out));
+        let awake: Vec<&Blocks> = sides.iter().map(|s| geometry.awake(&layout, *s)).collect();
+        seen.par_chunks_mut(count[0] * slices.1).enumerate().for_each_init(
+            || [const { Vec::new() }; 3],
+            |scratch, (row, out)| fan.march(isa, h, &awake, start, row, scratch, out),
+        );
         fan.seen = seen;
         Some(fan)
     }
@@ -67,9 +76,19 @@ impl Fan {
         if self.depth > 0.0 { self.slices.0 + step } else { self.slices.0 - step }
     }
 
-    /// One row of lines, all slices.
+    /// One row of lines, all slices. Where neither side could be lit nothing is read: h below the sweep hides nothing.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
-    fn march(&self, h: &[f32], start: f32, row: usize, [most, least, mixed]: &mut [Vec<f32>; 3], out: &mut [u8]) {
+    #[allow(clippy::too_many_arguments, reason = "one caller")]
+    fn march(
+        &self,
+        isa: Isa,
+        h: &[f32],
+        awake: &[&Blocks],
+        start: f32,
+        row: usize,
+        [most, least, mixed]: &mut [Vec<f32>; 3],
+        out: &mut [u8],
+    ) {
         let [nu, nv, _] = self.layout.dims;
         let [sv, sa] = self.layout.stride;
         let np = self.count[0];
@@ -87,10 +106,15 @@ impl Fan {
             }
             let j = (v as usize).min(nv - 2);
             let fv = (v - j as f64) as f32;
-            // Lines with u in Ω.
+            let Some((n0, n1)) =
+                awake.iter().filter_map(|a| a.extent((k * sa + j * sv) / nu, sv / nu, nu)).reduce(join)
+            else {
+                continue;
+            };
+            // Lines with u in Ω, over nodes that matter.
             let p = |u: f64| self.source[0] + (u - self.source[0]) / ratio - self.first[0] as f64;
-            let lo = p(0.0).ceil().max(0.0) as usize;
-            let hi = (p((nu - 1) as f64).floor().min(np as f64 - 1.0) + 1.0).max(0.0) as usize;
+            let lo = p(n0 as f64).ceil().max(0.0) as usize;
+            let hi = (p((n1 - 1) as f64).floor().min(np as f64 - 1.0) + 1.0).max(0.0) as usize;
             let u0 = (self.source[0] + (self.first[0] as f64 - self.source[0]) * ratio) as f32;
             let du = ratio as f32;
             if lo >= hi {
@@ -102,19 +126,8 @@ impl Fan {
             let (near, far) = (&h[k * sa + j * sv..][i0..i1], &h[k * sa + (j + 1) * sv..][i0..i1]);
             mixed.clear();
             mixed.extend(near.iter().zip(far).map(|(a, b)| a + fv * (b - a)));
-            let lines = most[lo..hi].iter_mut().zip(&mut least[lo..hi]).zip(&mut out[lo..hi]);
-            for (p, ((most, least), out)) in lines.enumerate() {
-                let u = (u0 + (lo + p) as f32 * du).max(0.0);
-                let i = (u as usize).clamp(i0, i1 - 2);
-                let fu = u - i as f32;
-                let (a, b) = (mixed[i - i0], mixed[i - i0 + 1]);
-                let x = a + fu * (b - a);
-                let lit = u8::from(x > *most) * LOWER + u8::from(x <= *least) * HIGHER + SAMPLED;
-                *out = if x.is_nan() { 0 } else { lit };
-                // f32::max and min pass over NaN.
-                *most = most.max(x);
-                *least = least.min(x);
-            }
+            let place = [u0 + lo as f32 * du - i0 as f32, du];
+            isa.march(mixed, place, &mut most[lo..hi], &mut least[lo..hi], &mut out[lo..hi]);
         }
     }
 
@@ -143,9 +156,31 @@ impl Fan {
     }
 }
 
+/// The least range that holds two.
+fn join(a: (usize, usize), b: (usize, usize)) -> (usize, usize) {
+    (a.0.min(b.0), a.1.max(b.1))
+}
+
+/// What lines see that meet u = place\[0\] + n · place\[1\] (line n) in a row of samples; takes the row into their extrema.
+#[inline(always)]
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the row")]
+pub(super) fn march_row(row: &[f32], [u0, du]: [f32; 2], most: &mut [f32], least: &mut [f32], out: &mut [u8]) {
+    let last = row.len() - 2;
+    for (n, ((most, least), out)) in most.iter_mut().zip(least).zip(out).enumerate() {
+        let u = (u0 + n as f32 * du).max(0.0);
+        let i = (u as usize).min(last);
+        let (a, b) = (row[i], row[i + 1]);
+        let x = a + (u - i as f32) * (b - a);
+        *out = if x.is_nan() { 0 } else { u8::from(x > *most) * LOWER + u8::from(x <= *least) * HIGHER + SAMPLED };
+        // f32::max and min pass over NaN.
+        *most = most.max(x);
+        *least = least.min(x);
+    }
+}
+
 /// Least and greatest h along the segment from local `a` to `b` inside Ω, at the slices of its dominant axis and its
 /// ends; (∞, −∞) if it misses Ω.
-#[allow(clippy::cast_possible_truncation, reason = "values are f32")]
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "values are f32, places in the lattice")]
 fn extrema(scene: &Scene, a: DVec3, b: DVec3) -> (f32, f32) {
     let far = scene.lattice().far();
     let d = b - a;
@@ -167,19 +202,32 @@ fn extrema(scene: &Scene, a: DVec3, b: DVec3) -> (f32, f32) {
     let size = d.abs();
     let axis = if size.z >= size.x && size.z >= size.y { 2 } else { usize::from(size.y >= size.x) };
     let mut range = (f32::INFINITY, f32::NEG_INFINITY);
-    let mut take = |t: f64| {
+    for t in [from, to] {
         let h = scene.field.value(a + t * d) as f32;
         range = (range.0.min(h), range.1.max(h));
-    };
-    take(from);
-    take(to);
-    if d[axis] != 0.0 {
-        let (p, q) = (a[axis] + from * d[axis], a[axis] + to * d[axis]);
-        let (mut k, end) = (p.min(q).ceil(), p.max(q));
-        while k <= end {
-            take(((k - a[axis]) / d[axis]).clamp(from, to));
-            k += 1.0;
-        }
+    }
+    if d[axis] == 0.0 {
+        return range;
+    }
+    // In slices of the axis h is bilinear.
+    let dims = scene.lattice().dims();
+    let strides = [1, dims[0], dims[0] * dims[1]];
+    let [u, v] = [(axis + 1) % 3, (axis + 2) % 3];
+    let (su, sv, sa) = (strides[u], strides[v], strides[axis]);
+    let h = scene.field.samples();
+    let (p, q) = (a[axis] + from * d[axis], a[axis] + to * d[axis]);
+    let (k0, k1) = (p.min(q).ceil().max(0.0) as usize, (p.max(q).floor().max(0.0) as usize).min(dims[axis] - 1));
+    let slope = [u, v].map(|x| (d[x] / d[axis]) as f32);
+    let start = [u, v].map(|x| (a[x] - a[axis] * d[x] / d[axis]) as f32);
+    let last = [u, v].map(|x| dims[x] - 2);
+    for k in k0..=k1 {
+        let [x, y] = [0, 1].map(|i| (start[i] + k as f32 * slope[i]).max(0.0));
+        let (i, j) = ((x as usize).min(last[0]), (y as usize).min(last[1]));
+        let (f, g) = ((x - i as f32).min(1.0), (y - j as f32).min(1.0));
+        let at = k * sa + i * su + j * sv;
+        let (near, far) = (h[at] + f * (h[at + su] - h[at]), h[at + sv] + f * (h[at + sv + su] - h[at + sv]));
+        let value = near + g * (far - near);
+        range = (range.0.min(value), range.1.max(value));
     }
     range
 }
@@ -223,7 +271,7 @@ fn points(light: &Polygon, seed: u64, index: u64, number: u32, count: usize) -> 
 #[allow(clippy::cast_possible_truncation, reason = "irradiance is f32")]
 pub(super) fn direct(
     scene: &Scene,
-    geometry: &Geometry,
+    (geometry, isa): (&Geometry, Isa),
     flats: &mut Flats,
     sides: &[Side],
     (seed, index, count): (u64, u64, usize),
@@ -237,11 +285,10 @@ pub(super) fn direct(
     let corners: Vec<DVec3> = (0..8)
         .map(|c| lattice.to_world(lattice.far() * DVec3::from_array([c & 1, c >> 1 & 1, c >> 2].map(f64::from))))
         .collect();
-    // The sign of each side's normal; 0 gives no light to a side that nobody asks for.
-    let wanted = [Side::Lower, Side::Higher].map(|s| match s {
+    // 0 gives no light to a side that nobody asks for.
+    let wanted: [f32; 2] = [Side::Lower, Side::Higher].map(|s| match s {
         s if !sides.contains(&s) => 0.0,
-        Side::Lower => 1.0,
-        Side::Higher => -1.0,
+        _ => 1.0,
     });
     for &number in scene.luminaires() {
         let light = &scene.polygons()[number as usize];
@@ -257,28 +304,37 @@ pub(super) fn direct(
             let inside = (0..3).all(|a| y[a] >= 0.0 && y[a] <= lattice.far()[a]);
             let start = if inside { scene.field.value(y) as f32 } else { f32::NEG_INFINITY };
             let start = if start.is_nan() { f32::NEG_INFINITY } else { start };
-            let fans: [Option<Fan>; 6] = std::array::from_fn(|f| Fan::new(geometry, y, start, f % 3, f >= 3));
-            sums.par_chunks_mut(nx * ny).enumerate().for_each(|(k, slab)| {
-                for (o, sum) in slab.iter_mut().enumerate() {
-                    let Some(normal) = geometry.normal(k * nx * ny + o) else { continue };
-                    let x = DVec3::new((o % nx) as f64, (o / nx) as f64, k as f64);
-                    let place = lattice.to_world(x);
-                    let d = (x - y).to_array();
-                    let size = d.map(f64::abs);
+            let fans: [Option<Fan>; 6] =
+                std::array::from_fn(|f| Fan::new((geometry, isa, sides), y, start, f % 3, f >= 3));
+            let axes = lattice.axes();
+            let step = axes.x_axis.as_vec3();
+            let facing = light.normal().as_vec3();
+            let fans = &fans;
+            sums.par_chunks_mut(nx).enumerate().for_each(|(row, sums)| {
+                let (j, k) = (row % ny, row / ny);
+                let begin = DVec3::new(0.0, j as f64, k as f64);
+                let start = (world - lattice.to_world(begin)).as_vec3();
+                let across = [(j as f64 - y.y).abs(), (k as f64 - y.z).abs()];
+                geometry.lit_nodes(row, |i| {
+                    let normal = geometry.normal_f32(row * nx + i);
+                    let to = start - i as f32 * step;
+                    let (r2, cos_x, cos_y) = (to.length_squared(), to.dot(normal), -to.dot(facing));
+                    // A side that nobody asks for counts as facing away.
+                    if !(cos_y > 0.0) || cos_x * wanted[usize::from(cos_x < 0.0)] == 0.0 {
+                        return;
+                    }
+                    let g = cos_x.abs() * cos_y / (r2 * r2);
+                    let x = [i as f64, begin.y, begin.z];
+                    let size = (x[0] - y.x).abs();
                     let axis =
-                        if size[2] >= size[0] && size[2] >= size[1] { 2 } else { usize::from(size[1] >= size[0]) };
-                    let g = wanted.map(|s| point_term(place, s * normal, world, light.normal()) as f32);
-                    if g == [0.0; 2] {
-                        continue;
-                    }
-                    let Some(fan) = &fans[axis + if d[axis] > 0.0 { 3 } else { 0 }] else { continue };
-                    let Some(v) = fan.visibility(x.to_array()) else { continue };
-                    let open = blockers.polygons.is_empty() || !blockers.block(number, None, y, x);
-                    for s in 0..2 {
-                        sum[s] += if open { g[s] * v[s] } else { 0.0 };
-                        sum[s + 2] += g[s];
-                    }
-                }
+                        if across[1] >= size && across[1] >= across[0] { 2 } else { usize::from(across[0] >= size) };
+                    let Some(fan) = &fans[axis + if x[axis] > y[axis] { 3 } else { 0 }] else { return };
+                    let Some(v) = fan.visibility(x) else { return };
+                    let s = usize::from(cos_x < 0.0);
+                    let open = blockers.polygons.is_empty() || !blockers.block(number, None, y, DVec3::from_array(x));
+                    sums[i][s] += if open { g * v[s] } else { 0.0 };
+                    sums[i][s + 2] += g;
+                });
             });
         }
         for (side, planes) in sides.iter().zip(&mut planes) {

@@ -94,7 +94,7 @@ pub(super) fn lines(lattice: &Lattice, seed: u64, index: u64, directions: usize)
         })
         .collect();
     // The x-dominant families come last: they read a transposed copy.
-    all.sort_by_key(|s| s.layout.transposed);
+    all.sort_by_key(|s| (s.layout.transposed, s.layout.axes[2]));
     all
 }
 

@@ -3,6 +3,8 @@
 #![allow(clippy::needless_range_loop, reason = "a channel indexes several planes at once")]
 
 use super::directions::Shear;
+use super::half::{Half4, encode};
+use super::pack::LANES;
 use crate::flat::{self, FlatTexture};
 use crate::scene::{Boundary, Scene};
 use glam::DVec3;
@@ -24,6 +26,8 @@ pub(super) struct Texture {
     pub indirect: Vec<f32>,
     /// Reflected radiance B.
     pub radiance: Vec<f32>,
+    /// Where the texture starts in [`Flats::packed`].
+    start: usize,
     /// ∫cos dω as the pass has seen it, per texel and isovalue: π where no part of it is inside the solid.
     weight: Vec<f32>,
 }
@@ -105,10 +109,14 @@ pub(super) struct Flats {
     pub textures: Vec<Option<Texture>>,
     /// Isovalue texels of every texture.
     pub isovalues: usize,
+    /// B of black and of all textures times the pass's scale, as lines read it: isovalues fastest.
+    pub packed: Vec<Half4>,
 }
 
 impl Flats {
     pub(super) fn new(scene: &Scene, across: usize, isovalues: usize) -> Self {
+        // Black comes first.
+        let mut next = isovalues;
         let textures = (0..flat::count(scene))
             .map(|number| {
                 let flat = flat::flat(scene, number)?;
@@ -118,6 +126,7 @@ impl Flats {
                 let dims = FlatTexture::resolution(flat.lengths(), across, isovalues);
                 let texels = dims[0] * dims[1];
                 let n = 3 * texels * isovalues;
+                next += texels * isovalues;
                 Some(Texture {
                     dims,
                     albedo: flat.albedo.as_vec3().to_array(),
@@ -125,16 +134,57 @@ impl Flats {
                     direct: vec![0.0; n],
                     indirect: vec![0.0; n],
                     radiance: vec![0.0; n],
+                    start: next - texels * isovalues,
                     weight: vec![0.0; texels * isovalues],
                 })
             })
             .collect();
-        Self { textures, isovalues }
+        Self { textures, isovalues, packed: vec![[0; 4]; next] }
     }
 
     /// Whether nothing reflects.
     pub(super) fn none(&self) -> bool {
         self.textures.iter().all(Option::is_none)
+    }
+
+    /// The greatest B.
+    pub(super) fn greatest(&self) -> f32 {
+        self.textures.iter().flatten().flat_map(|t| &t.radiance).fold(0.0, |m, x| m.max(*x))
+    }
+
+    /// Makes B times `scale` what lines read.
+    pub(super) fn pack(&mut self, scale: f32) {
+        for t in self.textures.iter().flatten() {
+            let nc = t.dims[2];
+            let radiance = &t.radiance;
+            self.packed[t.start..][..t.dims.iter().product()].par_chunks_mut(nc).enumerate().for_each(
+                |(texel, out)| {
+                    let b = &radiance[3 * texel * nc..][..3 * nc];
+                    for (i, o) in out.iter_mut().enumerate() {
+                        *o = [encode(scale * b[i]), encode(scale * b[nc + i]), encode(scale * b[2 * nc + i]), 0];
+                    }
+                },
+            );
+        }
+    }
+
+    /// Where in [`Flats::packed`] the B of a stop over isovalues starts: that of one of the four texels around it, each as
+    /// likely (over `random` ∈ [0, 1)) as bilinear interpolation weighs it.
+    #[inline(always)]
+    #[allow(clippy::cast_possible_truncation, reason = "textures hold fewer than 2³² numbers")]
+    pub(super) fn place(&self, stop: Option<Stop>, random: f32) -> u32 {
+        let texture = stop.and_then(|s| Some((self.textures[s.flat? as usize].as_ref()?, s.uv)));
+        let Some((texture, uv)) = texture else { return 0 };
+        let mut left = random;
+        let mut texel = 0;
+        for (t, w) in around(texture.dims, uv) {
+            texel = t;
+            left -= w;
+            if left < 0.0 {
+                break;
+            }
+        }
+        (texture.start + texel * self.isovalues) as u32
     }
 
     /// Takes the sums of a pass out, empty, so that lines can read while walls receive.
@@ -402,6 +452,51 @@ impl Ends {
             }
         }
         best.map(|(tau, m)| m.stop(p, q, tau, forward))
+    }
+
+    /// [`Ends::stop`] of lines first + 0 … 15 of row q from `from`, with their place in [`Flats::packed`].
+    #[inline(always)]
+    #[allow(clippy::cast_possible_truncation, reason = "texture coordinates")]
+    pub(super) fn stops(
+        &self,
+        flats: &Flats,
+        (first, q): (f64, f64),
+        from: &[f64; LANES],
+        forward: bool,
+        random: &[f32; LANES],
+        places: &mut [u32; LANES],
+    ) {
+        let mut best = [if forward { f64::INFINITY } else { f64::NEG_INFINITY }; LANES];
+        let mut which = [u32::MAX; LANES];
+        let sign = if forward { 1.0 } else { -1.0 };
+        for (number, m) in self.met.iter().enumerate() {
+            if m.front_plus != forward && !m.opaque_back {
+                continue;
+            }
+            let (t0, dt) = (at(&m.tau, first, q), m.tau[1]);
+            let mut tau = [0f64; LANES];
+            let mut slack = [f64::INFINITY; LANES];
+            for l in 0..LANES {
+                tau[l] = t0 + l as f64 * dt;
+            }
+            for e in &m.edges {
+                let (e0, de) = (at(e, first, q), e[1]);
+                for l in 0..LANES {
+                    slack[l] = slack[l].min(e0 + l as f64 * de);
+                }
+            }
+            for l in 0..LANES {
+                // 1e-6 of a slice, as in `stop`.
+                let beyond = (sign * (tau[l] - from[l]) >= -1e-6) & (sign * tau[l] < sign * best[l]);
+                let ok = beyond & (slack[l] >= -m.slack);
+                best[l] = if ok { tau[l] } else { best[l] };
+                which[l] = if ok { number as u32 } else { which[l] };
+            }
+        }
+        for l in 0..LANES {
+            let stop = self.met.get(which[l] as usize).map(|m| m.stop(first + l as f64, q, best[l], forward));
+            places[l] = flats.place(stop, random[l]);
+        }
     }
 
     /// Calls `visit` with every reflecting front that line (p, q) meets, and whether it looks towards +τ.

@@ -3,13 +3,15 @@
 use super::arrive;
 use super::directions::{Layout, Shear};
 use super::flats::{Arrivals, Ends, Flats, Incoming};
-use super::grid::{Geometry, NORMAL_SCALE, Planes, transposed, untransposed};
-use super::pack::{LANES, Pack, Plan, Way};
+use super::grid::{Geometry, NORMAL_SCALE, Planes, Source, transposed, untransposed};
+use super::half::Half4;
+use super::pack::{LANES, Light, Pack, Plan, Way};
 use super::simd::Isa;
 use crate::flattened::Side;
 use crate::scene::Scene;
 use glam::DVec3;
 use rayon::prelude::*;
+use std::sync::Mutex;
 
 /// What every pass of one bake shares.
 pub(super) struct Pass<'a> {
@@ -21,54 +23,80 @@ pub(super) struct Pass<'a> {
     pub primary: Side,
     /// The instruction set of the hot loops.
     pub isa: Isa,
+    /// Buffers to reuse.
+    pub workspaces: Mutex<Vec<Workspace>>,
 }
 
-/// Rows of lines that are in memory at a time. Every node is written once per direction whatever this is.
-const BLOCK: usize = 16;
+/// Tasks per thread that the rows of lines of a family are split into. Every task reads one row more than it owns.
+const TASKS: usize = 4;
 
-/// The radiance that the samples of one row of lines meet: [±τ and channel][slice][line].
-struct RowLight {
-    q: isize,
-    planes: [Vec<f32>; 6],
-    arrivals: Arrivals,
+/// The radiance that the samples of a row of lines meet: [channel][slice][line].
+type RowLight = [Vec<f32>; 3];
+
+/// The irradiance of a row of nodes, a slice per channel.
+type Row<'a> = [&'a mut [f32]; 3];
+
+/// What a task needs beside its rows.
+pub(super) struct Workspace {
+    pack: Pack,
+    light: [RowLight; 2],
+}
+
+/// What one family of lines reads.
+struct Family<'a> {
+    plan: &'a Plan,
+    source: Source<'a>,
+    ends: &'a Ends,
+    flats: &'a Flats,
+    walls: arrive::Walls<'a>,
+    way: Way,
+    /// The direction times what |ω·N| weighs, over N's units.
+    omega: [f32; 3],
 }
 
 impl Pass<'_> {
-    /// Irradiance of every node of `side` from the radiance `b` of the nodes and the flats, along all `lines` and both
-    /// their directions. Flats receive too. `tick` is asked before every family; false stops with what is done.
+    /// Irradiance of every node of `side` from the radiance `b` of the nodes (times `scale`) and the flats, along all
+    /// `lines` and both their directions. Flats receive too. `tick` is asked before every family; false stops with what is
+    /// done.
+    #[allow(clippy::too_many_arguments, reason = "one caller")]
     pub(super) fn gather(
         &self,
         side: Side,
         lines: &[Shear],
-        b: &Planes,
+        b: &[Half4],
+        scale: f32,
         flats: &Flats,
         incoming: &mut Incoming,
         tick: &mut dyn FnMut() -> bool,
     ) -> (Planes, bool) {
         let dims = self.geometry.dims;
-        let mut e = super::grid::black(b[0].len());
+        let mut e = super::grid::black(b.len());
         let split = lines.partition_point(|s| !s.layout.transposed);
-        for shear in &lines[..split] {
-            if !tick() {
-                return (e, false);
+        let mut complete = true;
+        for (transpose, some) in [(false, &lines[..split]), (true, &lines[split..])] {
+            if some.is_empty() {
+                continue;
             }
-            self.family(side, shear, lines.len(), b, &mut e, flats, incoming);
-        }
-        if split < lines.len() {
-            let turn = |p: &Planes| -> Planes { std::array::from_fn(|c| transposed(&p[c], dims)) };
-            let b = turn(b);
-            e = turn(&e);
-            for shear in &lines[split..] {
-                if !tick() {
-                    return (std::array::from_fn(|c| untransposed(&e[c], dims)), false);
+            let turned;
+            let b = if transpose {
+                turned = transposed(b, dims);
+                e.iter_mut().for_each(|e| *e = transposed(e, dims));
+                &turned
+            } else {
+                b
+            };
+            for shear in some {
+                complete = complete && tick();
+                if complete {
+                    self.family(side, shear, lines.len(), (b, scale), &mut e, flats, incoming);
                 }
-                self.family(side, shear, lines.len(), &b, &mut e, flats, incoming);
             }
-            drop(b);
-            e = std::array::from_fn(|c| untransposed(&e[c], dims));
+            if transpose {
+                e.iter_mut().for_each(|e| *e = untransposed(e, dims));
+            }
         }
         self.normalise(lines, &mut e);
-        (e, true)
+        (e, complete)
     }
 
     /// Divides by the sum of cosines that the directions gave each node's normal, which is π only in the mean: equal
@@ -98,7 +126,7 @@ impl Pass<'_> {
         side: Side,
         shear: &Shear,
         lines: usize,
-        b: &Planes,
+        (b, scale): (&[Half4], f32),
         e: &mut Planes,
         flats: &Flats,
         incoming: &mut Incoming,
@@ -106,133 +134,190 @@ impl Pass<'_> {
         let sign = if side == Side::Lower { 1.0 } else { -1.0 };
         let plan = Plan::new(*shear, sign);
         let ends = Ends::new(self.scene, flats, shear, self.inside);
-        let walls = arrive::Walls::new(self, &plan, &ends, flats, side, lines);
-        let h = self.geometry.h(&shear.layout);
-        let na = shear.layout.dims[2];
-        let size = na * plan.width;
-        let new_row =
-            || RowLight { q: 0, planes: std::array::from_fn(|_| vec![0.0; size]), arrivals: Arrivals::default() };
-        let mut rows: Vec<RowLight> = (0..BLOCK + 1).map(|_| new_row()).collect();
-        // Rows that meet Ω, one behind them for the last row of nodes, and those that only walls see.
-        let first = plan.first[1].min(walls.rows.0);
-        let last = (plan.first[1] + plan.count[1] as isize).max(walls.rows.1);
-        let strict = side == Side::Higher;
-        let isa = self.isa;
-        let scale = 4.0 * std::f64::consts::PI / (2 * lines) as f64;
-        let omega = (shear.omega * (f64::from(sign) * scale / f64::from(NORMAL_SCALE))).as_vec3().to_array();
-        let mut q0 = first;
-        while q0 <= last {
-            let q1 = (q0 + BLOCK as isize).min(last + 1);
-            let count = (q1 - q0).unsigned_abs();
-            rows[1..=count].par_iter_mut().enumerate().for_each_init(
-                || Pack::new(na, flats),
-                |pack, (n, row)| {
-                    row.q = q0 + n as isize;
-                    row.arrivals = Arrivals::default();
-                    let within = row.q >= plan.first[1] && row.q < plan.first[1] + plan.count[1] as isize;
-                    for start in (0..plan.width).step_by(LANES).filter(|_| within) {
-                        let p = plan.first[0] + start as isize;
-                        if !isa.read(pack, &plan, h, b, p, row.q) {
-                            continue;
-                        }
-                        isa.end(pack, &plan, &ends, flats, p, row.q);
-                        let (plus, minus) = row.planes.split_at_mut(3);
-                        for (forward, out) in [(true, plus), (false, minus)] {
-                            isa.scan(pack, Way { forward, strict, sign }, out, (plan.width, start));
-                        }
-                        walls.through(pack, p, row.q, &mut row.arrivals);
-                    }
-                    walls.past(row.q, within, &mut row.arrivals);
-                },
-            );
-            self.accumulate(&plan, omega, &rows[..=count], (q0, q1), e);
-            let arrivals: Vec<Arrivals> = rows[1..=count].iter_mut().map(|r| std::mem::take(&mut r.arrivals)).collect();
-            incoming.receive(&arrivals);
-            rows.swap(0, count);
-            q0 = q1;
+        let walls = arrive::Walls::new(self, &plan, &ends, flats, side, lines, 1.0 / scale);
+        let share = 4.0 * std::f64::consts::PI / (2 * lines) as f64 / f64::from(NORMAL_SCALE * scale);
+        let family = Family {
+            plan: &plan,
+            source: self.geometry.source(&shear.layout, side, b),
+            ends: &ends,
+            flats,
+            way: Way { strict: side == Side::Higher, sign },
+            omega: (shear.omega * share).as_vec3().to_array(),
+            // Rows that meet Ω, one behind them for the last row of nodes, and those that only walls see.
+            walls,
+        };
+        let first = plan.first[1].min(family.walls.rows.0);
+        let last = (plan.first[1] + plan.count[1] as isize).max(family.walls.rows.1);
+        let count = (last - first + 1).unsigned_abs();
+        let mut rows: Vec<(Vec<(usize, Row)>, Arrivals)> = (0..count).map(|_| Default::default()).collect();
+        for (k, j, row) in self.rows(&plan, e) {
+            rows[(j as isize - plan.shift[1][k].0 - first).unsigned_abs()].0.push((k, row));
+        }
+        let size = count.div_ceil(TASKS * rayon::current_num_threads());
+        rows.par_chunks_mut(size).enumerate().for_each(|(task, rows)| {
+            self.rows_of_lines(&family, first + (task * size) as isize, rows);
+        });
+        let arrivals: Vec<Arrivals> = rows.into_iter().map(|(_, a)| a).collect();
+        incoming.receive(&arrivals);
+    }
+
+    /// The rows of nodes that hold light, with their slice and place along v.
+    fn rows<'e>(&'e self, plan: &'e Plan, e: &'e mut Planes) -> impl Iterator<Item = (usize, usize, Row<'e>)> {
+        let layout = &plan.shear.layout;
+        let [nu, nv, na] = layout.dims;
+        let inner = if layout.slices_outermost() { nv } else { na };
+        let lit = &self.geometry.lit_blocks(layout).rows;
+        let [e0, e1, e2] = e;
+        e0.chunks_exact_mut(nu)
+            .zip(e1.chunks_exact_mut(nu))
+            .zip(e2.chunks_exact_mut(nu))
+            .enumerate()
+            .filter(|(row, _)| lit[*row] != 0)
+            .map(move |(row, ((e0, e1), e2))| {
+                let (outer, inner) = (row / inner, row % inner);
+                let (k, j) = if layout.slices_outermost() { (outer, inner) } else { (inner, outer) };
+                (k, j, [e0, e1, e2])
+            })
+    }
+
+    /// Rows q = `first` … of lines: their light to the nodes between each and the one before, and to walls.
+    fn rows_of_lines(&self, family: &Family, first: isize, rows: &mut [(Vec<(usize, Row)>, Arrivals)]) {
+        let plan = family.plan;
+        let size = plan.shear.layout.dims[2] * plan.width;
+        let mut work = self
+            .workspaces
+            .lock()
+            .expect("no thread panics")
+            .pop()
+            .unwrap_or_else(|| Workspace { pack: Pack::with_rows(0), light: Default::default() });
+        work.pack.fit(plan.shear.layout.dims[2]);
+        work.light.iter_mut().flatten().for_each(|l| l.resize(size, 0.0));
+        // Nodes of the first row need the lines before.
+        if !rows[0].0.is_empty() {
+            self.row_of_lines(family, first - 1, &mut work, 1, None);
+        }
+        for (n, (nodes, arrivals)) in rows.iter_mut().enumerate() {
+            let q = first + n as isize;
+            self.row_of_lines(family, q, &mut work, n % 2, Some(arrivals));
+            let (this, before) = (&work.light[n % 2], &work.light[1 - n % 2]);
+            for (k, e) in nodes {
+                self.accumulate(family, (*k, q), [this, before], e);
+            }
+        }
+        self.workspaces.lock().expect("no thread panics").push(work);
+    }
+
+    /// Light along one row of lines.
+    fn row_of_lines(
+        &self,
+        family: &Family,
+        q: isize,
+        work: &mut Workspace,
+        which: usize,
+        mut arrivals: Option<&mut Arrivals>,
+    ) {
+        let plan = family.plan;
+        let pack = &mut work.pack;
+        let within = q >= plan.first[1] && q < plan.first[1] + plan.count[1] as isize;
+        for start in (0..plan.width).step_by(LANES).filter(|_| within) {
+            let p = plan.first[0] + start as isize;
+            if self.isa.read(pack, plan, &family.source, p, q) {
+                self.isa.end(pack, plan, family.ends, family.flats, p, q);
+                let flats = family.flats;
+                let light = Light { b: family.source.b, flats: &flats.packed, isovalues: flats.isovalues };
+                self.isa.scan(pack, family.way, light, &mut work.light[which], (plan.width, start));
+            }
+            if let Some(arrivals) = &mut arrivals {
+                family.walls.through(pack, family.source.b, p, q, arrivals);
+            }
+        }
+        if let Some(arrivals) = arrivals {
+            family.walls.past(q, within, arrivals);
         }
     }
 
-    /// Adds what rows q0..q1 of lines (and the one before) brought to the nodes between them: each node takes its four
-    /// nearest lines by bilinear weights, normalised at Ω's faces, times the cosine of its own normal.
-    fn accumulate(&self, plan: &Plan, omega: [f32; 3], rows: &[RowLight], (q0, q1): (isize, isize), e: &mut Planes) {
+    /// Adds what lines q and q − 1 brought to a row of nodes in slice k: each node takes its four nearest lines by
+    /// bilinear weights, normalised at Ω's faces, times the cosine of its own normal.
+    fn accumulate(&self, family: &Family, (k, q): (usize, isize), light: [&RowLight; 2], e: &mut Row) {
+        let plan = family.plan;
         let layout = &plan.shear.layout;
-        let [nu, nv, na] = layout.dims;
-        let outer_is_slice = layout.slices_outermost();
-        let inner = if outer_is_slice { nv } else { na };
+        let [nu, nv, _] = layout.dims;
+        let (whole, fv) = plan.shift[1][k];
+        let j = (q + whole).unsigned_abs();
+        // Lines beyond Ω's faces do not exist: their neighbour counts alone.
+        let (near, far, fv) = match j {
+            0 => (0, 0, 0.0),
+            j if j == nv - 1 => (1, 1, 0.0),
+            _ => (0, 1, fv),
+        };
+        let (whole, fu) = plan.shift[0][k];
+        let line0 = (-whole - plan.first[0]).unsigned_abs();
+        let light: [[&[f32]; 3]; 2] =
+            [near, far].map(|r| std::array::from_fn(|c| &light[r][c][k * plan.width..][..plan.width]));
+        let at = k * layout.stride[1] + j * layout.stride[0];
         let normals = self.geometry.normals(layout);
-        let chunk = nu * inner;
+        let n = [0, 1, 2].map(|a| &normals[a][at..][..nu]);
+        let lit = self.geometry.lit_blocks(layout);
         let [e0, e1, e2] = e;
-        (e0.par_chunks_mut(chunk), e1.par_chunks_mut(chunk), e2.par_chunks_mut(chunk))
-            .into_par_iter()
-            .enumerate()
-            .for_each(|(outer, (e0, e1, e2))| {
-                for m in 0..inner {
-                    let (k, j) = if outer_is_slice { (outer, m) } else { (m, outer) };
-                    let q = j as isize - plan.shift[1][k].0;
-                    if q < q0 || q >= q1 {
-                        continue;
-                    }
-                    let fv = plan.shift[1][k].1;
-                    let this = (q - q0 + 1).unsigned_abs();
-                    // Lines beyond Ω's faces do not exist: their neighbour counts alone.
-                    let (near, far, fv) = match j {
-                        0 => (this, this, 0.0),
-                        j if j == nv - 1 => (this - 1, this - 1, 0.0),
-                        _ => (this, this - 1, fv),
-                    };
-                    let (whole, fu) = plan.shift[0][k];
-                    let line0 = (-whole - plan.first[0]).unsigned_abs();
-                    let light: [[&[f32]; 6]; 2] = [near, far]
-                        .map(|r| std::array::from_fn(|c| &rows[r].planes[c][k * plan.width..][..plan.width]));
-                    let at = m * nu..(m + 1) * nu;
-                    let n = [0, 1, 2].map(|a| &normals[a][outer * chunk..][at.clone()]);
-                    let e = [&mut e0[at.clone()], &mut e1[at.clone()], &mut e2[at.clone()]];
-                    self.isa.accumulate(e, n, omega, light, line0, fu, fv);
-                }
-            });
+        let mut bits = lit.rows[at / nu];
+        while bits != 0 {
+            // Runs of lit blocks.
+            let a = bits.trailing_zeros() as usize;
+            let run = (!(bits >> a)).trailing_zeros() as usize;
+            bits = if a + run >= 64 { 0 } else { bits >> (a + run) << (a + run) };
+            let (a, b) = (a * lit.size, ((a + run) * lit.size).min(nu));
+            self.isa.accumulate(
+                [&mut e0[..], &mut e1[..], &mut e2[..]],
+                n,
+                family.omega,
+                light,
+                line0,
+                [fu, fv],
+                (a, b),
+            );
+        }
     }
 }
 
-/// One row of nodes. `line0` is the line (in `light`) just beyond node 0, −1 of which is missing.
+/// Nodes a..b of a row. `line0` is the line (in `light`) just beyond node 0, −1 of which is missing.
 #[inline(always)]
 pub(super) fn accumulate_row(
     e: [&mut [f32]; 3],
     n: [&[i16]; 3],
     omega: [f32; 3],
-    light: [[&[f32]; 6]; 2],
+    light: [[&[f32]; 3]; 2],
     line0: usize,
-    fu: f32,
-    fv: f32,
+    [fu, fv]: [f32; 2],
+    (a, b): (usize, usize),
 ) {
     let nu = n[0].len();
     let cosine =
         |i: usize| omega[0] * f32::from(n[0][i]) + omega[1] * f32::from(n[1][i]) + omega[2] * f32::from(n[2][i]);
     // Ω's faces: one column of lines.
     for (i, line) in [(0, line0), (nu - 1, line0 + nu - 2)] {
-        let cos = cosine(i);
-        let way = if cos > 0.0 { 0 } else { 3 };
-        for c in 0..3 {
-            let (near, far) = (light[0][way + c][line], light[1][way + c][line]);
-            e[c][i] += cos.abs() * ((1.0 - fv) * near + fv * far);
+        if a <= i && i < b {
+            for c in 0..3 {
+                let (near, far) = (light[0][c][line], light[1][c][line]);
+                e[c][i] += cosine(i).abs() * ((1.0 - fv) * near + fv * far);
+            }
         }
     }
-    if nu < 3 {
+    let (a, b) = (a.max(1), b.min(nu - 1));
+    if a >= b {
         return;
     }
-    let inner = nu - 2;
     let w = [(1.0 - fv) * (1.0 - fu), (1.0 - fv) * fu, fv * (1.0 - fu), fv * fu];
-    let n = n.map(|n| &n[1..][..inner]);
-    for c in 0..3 {
-        let lines = |row: usize, way: usize, before: usize| &light[row][way + c][line0 + 1 - before..][..inner];
-        let plus = [lines(0, 0, 0), lines(0, 0, 1), lines(1, 0, 0), lines(1, 0, 1)];
-        let minus = [lines(0, 3, 0), lines(0, 3, 1), lines(1, 3, 0), lines(1, 3, 1)];
-        let e = &mut e[c][1..][..inner];
-        for i in 0..inner {
-            let cos = omega[0] * f32::from(n[0][i]) + omega[1] * f32::from(n[1][i]) + omega[2] * f32::from(n[2][i]);
-            let a = (w[0] * plus[0][i] + w[1] * plus[1][i]) + (w[2] * plus[2][i] + w[3] * plus[3][i]);
-            let b = (w[0] * minus[0][i] + w[1] * minus[1][i]) + (w[2] * minus[2][i] + w[3] * minus[3][i]);
-            e[i] += cos.max(0.0) * a + (-cos).max(0.0) * b;
+    let len = b - a;
+    let n = n.map(|n| &n[a..b]);
+    let [e0, e1, e2] = e;
+    let e = [&mut e0[a..b], &mut e1[a..b], &mut e2[a..b]];
+    let lines = light.map(|row| row.map(|c| (&c[line0 + a..][..len], &c[line0 + a - 1..][..len])));
+    let [near, far] = lines;
+    for i in 0..len {
+        let cos = omega[0] * f32::from(n[0][i]) + omega[1] * f32::from(n[1][i]) + omega[2] * f32::from(n[2][i]);
+        let cos = cos.abs();
+        for c in 0..3 {
+            e[c][i] += cos * ((w[0] * near[c].0[i] + w[1] * near[c].1[i]) + (w[2] * far[c].0[i] + w[3] * far[c].1[i]));
         }
     }
 }

@@ -2,14 +2,16 @@
 //! of nodes without a surface.
 
 use super::directions::Layout;
+use super::half::{Half4, decode, encode};
 use crate::field::Field;
-use glam::DVec3;
+use crate::flattened::Side;
+use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 /// Normals are stored in units of 1/32767.
 pub(super) const NORMAL_SCALE: f32 = 32767.0;
 
-/// Nodes this far outside the sweep, in its units, are still lit.
+/// Nodes this far outside the sweep, in its units, are still lit if a neighbour is in it.
 const OVERSHOOT: f32 = 0.1;
 
 /// Red, green and blue, a plane each, so that neighbouring lines load neighbouring numbers.
@@ -33,6 +35,89 @@ pub(super) struct Geometry<'a> {
     /// interpolate with than a copy.
     pub lit: Vec<bool>,
     rings: Vec<Vec<u32>>,
+    /// Per memory order, the blocks of lit nodes.
+    lit_blocks: [Blocks; 2],
+    /// Per side and memory order, the blocks of nodes within one node of those that reach the sweep.
+    awake: [[Blocks; 2]; 2],
+}
+
+/// For every row of nodes in memory, which blocks of [`Blocks::size`] nodes hold something.
+pub(super) struct Blocks {
+    /// Nodes in a block.
+    pub size: usize,
+    /// A bit per block of a row.
+    pub rows: Vec<u64>,
+}
+
+impl Blocks {
+    /// The blocks of nodes that `is` holds, in rows of `nu`; with `reach` neighbours along the row count too.
+    fn new(nu: usize, rows: usize, reach: usize, is: impl Fn(usize) -> bool + Sync) -> Self {
+        let size = nu.div_ceil(64).next_multiple_of(16);
+        let rows = (0..rows)
+            .into_par_iter()
+            .with_min_len(64)
+            .map(|row| {
+                let mut bits = 0u64;
+                for i in (0..nu).filter(|i| is(row * nu + i)) {
+                    bits |= 1 << (i.saturating_sub(reach) / size) | 1 << ((i + reach).min(nu - 1) / size);
+                }
+                bits
+            })
+            .collect();
+        Self { size, rows }
+    }
+
+    /// Joins every row with its neighbours along both other axes, the faster of which has `inner` rows.
+    fn joined(self, inner: usize) -> Self {
+        let outer = self.rows.len() / inner;
+        let rows = (0..self.rows.len())
+            .map(|row| {
+                let (i, o) = (row % inner, row / inner);
+                let mut bits = 0;
+                for o in o.saturating_sub(1)..(o + 2).min(outer) {
+                    for i in i.saturating_sub(1)..(i + 2).min(inner) {
+                        bits |= self.rows[o * inner + i];
+                    }
+                }
+                bits
+            })
+            .collect();
+        Self { size: self.size, rows }
+    }
+
+    /// The least range of nodes that holds the blocks of a row and the one `step` rows on; `None` if there are none.
+    #[inline]
+    pub(super) fn extent(&self, row: usize, step: usize, nu: usize) -> Option<(usize, usize)> {
+        let bits = self.rows[row] | self.rows[row + step];
+        let (a, b) = (bits.trailing_zeros() as usize, 64 - bits.leading_zeros() as usize);
+        // A line beyond a block's last node still meets its cell.
+        (bits != 0).then(|| ((a * self.size).saturating_sub(1), (b * self.size + 1).min(nu)))
+    }
+
+    /// Whether a block of `bits` meets nodes from..to.
+    #[inline(always)]
+    fn meets(&self, bits: u64, from: usize, to: usize) -> bool {
+        let (a, b) = (from / self.size, (to - 1) / self.size);
+        bits & (u64::MAX << a) & (u64::MAX >> (63 - b)) != 0
+    }
+}
+
+/// What lines read: h and B in one memory order.
+pub(super) struct Source<'a> {
+    pub h: &'a [f32],
+    pub b: &'a [Half4],
+    awake: &'a Blocks,
+    /// Rows of nodes from one v or slice to the next.
+    step: [usize; 2],
+}
+
+impl Source<'_> {
+    /// Whether nodes from..to of rows j and j + 1 in slice k may reach the sweep.
+    #[inline(always)]
+    pub(super) fn awake(&self, k: usize, j: usize, from: usize, to: usize) -> bool {
+        let row = j * self.step[0] + k * self.step[1];
+        self.awake.meets(self.awake.rows[row] | self.awake.rows[row + self.step[0]], from, to)
+    }
 }
 
 impl<'a> Geometry<'a> {
@@ -54,10 +139,63 @@ impl<'a> Geometry<'a> {
         let valid: Vec<bool> = h.iter().zip(&encoded).map(|(h, n)| (0.0..=1.0).contains(h) && *n != [0; 3]).collect();
         let normals: [Vec<i16>; 3] = std::array::from_fn(|a| encoded.iter().map(|n| n[a]).collect());
         let normals_transposed = std::array::from_fn(|a| transposed(&normals[a], dims));
-        let lit: Vec<bool> =
-            h.iter().zip(&encoded).map(|(h, n)| (-OVERSHOOT..=1.0 + OVERSHOOT).contains(h) && *n != [0; 3]).collect();
+        drop(encoded);
+        let near = |at: usize| (-OVERSHOOT..=1.0 + OVERSHOOT).contains(&h[at]) && (0..3).any(|a| normals[a][at] != 0);
+        let mut lit = valid.clone();
+        ring(dims, &valid).into_iter().filter(|at| near(*at as usize)).for_each(|at| lit[at as usize] = true);
         let rings = rings(dims, &lit);
-        Self { dims, h, h_transposed: transposed(h, dims), normals, normals_transposed, valid, lit, rings }
+        let h_transposed = transposed(h, dims);
+        let [nx, ny, nz] = dims;
+        // From y, z, x order.
+        let place = |at: usize| {
+            let (row, y) = (at / ny, at % ny);
+            (row % nz * ny + y) * nx + row / nz
+        };
+        let lit_blocks = [Blocks::new(nx, ny * nz, 0, |at| lit[at]), Blocks::new(ny, nz * nx, 0, |at| lit[place(at)])];
+        let awake = [Side::Lower, Side::Higher].map(|side| {
+            let reaches = |h: f32| if side == Side::Lower { !(h < 0.0) } else { !(h > 1.0) };
+            [
+                Blocks::new(nx, ny * nz, 1, |at| reaches(h[at])).joined(ny),
+                Blocks::new(ny, nz * nx, 1, |at| reaches(h_transposed[at])).joined(nz),
+            ]
+        });
+        Self { dims, h, h_transposed, normals, normals_transposed, valid, lit, rings, lit_blocks, awake }
+    }
+
+    /// What lines of `side` read, with B in the memory order of `layout`.
+    pub(super) fn source<'s>(&'s self, layout: &Layout, side: Side, b: &'s [Half4]) -> Source<'s> {
+        let nu = layout.dims[0];
+        Source { h: self.h(layout), b, awake: self.awake(layout, side), step: layout.stride.map(|s| s / nu) }
+    }
+
+    /// The blocks where lines of `side` read, in the memory order of `layout`.
+    pub(super) fn awake(&self, layout: &Layout, side: Side) -> &Blocks {
+        &self.awake[side.index()][usize::from(layout.transposed)]
+    }
+
+    /// Calls `visit` with the lit nodes of a row along x.
+    #[inline(always)]
+    pub(super) fn lit_nodes(&self, row: usize, mut visit: impl FnMut(usize)) {
+        let blocks = &self.lit_blocks[0];
+        let nx = self.dims[0];
+        let mut bits = blocks.rows[row];
+        while bits != 0 {
+            let a = bits.trailing_zeros() as usize * blocks.size;
+            bits &= bits - 1;
+            let b = (a + blocks.size).min(nx);
+            self.lit[row * nx + a..row * nx + b].iter().zip(a..b).filter(|(lit, _)| **lit).for_each(|(_, i)| visit(i));
+        }
+    }
+
+    /// The normal of a lit node towards the lower side, a unit vector to 3·10⁻⁵.
+    #[inline(always)]
+    pub(super) fn normal_f32(&self, at: usize) -> Vec3 {
+        Vec3::from_array(std::array::from_fn(|a| f32::from(self.normals[a][at]))) / NORMAL_SCALE
+    }
+
+    /// The lit nodes of rows in the memory order of `layout`.
+    pub(super) fn lit_blocks(&self, layout: &Layout) -> &Blocks {
+        &self.lit_blocks[usize::from(layout.transposed)]
     }
 
     /// h in the memory order of `layout`.
@@ -80,27 +218,29 @@ impl<'a> Geometry<'a> {
 
     /// Gives nodes without a surface the mean of their neighbours that have one (or were filled before), so that
     /// interpolation near the sweep's ends meets no black.
-    pub(super) fn fill(&self, planes: &mut Planes) {
+    pub(super) fn fill(&self, b: &mut [Half4]) {
         let mut known = self.lit.clone();
         let [nx, ny, nz] = self.dims;
         for ring in &self.rings {
             let known_before = &known;
-            let values: Vec<[f32; 3]> = ring
+            let old = &*b;
+            let values: Vec<Half4> = ring
                 .par_iter()
                 .with_min_len(1 << 10)
                 .map(|&at| {
                     let (mut sum, mut count) = ([0f32; 3], 0f32);
                     neighbours([nx, ny, nz], at as usize, |n| {
                         if known_before[n] {
-                            (0..3).for_each(|c| sum[c] += planes[c][n]);
+                            (0..3).for_each(|c| sum[c] += decode(old[n][c]));
                             count += 1.0;
                         }
                     });
-                    sum.map(|s| s / count.max(1.0))
+                    let [r, g, b] = sum.map(|s| encode(s / count.max(1.0)));
+                    [r, g, b, 0]
                 })
                 .collect();
             for (&at, v) in ring.iter().zip(values) {
-                (0..3).for_each(|c| planes[c][at as usize] = v[c]);
+                b[at as usize] = v;
             }
             ring.iter().for_each(|&at| known[at as usize] = true);
         }
@@ -118,28 +258,40 @@ fn neighbours([nx, ny, nz]: [usize; 3], at: usize, mut visit: impl FnMut(usize))
     }
 }
 
-/// Nodes without surface that share a cell with a valid node, then those that share a cell with these.
+/// Nodes that are not known but share a cell with one that is.
 #[allow(clippy::cast_possible_truncation, reason = "nodes are numbered in 32 bits")]
-fn rings(dims: [usize; 3], valid: &[bool]) -> Vec<Vec<u32>> {
-    let mut known = valid.to_vec();
+fn ring([nx, ny, nz]: [usize; 3], known: &[bool]) -> Vec<u32> {
+    // One axis at a time.
+    let along = |from: &[bool], stride: usize, n: usize| -> Vec<bool> {
+        let mut to = from.to_vec();
+        to.par_chunks_mut(stride * n).zip(from.par_chunks(stride * n)).for_each(|(to, from)| {
+            let inner = stride * (n - 1);
+            to[stride..].iter_mut().zip(&from[..inner]).for_each(|(t, f)| *t |= f);
+            to[..inner].iter_mut().zip(&from[stride..]).for_each(|(t, f)| *t |= f);
+        });
+        to
+    };
+    let wide = along(&along(&along(known, 1, nx), nx, ny), nx * ny, nz);
+    (0..known.len()).filter(|&at| wide[at] && !known[at]).map(|at| at as u32).collect()
+}
+
+/// Nodes without light that share a cell with a lit node, then those that share a cell with these.
+fn rings(dims: [usize; 3], lit: &[bool]) -> Vec<Vec<u32>> {
+    let mut known = lit.to_vec();
     (0..2)
         .map(|_| {
-            let ring: Vec<u32> = (0..known.len())
-                .into_par_iter()
-                .with_min_len(1 << 12)
-                .filter(|&at| {
-                    let mut any = false;
-                    if !known[at] {
-                        neighbours(dims, at, |n| any |= known[n]);
-                    }
-                    any
-                })
-                .map(|at| at as u32)
-                .collect();
+            let ring = ring(dims, &known);
             ring.iter().for_each(|&at| known[at as usize] = true);
             ring
         })
         .collect()
+}
+
+/// The greatest of numbers that are not negative.
+pub(super) fn greatest(plane: &[f32]) -> f32 {
+    // Their bits compare as they do, and integers in vectors.
+    let most = |x: &[f32]| x.iter().fold(0, |m, x| x.to_bits().max(m));
+    f32::from_bits(plane.par_chunks(1 << 14).map(most).max().unwrap_or(0))
 }
 
 /// Columns of x are moved this many at a time: a cache line of f32.

@@ -3,8 +3,9 @@
 #![allow(clippy::needless_range_loop, reason = "a channel indexes several planes at once")]
 
 use super::directions::Shear;
-use super::flats::{Ends, Flats, Stop, fill_column};
-use super::grid::Planes;
+use super::flats::{Ends, Flats, Stop};
+use super::grid::Source;
+use super::half::{Half4, decode};
 
 /// Lines in a pack.
 pub(super) const LANES: usize = 16;
@@ -12,6 +13,8 @@ pub(super) const LANES: usize = 16;
 pub(super) type Lanes = [f32; LANES];
 /// h where a line is outside Ω.
 pub(super) const OUTSIDE: f32 = f32::NEG_INFINITY;
+/// h where it was not read, since nothing there reaches the sweep: below everything, so that no ray ends there.
+pub(super) const ASLEEP: f32 = f32::MIN;
 
 /// Everything about one family of lines that its rows share.
 pub(super) struct Plan {
@@ -48,6 +51,16 @@ impl Plan {
         Self { shear, shift, first, count, width, sign }
     }
 
+    /// Differs from pack to pack and family to family.
+    #[inline(always)]
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "any bits do")]
+    fn noise(&self, first: isize, q: f64) -> u32 {
+        let family = (self.shear.offset[0].to_bits() ^ self.shear.offset[1].to_bits() >> 7) >> 12;
+        let pack =
+            (first as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ (q as i64 as u64).wrapping_mul(0xc2b2_ae3d_27d4_eb4f);
+        ((family ^ pack).wrapping_mul(0xff51_afd7_ed55_8ccd) >> 32) as u32
+    }
+
     /// τ at which line (p, q) enters and leaves Ω; empty if it misses.
     pub(super) fn span(&self, p: f64, q: f64) -> [f64; 2] {
         let [nu, nv, na] = self.shear.layout.dims;
@@ -68,37 +81,28 @@ impl Plan {
     }
 }
 
-/// Numbers at four samples and their weights: any point of a face of a cell.
+/// Weights of the four samples around a line, at those offsets.
 #[derive(Clone, Copy)]
 struct Taps {
     at: [isize; 4],
     weight: [f32; 4],
 }
 
-impl Taps {
-    #[inline(always)]
-    fn one(&self, plane: &[f32], lane: isize) -> f32 {
-        let s = |t: usize| self.weight[t] * plane[(self.at[t] + lane).unsigned_abs()];
-        (s(0) + s(1)) + (s(2) + s(3))
+/// Σ weight · x over four rows. (Loops, since closures given to the library are not compiled for the instruction set.)
+#[inline(always)]
+fn mix<const N: usize>(weight: [f32; 4], [a, b, c, d]: [&[f32; N]; 4], out: &mut [f32; N]) {
+    for l in 0..N {
+        out[l] = (weight[0] * a[l] + weight[1] * b[l]) + (weight[2] * c[l] + weight[3] * d[l]);
     }
+}
 
-    /// Lanes `lo..hi` of a pack that starts at memory position `at + 0`.
-    #[inline(always)]
-    fn many(&self, plane: &[f32], lo: usize, hi: usize, out: &mut Lanes) {
-        if lo == 0 && hi == LANES {
-            let lanes = |t: usize| -> &[f32; LANES] {
-                plane[self.at[t].unsigned_abs()..][..LANES].try_into().expect("sixteen lanes")
-            };
-            let (a, b, c, d) = (lanes(0), lanes(1), lanes(2), lanes(3));
-            let w = self.weight;
-            for l in 0..LANES {
-                out[l] = (w[0] * a[l] + w[1] * b[l]) + (w[2] * c[l] + w[3] * d[l]);
-            }
-        } else {
-            for (l, o) in out.iter_mut().enumerate().take(hi).skip(lo) {
-                *o = self.one(plane, l as isize);
-            }
-        }
+/// Marks the lanes that are not in lo..hi.
+#[inline(always)]
+#[allow(clippy::cast_possible_truncation, reason = "lanes")]
+fn blank(line: &mut Lanes, lo: usize, hi: usize) {
+    let (lo, width) = (lo as u32, (hi - lo) as u32);
+    for l in 0..LANES {
+        line[l] = if (l as u32).wrapping_sub(lo) < width { line[l] } else { OUTSIDE };
     }
 }
 
@@ -107,14 +111,22 @@ impl Taps {
 pub(super) struct Cut {
     pub row: usize,
     pub lane: usize,
-    pub slots: [u32; 2],
+    pub places: [u32; 2],
+}
+
+/// What rays meet.
+#[derive(Clone, Copy)]
+pub(super) struct Light<'a> {
+    /// B of the nodes.
+    pub b: &'a [Half4],
+    /// [`Flats::packed`], and its isovalues.
+    pub flats: &'a [Half4],
+    pub isovalues: usize,
 }
 
 /// How to scan.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Way {
-    /// Rays run towards +τ.
-    pub forward: bool,
     /// The next value must be greater, not only as great: the higher side.
     pub strict: bool,
     /// The sign h was read with.
@@ -125,107 +137,157 @@ pub(super) struct Way {
 /// line's entry and exit through Ω's sides stand in the rows before its first and after its last slice.
 pub(super) struct Pack {
     pub h: Vec<Lanes>,
-    pub b: [Vec<Lanes>; 3],
-    pub next: Vec<[u32; LANES]>,
-    pub h_next: Vec<Lanes>,
-    /// Rows that hold samples.
-    pub rows: (usize, usize),
+    /// Which node's B stands for that of each sample: per row one of the four around the line, each as likely as bilinear
+    /// interpolation weighs it. Neighbouring nodes differ little and every ray meets others, so that the mean is what
+    /// interpolation gives at a quarter of the work.
+    pub node: Vec<[u32; LANES]>,
+    /// Per direction (+, −), the number 16 · row + lane of the sample that the ray from each sample meets, and h there; from
+    /// [`Pack::ends`] on the place of an end in [`Flats::packed`], and ∞.
+    pub next: [Vec<[u32; LANES]>; 2],
+    pub h_next: [Vec<Lanes>; 2],
+    /// The rows that were read, ascending: all that reach the sweep.
+    pub awake: Vec<u32>,
+    is_awake: Vec<bool>,
     pub cuts: Vec<Cut>,
-    /// Radiance of ends over isovalues: slot = lane for + ends, 16 + lane for − ends, then cuts.
-    pub columns: Vec<f32>,
-    pub isovalues: usize,
-    pub dark: bool,
+    /// Where in [`Flats::packed`] the ends of lines are, per direction (+, −).
+    pub lasts: [[u32; LANES]; 2],
     scratch: Vec<[Stop; 2]>,
 }
 
 impl Pack {
-    pub(super) fn new(slices: usize, flats: &Flats) -> Self {
-        Self { dark: flats.none(), ..Self::with_rows(slices + 2, flats.isovalues) }
+    /// Makes room for lines through so many slices.
+    pub(super) fn fit(&mut self, slices: usize) {
+        if self.h.len() != slices + 2 {
+            *self = Self::with_rows(slices + 2);
+        }
     }
 
-    /// Nothing, in so many rows, with ends that shine over `isovalues`.
-    pub(super) fn with_rows(rows: usize, isovalues: usize) -> Self {
-        let zero = || vec![[0.0; LANES]; rows];
+    /// Nothing, in so many rows, with black ends.
+    pub(super) fn with_rows(rows: usize) -> Self {
+        let next = || vec![[0; LANES]; rows];
+        let h_next = || vec![[0.0; LANES]; rows];
         Self {
             h: vec![[OUTSIDE; LANES]; rows],
-            b: [zero(), zero(), zero()],
-            next: vec![[0; LANES]; rows],
-            h_next: zero(),
-            rows: (0, 0),
+            node: next(),
+            next: [next(), next()],
+            h_next: [h_next(), h_next()],
+            awake: Vec::new(),
+            is_awake: vec![false; rows],
             cuts: Vec::new(),
-            columns: vec![0.0; 2 * LANES * 3 * isovalues],
-            isovalues,
-            dark: false,
+            lasts: [[0; LANES]; 2],
             scratch: Vec::new(),
         }
     }
 
-    /// Reads h and B along lines (first + lane, q). Returns whether any of them meets Ω.
+    /// Places from here on are ends.
+    pub(super) fn ends(&self) -> usize {
+        self.h.len() * LANES
+    }
+
+    /// Reads h and B along lines (first + lane, q), where they reach the sweep. Returns whether any does.
     #[inline(always)]
-    pub(super) fn read(&mut self, plan: &Plan, h: &[f32], b: &Planes, first: isize, q: isize) -> bool {
+    pub(super) fn read(&mut self, plan: &Plan, source: &Source, first: isize, q: isize) -> bool {
         let [nu, nv, na] = plan.shear.layout.dims;
         let [sv, sa] = plan.shear.layout.stride;
-        let mut range = (usize::MAX, 0);
-        let mut before: Option<(usize, usize)> = None;
+        let h = source.h;
+        let seed = plan.noise(first, q as f64);
+        self.is_awake.fill(false);
         self.h[0] = [OUTSIDE; LANES];
         self.h[na + 1] = [OUTSIDE; LANES];
+        let mut any = false;
+        let mut before: Option<(usize, usize, bool)> = None;
         for k in 0..na {
             let (uk, fu) = plan.shift[0][k];
             let (vk, fv) = plan.shift[1][k];
             let (i, j) = (first + uk, q + vk);
             // Lanes whose cell lies in Ω.
             #[allow(clippy::cast_sign_loss, reason = "clamped")]
-            let mut lanes = ((-i).clamp(0, 16) as usize, (nu as isize - 1 - i).clamp(0, 16) as usize);
-            if j < 0 || j > nv as isize - 2 || lanes.0 >= lanes.1 {
-                lanes = (0, 0);
+            let (mut lo, mut hi) = ((-i).clamp(0, 16) as usize, (nu as isize - 1 - i).clamp(0, 16) as usize);
+            if j < 0 || j > nv as isize - 2 || lo >= hi {
+                (lo, hi) = (0, 0);
             }
             let row = k + 1;
-            let (lo, hi) = lanes;
-            if lo < hi {
-                let at = k as isize * sa as isize + j * sv as isize + i;
+            let at = k as isize * sa as isize + j * sv as isize + i;
+            let awake = lo < hi && {
+                let node = (i + lo as isize).unsigned_abs();
+                source.awake(k, j.unsigned_abs(), node, node + hi - lo + 1)
+            };
+            if awake {
                 let taps = Taps {
                     at: [at, at + 1, at + sv as isize, at + sv as isize + 1],
                     weight: [(1.0 - fu) * (1.0 - fv), fu * (1.0 - fv), (1.0 - fu) * fv, fu * fv],
                 };
-                // Whole packs wherever memory allows: lanes outside Ω read a neighbouring row and are blanked.
-                let whole = at >= 0 && at.unsigned_abs() + sv + 1 + LANES <= h.len();
-                let (l0, l1) = if whole { (0, LANES) } else { (lo, hi) };
-                let line = &mut self.h[row];
-                Taps { weight: taps.weight.map(|w| w * plan.sign), ..taps }.many(h, l0, l1, line);
-                for (l, x) in line.iter_mut().enumerate() {
-                    *x = if lo <= l && l < hi { *x } else { OUTSIDE };
-                }
-                for c in 0..3 {
-                    taps.many(&b[c], l0, l1, &mut self.b[c][row]);
-                }
-                range = (range.0.min(row), row);
+                self.take(&taps, plan.sign, h, row, (lo, hi));
+                self.choose(&taps, dither(seed, 2 * LANES + k), row);
+                self.is_awake[row] = true;
+                any = true;
             } else {
-                self.h[row] = [OUTSIDE; LANES];
+                let line = &mut self.h[row];
+                *line = [ASLEEP; LANES];
+                if hi - lo < LANES {
+                    blank(line, lo, hi);
+                }
             }
             // Lanes that entered through a side get their entry point in the row before, those that left theirs here.
-            let old = before.unwrap_or((0, 0));
-            if lanes != old && k > 0 {
+            let old = before.unwrap_or((0, 0, false));
+            if (lo, hi) != (old.0, old.1) && k > 0 && (awake || old.2) {
                 for lane in 0..LANES {
                     let (was, is) = (old.0 <= lane && lane < old.1, lo <= lane && lane < hi);
-                    if is && !was {
-                        self.side(plan, h, b, (first + lane as isize, q), lane, k, false);
-                        range.0 = range.0.min(row - 1);
-                    } else if was && !is {
-                        self.side(plan, h, b, (first + lane as isize, q), lane, k - 1, true);
-                        range.1 = range.1.max(row);
+                    if is && !was && awake {
+                        self.side(plan, source, (first + lane as isize, q), lane, k, false);
+                    } else if was && !is && old.2 {
+                        self.side(plan, source, (first + lane as isize, q), lane, k - 1, true);
                     }
                 }
             }
-            before = Some(lanes);
+            before = Some((lo, hi, awake));
         }
-        self.rows = if range.0 == usize::MAX { (0, 0) } else { (range.0, range.1 + 1) };
-        self.rows.1 > 0
+        self.awake.clear();
+        #[allow(clippy::cast_possible_truncation, reason = "rows of a pack")]
+        self.awake.extend(self.is_awake.iter().enumerate().filter(|(_, a)| **a).map(|(row, _)| row as u32));
+        any
+    }
+
+    /// Reads one row, lanes `lo..hi` of which lie in Ω.
+    #[inline(always)]
+    fn take(&mut self, taps: &Taps, sign: f32, h: &[f32], row: usize, (lo, hi): (usize, usize)) {
+        let line = &mut self.h[row];
+        let [w0, w1, w2, w3] = taps.weight;
+        let weight = [w0 * sign, w1 * sign, w2 * sign, w3 * sign];
+        let [t0, t1, t2, t3] = taps.at;
+        // Whole packs wherever memory allows: lanes outside Ω read a neighbouring row and are blanked.
+        if t0 >= 0 && t3.unsigned_abs() + LANES <= h.len() {
+            let lanes =
+                |t: isize| -> &[f32; LANES] { h[t.unsigned_abs()..][..LANES].try_into().expect("sixteen lanes") };
+            mix(weight, [lanes(t0), lanes(t1), lanes(t2), lanes(t3)], line);
+            if hi - lo < LANES {
+                blank(line, lo, hi);
+            }
+        } else {
+            *line = [OUTSIDE; LANES];
+            for l in lo..hi {
+                let at = |t: isize| h[(t + l as isize).unsigned_abs()];
+                line[l] = (weight[0] * at(t0) + weight[1] * at(t1)) + (weight[2] * at(t2) + weight[3] * at(t3));
+            }
+        }
+    }
+
+    /// Picks the nodes whose B the samples of a row have.
+    #[inline(always)]
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "lanes in Ω meet nodes in Ω")]
+    fn choose(&mut self, taps: &Taps, random: f32, row: usize) {
+        let [w0, w1, w2, _] = taps.weight;
+        let tap = usize::from(random >= w0) + usize::from(random >= w0 + w1) + usize::from(random >= w0 + w1 + w2);
+        let at = taps.at[tap] as i32;
+        for l in 0..LANES {
+            // Lanes outside Ω, whose place may be anything, are not asked.
+            self.node[row][l] = (at + l as i32).max(0) as u32;
+        }
     }
 
     /// Adds the point where a line whose first or last slice is `k` meets Ω's side.
-    #[allow(clippy::too_many_arguments, reason = "one caller")]
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
-    fn side(&mut self, plan: &Plan, h: &[f32], b: &Planes, pq: (isize, isize), lane: usize, k: usize, leaves: bool) {
+    fn side(&mut self, plan: &Plan, source: &Source, pq: (isize, isize), lane: usize, k: usize, leaves: bool) {
         let [nu, nv, na] = plan.shear.layout.dims;
         let [sv, sa] = plan.shear.layout.stride;
         let span = plan.span(pq.0 as f64, pq.1 as f64);
@@ -238,137 +300,179 @@ impl Pack {
         let (i, j, l) = (cell(x, nu), cell(y, nv), cell(tau.clamp(0.0, na as f64 - 1.0), na));
         let f = [x - i as f64, y - j as f64, tau - l as f64].map(|f| f as f32);
         let at = l * sa + j * sv + i;
-        let value = |plane: &[f32]| {
-            let lerp = |t: f32, a: f32, b: f32| a + t * (b - a);
-            let edge = |o: usize| lerp(f[0], plane[o], plane[o + 1]);
-            let face = |o: usize| lerp(f[1], edge(o), edge(o + sv));
-            lerp(f[2], face(at), face(at + sa))
-        };
+        let h = source.h;
+        let lerp = |t: f32, a: f32, b: f32| a + t * (b - a);
+        let edge = |o: usize| lerp(f[0], h[o], h[o + 1]);
+        let face = |o: usize| lerp(f[1], edge(o), edge(o + sv));
+        let nearest = |x: f32| usize::from(x >= 0.5);
         let row = if leaves { k + 2 } else { k };
-        self.h[row][lane] = plan.sign * value(h);
-        for c in 0..3 {
-            self.b[c][row][lane] = value(&b[c]);
-        }
+        self.is_awake[row] = true;
+        self.h[row][lane] = plan.sign * lerp(f[2], face(at), face(at + sa));
+        self.node[row][lane] = (at + nearest(f[0]) + nearest(f[1]) * sv + nearest(f[2]) * sa) as u32;
     }
 
     /// Finds what the lines end on and reads the radiance there. `first` and `q` as in [`Pack::read`].
     #[inline(always)]
     pub(super) fn end(&mut self, plan: &Plan, ends: &Ends, flats: &Flats, first: isize, q: isize) {
         self.cuts.clear();
-        let n = 3 * self.isovalues;
-        if self.dark && !ends.cut() {
+        if flats.none() && !ends.cut() {
+            self.lasts = [[0; LANES]; 2];
             return;
         }
-        self.columns.truncate(2 * LANES * n);
+        let (p, q) = (first as f64, q as f64);
+        let mut from = [[0.0; LANES]; 2];
+        let mut random = [[0.0; LANES]; 2];
+        let seed = plan.noise(first, q);
         for lane in 0..LANES {
-            let (p, q) = ((first + lane as isize) as f64, q as f64);
-            let span = plan.span(p, q);
-            if !(span[0] <= span[1]) {
-                continue;
+            let span = plan.span(p + lane as f64, q);
+            let hit = span[0] <= span[1];
+            for d in 0..2 {
+                from[d][lane] = if hit { span[1 - d] } else { 0.0 };
+                random[d][lane] = dither(seed, lane + d * LANES);
             }
-            for (slot, from, forward) in [(lane, span[1], true), (LANES + lane, span[0], false)] {
-                let stop = ends.stop(p, q, from, forward, None);
-                fill_column(flats, stop, &mut self.columns[slot * n..][..n]);
-            }
-            if ends.cut() {
-                let mut scratch = std::mem::take(&mut self.scratch);
-                ends.cuts(p, q, span[0], span[1], &mut scratch);
-                for &[before, behind] in &scratch {
-                    let slot = self.columns.len() / n;
-                    self.columns.resize((slot + 2) * n, 0.0);
-                    fill_column(flats, Some(before), &mut self.columns[slot * n..][..n]);
-                    fill_column(flats, Some(behind), &mut self.columns[(slot + 1) * n..][..n]);
+        }
+        for (d, forward) in [(0, true), (1, false)] {
+            ends.stops(flats, (p, q), &from[d], forward, &random[d], &mut self.lasts[d]);
+        }
+        if ends.cut() {
+            let mut scratch = std::mem::take(&mut self.scratch);
+            for lane in 0..LANES {
+                ends.cuts(p + lane as f64, q, from[1][lane], from[0][lane], &mut scratch);
+                for &stops in &scratch {
                     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a row of the pack")]
-                    let (row, slot) = (before.tau.floor() as usize + 1, slot as u32);
-                    self.cuts.push(Cut { row, lane, slots: [slot, slot + 1] });
+                    let row = stops[0].tau.floor() as usize + 1;
+                    let places = stops.map(|s| flats.place(Some(s), dither(seed, lane)));
+                    self.cuts.push(Cut { row, lane, places });
                 }
-                self.scratch = scratch;
             }
+            self.scratch = scratch;
         }
     }
 
-    /// For every sample, the radiance its ray towards +τ (`forward`) or −τ meets: B where h is first back at the sample's
+    /// The place of what a lane's rays meet that meet nothing else.
+    #[inline(always)]
+    #[allow(clippy::cast_possible_truncation, reason = "places in a pack")]
+    pub(super) fn last(&self, lane: usize, forward: bool) -> u32 {
+        self.ends() as u32 + self.lasts[usize::from(!forward)][lane]
+    }
+
+    /// For every sample, the radiance that its ray meets which leaves downhill: B where h is first back at the sample's
     /// value, or what stands at the end. \[BSV93: all nearest greater values, one line per lane\]
     ///
-    /// Writes slice k to `out` at k · width + start. With `strict` the next value must be greater.
-    #[allow(clippy::cast_possible_truncation, reason = "rows of a pack")]
-    pub(super) fn scan(&mut self, way: Way, out: &mut [Vec<f32>], (width, start): (usize, usize)) {
-        let Way { forward, strict, sign } = way;
-        let rows = self.h.len();
-        let end = rows as u32;
-        let default = |lane: usize| end + (lane + if forward { 0 } else { LANES }) as u32;
-        let mut at: [u32; LANES] = std::array::from_fn(default);
-        let mut top = [f32::INFINITY; LANES];
-        let (from, to) = self.rows;
-        for step in 0..to - from {
-            let row = if forward { to - 1 - step } else { from + step };
-            // Cuts behind this row close what lies beyond them; the nearest comes last.
-            let cut_row = if forward { row } else { row.wrapping_sub(1) };
-            let mut reset = |cut: &Cut| {
-                if cut.row == cut_row {
-                    at[cut.lane] = end + cut.slots[usize::from(!forward)];
-                    top[cut.lane] = f32::INFINITY;
-                }
-            };
-            if forward {
-                self.cuts.iter().rev().for_each(&mut reset);
-            } else {
-                self.cuts.iter().for_each(&mut reset);
-            }
-            let h = self.h[row];
-            let mut light = [[0f32; LANES]; 3];
+    /// Uphill the ray of the same line runs inside the solid; which way is downhill tells the neighbouring samples, as the
+    /// receiver normal does. Writes slice k to `out` at k · width + start.
+    pub(super) fn scan(&mut self, way: Way, light: Light, out: &mut [Vec<f32>], place: (usize, usize)) {
+        self.link(way, true);
+        self.link(way, false);
+        self.look(way, light, out, place);
+    }
+
+    /// Finds for every sample the next value ≥ its own towards +τ (`forward`) or −τ; with `strict` it must be greater.
+    #[allow(clippy::cast_possible_truncation, reason = "places in a pack")]
+    fn link(&mut self, way: Way, forward: bool) {
+        let default: [u32; LANES] = std::array::from_fn(|lane| self.last(lane, forward));
+        let (mut at, mut top) = (default, [f32::INFINITY; LANES]);
+        let d = usize::from(!forward);
+        for step in 0..self.awake.len() {
+            let row = self.awake[if forward { self.awake.len() - 1 - step } else { step }] as usize;
+            self.close(row, forward, |lane, place| (at[lane], top[lane]) = (place, f32::INFINITY));
             for lane in 0..LANES {
-                let value = h[lane];
+                let value = self.h[row][lane];
                 if value == OUTSIDE {
-                    at[lane] = default(lane);
-                    top[lane] = f32::INFINITY;
+                    (at[lane], top[lane]) = (default[lane], f32::INFINITY);
                     continue;
                 }
                 if value.is_nan() {
                     continue;
                 }
                 let (mut j, mut t) = (at[lane], top[lane]);
-                while t < value || (strict && t == value) {
-                    t = self.h_next[j as usize][lane];
-                    j = self.next[j as usize][lane];
+                while t < value || (way.strict && t == value) {
+                    t = self.h_next[d].as_flattened()[j as usize];
+                    j = self.next[d].as_flattened()[j as usize];
                 }
-                self.next[row][lane] = j;
-                self.h_next[row][lane] = t;
-                (at[lane], top[lane]) = (row as u32, value);
-                if j >= end {
-                    if !self.dark {
-                        let column = &self.columns[(j - end) as usize * 3 * self.isovalues..][..3 * self.isovalues];
-                        let rgb = at_isovalue(column, self.isovalues, sign * value);
-                        (0..3).for_each(|c| light[c][lane] = rgb[c]);
-                    }
-                } else {
-                    let j = j as usize;
-                    let before = if forward { j - 1 } else { j + 1 };
-                    let f = (value - self.h[before][lane]) / (t - self.h[before][lane]);
-                    // Also where the sample before is missing (NaN): then the later one counts alone.
-                    let f = if f < 1.0 { f.max(0.0) } else { 1.0 };
-                    for c in 0..3 {
-                        let b = &self.b[c];
-                        light[c][lane] = (1.0 - f) * b[before][lane] + f * b[j][lane];
-                    }
-                }
+                self.next[d][row][lane] = j;
+                self.h_next[d][row][lane] = t;
+                (at[lane], top[lane]) = ((row * LANES + lane) as u32, value);
             }
-            if row > 0 && row < rows - 1 {
+        }
+    }
+
+    /// Calls `close` with the lanes of which cuts close what lies beyond them when a scan comes to `row`, and the place of
+    /// what they show. Rows between that were not read count.
+    #[inline(always)]
+    pub(super) fn close(&self, row: usize, forward: bool, mut close: impl FnMut(usize, u32)) {
+        if self.cuts.is_empty() {
+            return;
+        }
+        let position = self.awake.binary_search(&u32::try_from(row).expect("a row")).expect("a row that was read");
+        // Cuts after row r lie between r and r + 1; the nearest comes last.
+        let (from, to) = if forward {
+            (row, self.awake.get(position + 1).map_or(usize::MAX, |r| *r as usize))
+        } else {
+            (position.checked_sub(1).map_or(0, |p| self.awake[p] as usize), row)
+        };
+        let mut each = |cut: &Cut| {
+            if (from..to).contains(&cut.row) {
+                close(cut.lane, self.ends() as u32 + cut.places[usize::from(!forward)]);
+            }
+        };
+        if forward {
+            self.cuts.iter().rev().for_each(&mut each);
+        } else {
+            self.cuts.iter().for_each(&mut each);
+        }
+    }
+
+    /// Reads the radiance that the samples' downhill rays meet.
+    fn look(&self, way: Way, light: Light, out: &mut [Vec<f32>], (width, start): (usize, usize)) {
+        let (rows, ends) = (self.h.len(), self.ends());
+        for &row in &self.awake {
+            let row = row as usize;
+            if row == 0 || row == rows - 1 {
+                continue;
+            }
+            for lane in 0..LANES {
+                let value = self.h[row][lane];
+                let mut rgb = [0f32; 3];
+                if value.is_finite() {
+                    let forward = self.h[row + 1][lane] < self.h[row - 1][lane];
+                    let d = usize::from(!forward);
+                    let (j, t) = (self.next[d][row][lane] as usize, self.h_next[d][row][lane]);
+                    if j < ends {
+                        let near = if forward { j - LANES } else { j + LANES };
+                        let h0 = self.h.as_flattened()[near];
+                        // The nearer of the two samples around the hit; the later one if that before is missing (NaN).
+                        let first = (value - h0) < 0.5 * (t - h0);
+                        let node = self.node.as_flattened()[if first { near } else { j }];
+                        rgb = std::array::from_fn(|c| decode(light.b[node as usize][c]));
+                    } else {
+                        let (i, f) = isovalue(light.isovalues, way.sign * value);
+                        let (a, b) = (light.flats[j - ends + i], light.flats[j - ends + i + 1]);
+                        rgb = std::array::from_fn(|c| (1.0 - f) * decode(a[c]) + f * decode(b[c]));
+                    }
+                }
                 for c in 0..3 {
-                    out[c][(row - 1) * width + start..][..LANES].copy_from_slice(&light[c]);
+                    out[c][(row - 1) * width + start + lane] = rgb[c];
                 }
             }
         }
     }
 }
 
-/// A column of radiance at isovalue c: linear between texel centres.
+/// A number in [0, 1) for a lane of a pack.
+#[inline(always)]
+fn dither(seed: u32, lane: usize) -> f32 {
+    #[allow(clippy::cast_possible_truncation, reason = "lanes")]
+    let x = (seed ^ lane as u32).wrapping_mul(0x9e37_79b1);
+    let x = (x ^ x >> 15).wrapping_mul(0x85eb_ca77);
+    ((x ^ x >> 13) >> 8) as f32 / (1 << 24) as f32
+}
+
+/// Between which texels of n ≥ 2 isovalue c lies, and how far: linear between texel centres.
 #[inline]
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the texture")]
-fn at_isovalue(column: &[f32], n: usize, c: f32) -> [f32; 3] {
-    let x = (c * n as f32 - 0.5).clamp(0.0, (n - 1) as f32);
-    let i = (x as usize).min(n.saturating_sub(2));
-    let f = x - i as f32;
-    let next = (i + 1).min(n - 1);
-    std::array::from_fn(|ch| (1.0 - f) * column[ch * n + i] + f * column[ch * n + next])
+fn isovalue(n: usize, c: f32) -> (usize, f32) {
+    let x = (c * n as f32 - 0.5).max(0.0).min((n - 1) as f32);
+    let i = (x as usize).min(n - 2);
+    (i, x - i as f32)
 }

@@ -1,0 +1,370 @@
+//! The parts of the model that the line-sweep engine must get right: energy, isolation, walls, caps, oblique axes, holes in
+//! the data, several luminaires, and its own standard error.
+
+use glam::{DMat3, DVec3};
+use isolume::embree::{Device, GraphTracer};
+use isolume::field::{Field, Sweep};
+use isolume::flattened::{Departure, Side, Target};
+use isolume::polygon::Polygon;
+use isolume::rng::{Rng, Sobol, Stage};
+use isolume::scene::{Boundary, Scene, Surface, cornell_box};
+use isolume::sweep::{SweepResult, SweepSettings, sweep};
+use isolume::tracer::Tracer;
+use isolume::volume::{Lattice, Samples, Volume};
+use isolume::warp::{Frame, cosine_hemisphere};
+use rayon::prelude::*;
+use std::f64::consts::PI;
+
+fn field(lattice: Lattice, range: (f64, f64), f: impl Fn(DVec3) -> f64 + Sync) -> Field {
+    let samples = (0..lattice.len())
+        .into_par_iter()
+        .map(|o| f(lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|x| x as f64)))))
+        .collect();
+    let volume = Volume::new("test", lattice, Samples::F64(samples)).unwrap();
+    Field::new(&volume, Sweep::new(range.0, range.1).unwrap()).unwrap()
+}
+
+fn cube(n: usize, lo: f64, hi: f64) -> Lattice {
+    Lattice::aligned([n; 3], DVec3::splat(lo), DVec3::splat((hi - lo) / (n - 1) as f64)).unwrap()
+}
+
+fn bumps(x: DVec3) -> f64 {
+    let g = |m: [f64; 3], s: f64| (-(x - DVec3::from_array(m)).length_squared() / (2.0 * s * s)).exp();
+    100.0 * g([0.5, 0.5, 0.38], 0.16)
+        + 80.0 * (g([0.32, 0.40, 0.74], 0.05) + g([0.62, 0.35, 0.76], 0.05) + g([0.52, 0.66, 0.72], 0.05))
+}
+
+/// The six faces of a box around Ω, `margin` of its edges wide, facing in.
+fn closed_box(lattice: &Lattice, margin: f64, albedo: f64, emission: f64) -> Vec<Polygon> {
+    let far = lattice.far();
+    let place = |p: DVec3| lattice.to_world((p * (1.0 + 2.0 * margin) - margin) * far);
+    (0..6)
+        .map(|face| {
+            let (a, end) = (face % 3, (face / 3) as f64);
+            let (b, c) = ((a + 1) % 3, (a + 2) % 3);
+            let mut v = [(0., 0.), (1., 0.), (1., 1.), (0., 1.)]
+                .map(|(s, t)| {
+                    let mut p = DVec3::ZERO;
+                    (p[a], p[b], p[c]) = (end, s, t);
+                    place(p)
+                })
+                .to_vec();
+            if (v[1] - v[0]).cross(v[3] - v[0]).dot(place(DVec3::splat(0.5)) - v[0]) < 0.0 {
+                v.reverse();
+            }
+            Polygon::new(&format!("face {face}"), v, DVec3::splat(albedo), DVec3::splat(emission)).unwrap()
+        })
+        .collect()
+}
+
+fn run(scene: &Scene, settings: SweepSettings) -> SweepResult {
+    sweep(scene, &settings, &|_| true).unwrap()
+}
+
+const ONE_BOUNCE: SweepSettings = SweepSettings {
+    directions: 256,
+    light_points: 16,
+    max_bounces: 1,
+    target: 1e-3,
+    replicates: 1,
+    flat_resolution: (16, 16),
+    seed: 1,
+};
+
+fn is_valid(scene: &Scene, o: usize) -> bool {
+    (0.0..=1.0).contains(&scene.field.samples()[o]) && scene.field.node_gradient(scene.lattice().ijk(o)) != DVec3::ZERO
+}
+
+/// Valid nodes at least `skin` nodes from Ω's faces.
+fn nodes(scene: &Scene, skin: usize) -> Vec<usize> {
+    let dims = scene.lattice().dims();
+    let deep = |o: usize| {
+        let ijk = scene.lattice().ijk(o);
+        (0..3).all(|a| ijk[a] >= skin && ijk[a] + skin < dims[a])
+    };
+    (0..scene.lattice().len()).filter(|&o| is_valid(scene, o) && deep(o)).collect()
+}
+
+fn mean_rms(x: &[f64]) -> (f64, f64) {
+    let n = x.len() as f64;
+    (x.iter().sum::<f64>() / n, (x.iter().map(|e| e * e).sum::<f64>() / n).sqrt())
+}
+
+/// E/π of the first stored side, green.
+fn radiosity(got: &SweepResult, o: usize) -> f64 {
+    f64::from(got.sides[0].direct[o][1] + got.sides[0].indirect[o][1]) / PI
+}
+
+#[test]
+fn what_level_sets_send_is_what_walls_and_level_sets_gather() {
+    // Level sets of bumps shine with radiance 1 on their outer sides in a closed box. Over all isovalues they send
+    // π ∫|∇h| dV (coarea); it arrives on themselves, ∫E |∇h| dV, and on the walls, ∫∫E dA dc.
+    let lattice = cube(61, 0.0, 1.0);
+    // The sweep ends above what reaches Ω's faces, so that every level set is closed.
+    let f = field(lattice, (20.0, 95.0), bumps);
+    let surface = Surface { albedo: DVec3::ZERO, emission: DVec3::ONE, ..Surface::default() };
+    let walls = closed_box(f.lattice(), 0.0, 0.5, 0.0);
+    let scene = Scene::new(f, surface, Boundary::Open, walls).unwrap();
+    let cell = scene.lattice().cell_volume();
+    let valid = nodes(&scene, 0);
+    let gradient = |o: usize| scene.field.node_gradient(scene.lattice().ijk(o)).length();
+    let sent: f64 = PI * cell * valid.iter().map(|&o| gradient(o)).sum::<f64>();
+    let balance: Vec<f64> = (0..8)
+        .map(|seed| {
+            let got = run(&scene, SweepSettings { directions: 128, seed, flat_resolution: (24, 24), ..ONE_BOUNCE });
+            let own: f64 = cell * valid.iter().map(|&o| PI * radiosity(&got, o) * gradient(o)).sum::<f64>();
+            let mut walls = 0.0;
+            for (t, p) in got.flats.iter().zip(scene.polygons()) {
+                let texels = &t.as_ref().unwrap().texels;
+                // B = ρE/π.
+                walls +=
+                    texels.iter().map(|t| f64::from(t[1]) * PI / 0.5).sum::<f64>() / texels.len() as f64 * p.area();
+            }
+            assert!(own > 0.0 && walls > 0.8 * sent);
+            (own + walls) / sent - 1.0
+        })
+        .collect();
+    let (mean, _) = mean_rms(&balance);
+    let spread = (balance.iter().map(|b| (b - mean).powi(2)).sum::<f64>() / 7.0 / 8.0).sqrt();
+    println!("gathered / sent − 1: {mean:.5} ± {spread:.5}");
+    // Sums over a lattice stand for integrals: they are good to about 1e-2 here.
+    assert!(mean.abs() < 3.0 * spread + 0.01, "{mean} ± {spread}");
+}
+
+#[test]
+fn a_convex_level_set_in_a_furnace_shows_its_albedo() {
+    let (rho, lattice) = (0.3, cube(41, -1.0, 1.0));
+    let f = field(lattice, (-0.8, -0.2), |x| -(x.length_squared() + 0.3 * x.x * x.x));
+    let surface = Surface { albedo: DVec3::splat(rho), ..Surface::default() };
+    let walls = closed_box(f.lattice(), 0.0, 0.0, 1.0);
+    let scene = Scene::new(f, surface, Boundary::Open, walls).unwrap();
+    let got = run(&scene, SweepSettings { light_points: 64, ..ONE_BOUNCE });
+    let errors: Vec<f64> = nodes(&scene, 0).iter().map(|&o| rho * (radiosity(&got, o) - 1.0)).collect();
+    let (mean, rms) = mean_rms(&errors);
+    println!("convex furnace: mean {mean:.5}, RMS {rms:.5}, {} nodes", errors.len());
+    assert!(errors.len() > 5000 && mean.abs() < 0.002 && rms < 0.004);
+}
+
+#[test]
+fn far_isovalues_do_not_light_each_other() {
+    let lattice = cube(65, 0.0, 1.0);
+    let h = |x: DVec3| {
+        let g = |m: DVec3| (-(x - m).length_squared() / (2.0 * 0.25 * 0.25)).exp();
+        g(DVec3::new(0.2, 0.5, 0.5)).max(0.0) + 0.8 * g(DVec3::new(0.8, 0.4, 0.5))
+    };
+    let (c, w) = (0.5, 0.35);
+    // Monotone and the identity within w of c: no sample changes sides of an isovalue there.
+    let squeezed = |x: DVec3| {
+        let h = h(x);
+        if h > c + w {
+            c + w + 0.3 * (h - c - w)
+        } else if h < c - w {
+            c - w - 0.4 * (c - w - h)
+        } else {
+            h
+        }
+    };
+    let light = {
+        let v = [(-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0), (1.0, -1.0)]
+            .map(|(x, y)| DVec3::new(0.5 + 0.3 * x, 0.5 + 0.3 * y, 1.2))
+            .to_vec();
+        Polygon::new("light", v, DVec3::ZERO, DVec3::ONE).unwrap()
+    };
+    let light_it = |f: Field| {
+        let scene = Scene::new(f, Surface::default(), Boundary::Open, vec![light.clone()]).unwrap();
+        let got = run(&scene, SweepSettings { directions: 64, light_points: 4, ..ONE_BOUNCE });
+        (scene, got)
+    };
+    let (scene, one) = light_it(field(lattice.clone(), (0.0, 1.0), h));
+    let (_, two) = light_it(field(lattice, (0.0, 1.0), squeezed));
+    let differs = |o: usize| {
+        let bits = |x: &SweepResult| [x.sides[0].direct[o], x.sides[0].indirect[o]].map(|c| c.map(f32::to_bits));
+        bits(&one) != bits(&two)
+    };
+    let (mut near, mut lit, mut far) = (0, 0, 0);
+    for o in nodes(&scene, 1) {
+        let d = (f64::from(scene.field.samples()[o]) - c).abs();
+        if d < 0.05 {
+            near += 1;
+            lit += usize::from(one.sides[0].indirect[o][1] > 0.0);
+            assert!(!differs(o), "node {o} at {}", scene.field.samples()[o]);
+        } else if d > w {
+            far += usize::from(differs(o));
+        }
+    }
+    println!("{near} nodes alike, {lit} of them lit by others; {far} far ones differ");
+    assert!(near > 5000 && lit > 500 && far > 5000);
+}
+
+#[test]
+fn a_floor_sees_a_long_wall_as_it_should() {
+    // The floor is a polygon with a texture; the wall shines: x ≥ 50 + c up to z = height − c.
+    for (k, height, expected) in [(0.6, 24.0, 0.071254), (2.0, 40.0, 0.276393), (10.0, 120.0, 0.450248)] {
+        let lattice =
+            Lattice::aligned([61, 31, height as usize + 12], DVec3::ZERO, DVec3::new(1.0, 20.0, 1.0)).unwrap();
+        let f = field(lattice, (-2.0, 2.0), |x| (x.x - 50.0).min(height - x.z));
+        let v = [(0., 0.), (60., 0.), (60., 600.), (0., 600.)].map(|(x, y)| DVec3::new(x, y, 0.0)).to_vec();
+        let floor = Polygon::new("floor", v, DVec3::splat(0.5), DVec3::ZERO).unwrap();
+        let surface = Surface { albedo: DVec3::ZERO, emission: DVec3::ONE, ..Surface::default() };
+        let scene = Scene::new(f, surface, Boundary::Open, vec![floor]).unwrap();
+        // Few lines meet each texel: what counts is the mean.
+        let settings = SweepSettings { directions: 1024, replicates: 8, flat_resolution: (150, 8), ..ONE_BOUNCE };
+        let got = run(&scene, settings);
+        let texture = got.flats[0].as_ref().unwrap();
+        let errors: Vec<f64> = (0..50)
+            .map(|y| {
+                let at = DVec3::new(50.0 - height / k, 200.0 + 4.0 * f64::from(y), 0.0);
+                let [u, v] = scene.polygons()[0].texture(at);
+                // B = ρE/π, ρ = ½; c = 0.
+                texture.lookup([u, v, 0.5]).y / 0.5 - expected
+            })
+            .collect();
+        let (mean, rms) = mean_rms(&errors);
+        println!("k = {k}: {expected}, error {mean:.5}, RMS {rms:.5}");
+        assert!(mean.abs() < 0.006 && rms < 0.015, "k = {k}: {mean} {rms}");
+    }
+}
+
+#[test]
+fn oblique_axes_change_nothing() {
+    // Bumps on a sheared, flipped lattice of uneven spacing, against exact rays.
+    let axes = DMat3::from_cols(
+        DVec3::new(-0.016, 0.002, 0.0),
+        DVec3::new(0.005, 0.02, 0.001),
+        DVec3::new(0.0, -0.004, 0.011),
+    );
+    let lattice = Lattice::new([71, 61, 91], DVec3::new(0.95, 0.15, 0.0), axes).unwrap();
+    let surface = Surface { albedo: DVec3::ZERO, emission: DVec3::ONE, ..Surface::default() };
+    let scene = Scene::new(field(lattice, (3.6, 95.0), bumps), surface, Boundary::Open, Vec::new()).unwrap();
+    let device = Device::new(1).unwrap();
+    let tracer = GraphTracer::new(&device, &scene).unwrap();
+    let got = run(&scene, SweepSettings { directions: 512, ..ONE_BOUNCE });
+    let all = nodes(&scene, 3);
+    let mut rng = Rng::stream(1, Stage::Test, 0);
+    let some: Vec<usize> = (0..400).map(|_| all[(rng.unit() * all.len() as f64) as usize]).collect();
+    let errors: Vec<f64> = some
+        .par_iter()
+        .map(|&o| {
+            let p = DVec3::from_array(scene.lattice().ijk(o).map(|x| x as f64));
+            let frame = Frame::new(scene.normal(p, Side::Lower).unwrap());
+            let set = Sobol::set(3, Stage::Test, o as u64);
+            let hits = (0..1024u32).filter(|&i| {
+                let d = frame.to_world(cosine_hemisphere(set.point2(i, 0)));
+                let ray = scene.ray(p.as_vec3(), d, scene.field.samples()[o], Departure::Surface(Side::Lower));
+                matches!(tracer.intersect(&ray), Some(h) if matches!(h.target, Target::Surface(_)))
+            });
+            radiosity(&got, o) - hits.count() as f64 / 1024.0
+        })
+        .collect();
+    let (mean, rms) = mean_rms(&errors);
+    println!("oblique axes: mean {mean:.5}, RMS {rms:.5}");
+    assert!(mean.abs() < 0.002 && rms < 0.006);
+}
+
+#[test]
+fn standard_errors_are_what_they_say() {
+    let f = field(cube(29, 0.0, 1.0), (3.6, 95.0), bumps);
+    let walls = cornell_box(f.lattice(), 0.0).unwrap();
+    let scene = Scene::new(f, Surface::default(), Boundary::Open, walls).unwrap();
+    let settings = SweepSettings { directions: 32, light_points: 4, max_bounces: 3, replicates: 8, ..ONE_BOUNCE };
+    let luminance = |got: &SweepResult, o: usize| -> f64 {
+        (0..3)
+            .map(|c| {
+                let e = f64::from(got.sides[0].direct[o][c] + got.sides[0].indirect[o][c]);
+                [0.2126, 0.7152, 0.0722][c] * 0.75 * e / PI
+            })
+            .sum()
+    };
+    let truth = run(&scene, SweepSettings { replicates: 128, seed: 99, ..settings });
+    let got = run(&scene, settings);
+    // In the mean over nodes the squared error is the variance that is claimed (the truth has 1/16 of it). Node by node,
+    // few replicates beside shadows' edges see what others do not: there tails are longer than Student's.
+    let (mut squared, mut said, mut within, mut count) = (0.0, 0.0, 0.0, 0.0);
+    for o in nodes(&scene, 1) {
+        let error2 = (luminance(&got, o) - luminance(&truth, o)).powi(2);
+        let variance = 17.0 / 16.0 * f64::from(got.sides[0].std_error[o]).powi(2);
+        squared += error2;
+        said += variance;
+        within += f64::from(u8::from(error2 <= 2.365 * 2.365 * variance));
+        count += 1.0;
+    }
+    println!("error² {squared:.4e}, claimed {said:.4e}, {:.3} within 95 % limits, {count} nodes", within / count);
+    assert!(count > 3000.0 && (0.7..1.4).contains(&(squared / said)) && within / count > 0.8);
+}
+
+#[test]
+fn caps_close_level_sets() {
+    // A ramp in a furnace with a margin: level sets and Ω's faces bound a convex solid that shows its albedo everywhere.
+    let (rho, lattice) = (0.4, cube(25, 0.0, 1.0));
+    let f = field(lattice, (0.2, 0.8), |x| x.x + 0.1 * x.y);
+    let walls = closed_box(f.lattice(), 0.3, 0.0, 1.0);
+    let surface = Surface { albedo: DVec3::splat(rho), ..Surface::default() };
+    let scene = Scene::new(f, surface, Boundary::Capped, walls).unwrap();
+    let got = run(&scene, SweepSettings { light_points: 64, ..ONE_BOUNCE });
+    let errors: Vec<f64> = nodes(&scene, 1).iter().map(|&o| rho * (radiosity(&got, o) - 1.0)).collect();
+    let (mean, rms) = mean_rms(&errors);
+    println!("capped: level sets {mean:.5}, RMS {rms:.5}");
+    assert!(mean.abs() < 0.005 && rms < 0.01);
+    // The cap on x = 1 (face 3) is covered at every isovalue.
+    let cap = got.flats[scene.polygons().len() + 3].as_ref().unwrap();
+    let errors: Vec<f64> = cap.texels.iter().map(|t| f64::from(t[1]) - rho).collect();
+    let (mean, rms) = mean_rms(&errors);
+    println!("capped: caps {mean:.5}, RMS {rms:.5}");
+    assert!(mean.abs() < 0.005 && rms < 0.01);
+    // Uncapped, the inside of the solid is open, but the outer side sees the same.
+    assert!(got.flats.iter().flatten().flat_map(|t| &t.texels).flatten().all(|x| x.is_finite()));
+}
+
+#[test]
+fn holes_in_the_data_hold_no_surface_and_hide_nothing() {
+    let f = |hole: bool| {
+        field(cube(33, 0.0, 1.0), (3.6, 95.0), move |x| {
+            // Where every level set is far.
+            let in_hole = hole && x.x < 0.1 && x.y < 0.1 && x.z < 0.3;
+            if in_hole { f64::NAN } else { bumps(x) }
+        })
+    };
+    let light_it = |f: Field| {
+        let walls = cornell_box(f.lattice(), 0.0).unwrap();
+        let scene = Scene::new(f, Surface::default(), Boundary::Open, walls).unwrap();
+        let got = run(&scene, SweepSettings { directions: 128, max_bounces: 2, ..ONE_BOUNCE });
+        (scene, got)
+    };
+    let ((whole, one), (holed, two)) = (light_it(f(false)), light_it(f(true)));
+    assert!(two.sides[0].direct.iter().chain(&two.sides[0].indirect).flatten().all(|x| x.is_finite()));
+    assert!(two.flats.iter().flatten().flat_map(|t| &t.texels).flatten().all(|x| x.is_finite()));
+    let holes = (0..holed.lattice().len()).filter(|&o| holed.field.samples()[o].is_nan()).count();
+    assert!(holes > 50);
+    let errors: Vec<f64> = nodes(&whole, 0).iter().map(|&o| radiosity(&two, o) - radiosity(&one, o)).collect();
+    let (mean, rms) = mean_rms(&errors);
+    println!("holes: mean {mean:.6}, RMS {rms:.6}");
+    assert!(mean.abs() < 1e-4 && rms < 1e-3);
+}
+
+#[test]
+fn luminaires_add_up() {
+    let square = |name: &str, at: DVec3, to: DVec3| {
+        let n = (to - at).normalize();
+        let s = n.any_orthonormal_vector();
+        let t = n.cross(s);
+        let v = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)].map(|(a, b)| at + 0.2 * (a * s + b * t)).to_vec();
+        Polygon::new(name, v, DVec3::ZERO, DVec3::ONE).unwrap()
+    };
+    let middle = DVec3::splat(0.5);
+    let (a, b) = (square("a", DVec3::new(0.5, 0.5, 1.3), middle), square("b", DVec3::new(-0.4, 0.3, 0.6), middle));
+    let light_it = |lights: Vec<Polygon>| {
+        let f = field(cube(33, 0.0, 1.0), (3.6, 95.0), bumps);
+        let scene = Scene::new(f, Surface::default(), Boundary::Open, lights).unwrap();
+        let got = run(&scene, SweepSettings { directions: 256, light_points: 64, max_bounces: 2, ..ONE_BOUNCE });
+        (scene, got)
+    };
+    let (scene, both) = light_it(vec![a.clone(), b.clone()]);
+    let ((_, one), (_, two)) = (light_it(vec![a]), light_it(vec![b]));
+    let all = nodes(&scene, 0);
+    let sum = |o: usize| radiosity(&one, o) + radiosity(&two, o);
+    let errors: Vec<f64> = all.iter().map(|&o| radiosity(&both, o) - sum(o)).collect();
+    let (mean, rms) = mean_rms(&errors);
+    let scale = mean_rms(&all.iter().map(|&o| sum(o)).collect::<Vec<_>>()).1;
+    println!("two luminaires: mean {:.5}, RMS {:.5} of {scale:.4}", mean / scale, rms / scale);
+    assert!(mean.abs() < 0.005 * scale && rms < 0.03 * scale);
+}
