@@ -36,14 +36,18 @@ pub struct CacheSettings {
 pub struct RadianceCache {
     /// Per side (lower, higher): RGB at each node, NaN where neither the node nor its surroundings hold a surface.
     nodes: [Option<Vec<[f32; 3]>>; 2],
+    /// What gather rays find: photons under the narrowest kernel, since many rays average their noise.
     flats: Vec<Option<FlatTexture>>,
+    /// What pictures show: the same light, photons smoothed until their noise is not seen.
+    shown: Vec<Option<FlatTexture>>,
     /// Rays traced to fill it.
     pub rays: u64,
 }
 
 impl RadianceCache {
-    /// Fills the cache: flats always, nodes if `with_nodes` (a gather needs them, pictures of walls do not). `tick(n)` reports n nodes or texels done; returning false stops early. `saved`: where the blocks of nodes of each side (lower, higher) are
-    /// kept and looked for.
+    /// Fills the cache: flats always, nodes if `with_nodes` (a gather needs them, pictures of walls do not). `tick(n)`
+    /// reports n nodes done; returning false stops early. `saved`: where the blocks of nodes of each side (lower, higher)
+    /// are kept and looked for.
     #[allow(clippy::too_many_arguments, reason = "one call per bake")]
     pub fn new<T: Tracer>(
         scene: &Scene,
@@ -56,8 +60,8 @@ impl RadianceCache {
         tick: &(dyn Fn(u64) -> bool + Sync),
     ) -> Self {
         let rays = AtomicU64::new(0);
-        let flats =
-            (0..flat::count(scene)).map(|n| fill_flat(scene, tracer, n, &photons.flat, settings, &rays)).collect();
+        let (flats, shown) =
+            (0..flat::count(scene)).map(|n| fill_flat(scene, tracer, n, &photons.flat, settings, &rays)).unzip();
         // A side is filled if photons reach it, or light can: the outside always.
         let nodes = [Side::Lower, Side::Higher].map(|side| {
             let used = side == scene.surface.outside
@@ -66,13 +70,13 @@ impl RadianceCache {
             (with_nodes && used)
                 .then(|| fill_nodes(scene, tracer, photons, side, estimate, settings, saved[side.index()], tick, &rays))
         });
-        Self { nodes, flats, rays: rays.into_inner() }
+        Self { nodes, flats, shown, rays: rays.into_inner() }
     }
 
     /// A cache of radiance known already: per side (lower, higher) RGB at the nodes of the scene's lattice, NaN where
     /// unknown, and the flats' textures.
     pub fn from_parts(nodes: [Option<Vec<[f32; 3]>>; 2], flats: Vec<Option<FlatTexture>>) -> Self {
-        Self { nodes, flats, rays: 0 }
+        Self { nodes, shown: flats.clone(), flats, rays: 0 }
     }
 
     /// Total work units that `tick` will see, for a progress bar.
@@ -132,9 +136,9 @@ impl RadianceCache {
         &self.flats
     }
 
-    /// The flats' textures, without the rest.
-    pub fn into_flats(self) -> Vec<Option<FlatTexture>> {
-        self.flats
+    /// The flats' textures for pictures, without the rest.
+    pub fn into_shown_flats(self) -> Vec<Option<FlatTexture>> {
+        self.shown
     }
 }
 
@@ -210,7 +214,7 @@ fn fill_nodes<T: Tracer>(
     nodes
 }
 
-/// Direct light at texel centres and photons of later landings, smoothed.
+/// Direct light at texel centres and photons of later landings, smoothed little for gathers and more for pictures.
 fn fill_flat<T: Tracer>(
     scene: &Scene,
     tracer: &T,
@@ -218,76 +222,83 @@ fn fill_flat<T: Tracer>(
     photons: &[FlatPhoton],
     settings: &CacheSettings,
     rays: &AtomicU64,
-) -> Option<FlatTexture> {
-    let flat = flat::flat(scene, number)?;
-    if flat.albedo == DVec3::ZERO {
-        return None;
-    }
+) -> (Option<FlatTexture>, Option<FlatTexture>) {
+    let Some(flat) = flat::flat(scene, number).filter(|f| f.albedo != DVec3::ZERO) else { return (None, None) };
     let dims = FlatTexture::resolution(flat.lengths(), settings.flat_resolution, settings.isovalue_resolution);
-    let indirect = flat_irradiance(&flat, number, dims, photons);
-    let mut texture = FlatTexture::black(dims);
     let centres = FlatTexture::black(dims);
     let lattice = scene.lattice();
-    texture.texels.par_iter_mut().enumerate().with_min_len(256).for_each(|(i, texel)| {
-        let [u, v, c] = centres.centre(i);
-        let x = flat.at([u, v]);
-        #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
-        let receiver = Receiver {
-            position: lattice.to_index(x).as_vec3(),
-            normal: flat.normal,
-            isovalue: c as f32,
-            departure: flat.departure,
-        };
-        let index = ((number as u64) << 40) | i as u64;
-        let direct = direct_irradiance(
-            scene,
-            tracer,
-            &receiver,
-            settings.flat_shadow_rays,
-            (settings.seed, Stage::Cache, !index),
-        );
-        rays.fetch_add(direct.rays, Ordering::Relaxed);
-        let total = direct.mean + DVec3::from_array(indirect[i].map(f64::from));
-        *texel = reflected(flat.albedo, total).as_vec3().to_array();
-    });
-    Some(texture)
+    let direct: Vec<DVec3> = (0..centres.texels.len())
+        .into_par_iter()
+        .with_min_len(256)
+        .map(|i| {
+            let [u, v, c] = centres.centre(i);
+            #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
+            let receiver = Receiver {
+                position: lattice.to_index(flat.at([u, v])).as_vec3(),
+                normal: flat.normal,
+                isovalue: c as f32,
+                departure: flat.departure,
+            };
+            let key = (settings.seed, Stage::Cache, !(((number as u64) << 40) | i as u64));
+            let direct = direct_irradiance(scene, tracer, &receiver, settings.flat_shadow_rays, key);
+            rays.fetch_add(direct.rays, Ordering::Relaxed);
+            direct.mean
+        })
+        .collect();
+    let (power, count) = flat_power(number, dims, photons);
+    let texel = flat.area() / (dims[0] * dims[1]) as f64 / dims[2] as f64;
+    let density: Vec<DVec3> = power.into_iter().map(|p| p / texel).collect();
+    let per_texel = count as f64 / density.len() as f64;
+    let texture = |kernel: Kernel| {
+        let indirect = smooth_twice(&density, dims, kernel.passes(per_texel));
+        let light = direct.iter().zip(indirect).map(|(d, i)| reflected(flat.albedo, *d + i).as_vec3().to_array());
+        Some(FlatTexture { dims, texels: light.collect() })
+    };
+    (texture(GATHERED), texture(SHOWN))
 }
 
-/// Irradiance of photons that were reflected before, per texel: a histogram over (u, v, c), smoothed by a 2D kernel × a
-/// 1D kernel in c that keep flux and shrink with more photons; twice: what the first smoothing took away is smoothed and
-/// put back, so that the bias left is of fourth order in their width. \[Tukey77\]
-#[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-fn flat_irradiance(flat: &flat::Flat, number: usize, dims: [usize; 3], photons: &[FlatPhoton]) -> Vec<[f32; 3]> {
-    let mut bins = FlatTexture::black(dims);
-    let mut power = vec![DVec3::ZERO; bins.texels.len()];
-    let mut count = 0u64;
+/// Power per texel of photons that were reflected before, and how many they are.
+fn flat_power(number: usize, dims: [usize; 3], photons: &[FlatPhoton]) -> (Vec<DVec3>, u64) {
+    let bins = FlatTexture::black(dims);
+    let (mut power, mut count) = (vec![DVec3::ZERO; bins.texels.len()], 0);
     for p in photons.iter().filter(|p| p.flat as usize == number && p.bounces > 0) {
         power[bins.texel(p.uvc)] += p.power.as_dvec3();
         count += 1;
     }
-    let texel = flat.area() / (dims[0] * dims[1]) as f64 / dims[2] as f64;
-    let image: Vec<DVec3> = power.into_iter().map(|p| p / texel).collect();
-    let passes = passes(count as f64 / image.len() as f64);
-    let once = smooth(image.clone(), dims, passes);
-    let lost = smooth(image.iter().zip(&once).map(|(i, s)| *i - *s).collect(), dims, passes);
-    // Not clamped at 0: that would brighten what few photons reach.
-    let twice = once.iter().zip(&lost).map(|(s, l)| *s + *l);
-    bins.texels.iter_mut().zip(twice).for_each(|(t, e)| *t = e.as_vec3().to_array());
-    bins.texels
+    (power, count)
 }
 
-/// Photons that a texel's kernel should hold: about 4 % of noise after twicing.
-const PHOTONS_PER_KERNEL: f64 = 1000.0;
+/// How far photons on a flat are smoothed: a kernel that shrinks as they grow in number.
+struct Kernel {
+    /// Photons that it should hold.
+    photons: f64,
+    /// Most passes of ¼ ½ ¼ along u and v; c gets half of them, since there are fewer texels along it.
+    most: f64,
+}
 
-/// Passes of ¼ ½ ¼ along u, v and c for so many photons per texel: a kernel that shrinks as they grow. It is (2√π σ)³
-/// texels worth with σ² of half the passes; c gets half of them, since there are fewer texels along it.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
-fn passes(photons_per_texel: f64) -> [usize; 3] {
-    let texels = PHOTONS_PER_KERNEL / photons_per_texel.max(1e-9);
-    let sigma = (texels * 2f64.sqrt()).cbrt() / (2.0 * std::f64::consts::PI.sqrt());
-    let along = 2.0 * sigma * sigma;
-    let n = |x: f64, most: f64| x.round().clamp(1.0, most) as usize;
-    [n(along, 16.0), n(along, 16.0), n(0.5 * along, 8.0)]
+const GATHERED: Kernel = Kernel { photons: 300.0, most: 2.0 };
+const SHOWN: Kernel = Kernel { photons: 2000.0, most: 16.0 };
+
+impl Kernel {
+    /// Passes of ¼ ½ ¼ along u, v and c for so many photons per texel: the kernel is (2√π σ)³ texels worth, with σ² of half
+    /// the passes.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
+    fn passes(&self, photons_per_texel: f64) -> [usize; 3] {
+        let texels = self.photons / photons_per_texel.max(1e-9);
+        let sigma = (texels * 2f64.sqrt()).cbrt() / (2.0 * std::f64::consts::PI.sqrt());
+        let along = (2.0 * sigma * sigma).clamp(1.0, self.most);
+        let n = |x: f64| x.round().max(1.0) as usize;
+        [n(along), n(along), n(0.5 * along)]
+    }
+}
+
+/// Smooths by a 2D kernel × a 1D kernel in c that keep flux, twice: what the first smoothing took away is smoothed and put
+/// back, so that the bias left is of fourth order in their width. \[Tukey77\]
+fn smooth_twice(image: &[DVec3], dims: [usize; 3], passes: [usize; 3]) -> Vec<DVec3> {
+    let once = smooth(image.to_vec(), dims, passes);
+    let lost = smooth(image.iter().zip(&once).map(|(i, s)| *i - *s).collect(), dims, passes);
+    // Not clamped at 0: that would brighten what few photons reach.
+    once.iter().zip(&lost).map(|(s, l)| *s + *l).collect()
 }
 
 /// Passes of ¼ ½ ¼ along each axis.

@@ -104,7 +104,7 @@ pub(super) fn light(
         lit.seconds.interpolate += stage.end()?;
         lit.sides.push((side, grid));
     }
-    lit.flats = cache.into_flats();
+    lit.flats = cache.into_shown_flats();
     Ok(lit)
 }
 

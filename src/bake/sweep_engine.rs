@@ -81,7 +81,7 @@ pub(super) fn light(
         lit.sides.push((s.side, grid));
     }
     lit.seconds.samples = begun.elapsed().as_secs_f64();
-    lit.flats = cache.into_flats();
+    lit.flats = cache.into_shown_flats();
     Ok(lit)
 }
 
