@@ -4,9 +4,11 @@ mod memory;
 mod photon_engine;
 mod settings;
 mod sweep_engine;
+mod time;
 
 pub use memory::MemoryEstimate;
 pub use settings::{BakeOptions, BakeSettings, Engine, Interpolation, Preset, StrategyName};
+pub use time::TimeEstimate;
 
 use crate::checkpoint::{self, Checkpoint};
 use crate::embree::Device;

@@ -1,7 +1,7 @@
 //! `isolume bake`: from a volume or scene to the file that holds it with its light.
 
 use super::{device, expect_extension, writable};
-use crate::bake::{BakeOptions, BakeSettings, MemoryEstimate, bake_resumable, job};
+use crate::bake::{BakeOptions, BakeSettings, MemoryEstimate, TimeEstimate, bake_resumable, job};
 use crate::checkpoint::Checkpoint;
 use crate::error::{Error, Result};
 use crate::export::bake_file;
@@ -21,7 +21,7 @@ Examples:
   isolume bake scene.toml -o out.vti --preset preview
   isolume bake scan.raw --raw-dims 305,224,14 --raw-spacing 0.24,0.24,1 -o scan.vti
   isolume bake big.nrrd -o big.vti --resume              go on where an interrupted bake stopped
-  isolume bake big.nrrd -o big.vti --max-memory 8G --dry-run   how much memory it would take")]
+  isolume bake big.nrrd -o big.vti --max-memory 8G --dry-run   what it would take")]
 pub(super) struct Bake {
     /// Volume, or scene file (.toml)
     input: PathBuf,
@@ -46,7 +46,7 @@ pub(super) struct Bake {
     /// Refuse a bake whose estimated memory exceeds this, such as 8G or 500M
     #[arg(long, value_name = "BYTES", value_parser = bytes)]
     max_memory: Option<u64>,
-    /// Print the memory estimate, check everything, and stop before the work
+    /// Print what memory and time it would take, check everything, and stop before the work
     #[arg(long)]
     dry_run: bool,
     #[command(flatten)]
@@ -97,6 +97,10 @@ impl Bake {
             memory.check(most)?;
         }
         if self.dry_run {
+            match TimeEstimate::new(&loaded.scene, &settings, &device)? {
+                Some(time) => eprintln!("{:>14}  {time}", "time"),
+                None => eprintln!("{:>14}  not estimated for the sweep engine", "time"),
+            }
             return Ok(());
         }
         let checkpoint = self.checkpoint(job(&loaded.scene, &settings))?;

@@ -5,7 +5,7 @@ use super::{Effort, Study, Subject, Table, accuracy_of, provenance};
 use crate::bake::{BakeOptions, BakeSettings, StrategyName};
 use crate::error::Result;
 use crate::illumination_grid::GridSize;
-use crate::mask::masks;
+use crate::mask::{Mask, masks};
 use crate::plot::{Plot, Series};
 
 const COLUMNS: [&str; 14] = [
@@ -40,6 +40,13 @@ const STRATEGIES: [(StrategyName, &str); 4] = [
 pub fn strategies(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Result<()> {
     let mut table = Table::open(study.folder.join("strategies.csv"), &COLUMNS, 4)?;
     let counts: &[u64] = if study.quick { &[20_000, 100_000] } else { &[100_000, 1_000_000, 10_000_000] };
+    // Plots of what is there, also after an interrupt.
+    let measured = measure(study, subjects, base, counts, &mut table);
+    summarise(study, subjects, &table, counts)?;
+    measured
+}
+
+fn measure(study: &Study, subjects: &[Subject], base: &BakeOptions, counts: &[u64], table: &mut Table) -> Result<()> {
     for subject in subjects {
         let isovalues = isovalues(study, subject);
         for &count in counts {
@@ -84,7 +91,7 @@ pub fn strategies(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Re
             }
         }
     }
-    summarise(study, subjects, &table, counts)
+    Ok(())
 }
 
 /// The largest grid of Ω's proportions that takes at most `count` samples (two for points that neighbours stand for).
@@ -96,11 +103,18 @@ fn grid_of(subject: &Subject, count: u64) -> Result<GridSize> {
     let field = &subject.scene.field;
     let dims = subject.scene.lattice().dims();
     let mut factor = 1.0f64;
+    let mut tried = 0;
     loop {
+        tried += 1;
         let grid = GridSize::Points(dims.map(|n| ((n as f64 * factor) as usize).max(2)));
         let lattice = grid.lattice(subject.scene.lattice())?;
-        let samples: u64 = masks(field, &lattice).iter().map(|m| *m as u64).sum();
-        if samples <= count && samples as f64 > 0.9 * count as f64 || lattice.len() == 8 {
+        let taken = |m: &Mask| match m {
+            Mask::Empty => 0u64,
+            Mask::Valid => 1,
+            Mask::Filled => 2,
+        };
+        let samples: u64 = masks(field, &lattice).iter().map(taken).sum();
+        if samples <= count && samples as f64 > 0.9 * count as f64 || lattice.len() == 8 || tried == 32 {
             return Ok(grid);
         }
         factor *= (0.97 * count as f64 / samples.max(1) as f64).cbrt();

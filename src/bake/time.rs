@@ -1,0 +1,124 @@
+//! How long a bake takes, before it takes it.
+
+use super::{BakeSettings, Engine, StrategyName};
+use crate::checkpoint;
+use crate::direct::{Receiver, direct_irradiance};
+use crate::embree::{Device, GraphTracer};
+use crate::error::Result;
+use crate::flat::{self, FlatTexture};
+use crate::flattened::Departure;
+use crate::mask::{Mask, masks};
+use crate::nearest::Neighbours;
+use crate::photon::{PhotonSettings, trace_photons};
+use crate::photon_map::PhotonMap;
+use crate::radiance::{Indirect, sample_radiance};
+use crate::radiance_cache::RadianceCache;
+use crate::rng::Stage;
+use crate::sampling::{Strategy, positions};
+use crate::scene::Scene;
+use rayon::prelude::*;
+use std::time::Instant;
+
+/// Photons and samples tried: a second or so.
+const PHOTONS: u64 = 1 << 15;
+const SAMPLES: u64 = 1 << 12;
+
+/// Estimated wall seconds of a bake by the photon engine, stage by stage, on as many threads as it will have.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TimeEstimate {
+    /// Name and seconds of each stage.
+    pub stages: Vec<(&'static str, f64)>,
+}
+
+impl TimeEstimate {
+    /// Does a small part of each stage and scales it up: right within a factor of about 2 on a machine that stays as busy
+    /// as it is. Interpolation of scattered samples and export are left out. `None` for the sweep engine, whose passes
+    /// depend on how often light bounces.
+    ///
+    /// # Errors
+    /// `Invalid` if the grid has too many points; `Embree`.
+    #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
+    pub fn new(scene: &Scene, settings: &BakeSettings, device: &Device) -> Result<Option<Self>> {
+        if settings.engine == Engine::Sweep {
+            return Ok(None);
+        }
+        let tracer = GraphTracer::new(device, scene)?;
+        let needed = |masks: &[Mask]| masks.iter().filter(|&&m| m != Mask::Empty).count() as f64;
+        let count = settings.photons.min(PHOTONS);
+        let pilot = PhotonSettings { count, max_bounces: settings.bounces, seed: settings.seed, fixed_isovalue: None };
+        let begun = Instant::now();
+        let photons = trace_photons(scene, &tracer, &pilot, &|_| true);
+        let mut stages = vec![("photons", begun.elapsed().as_secs_f64() * settings.photons as f64 / count as f64)];
+
+        let side = scene.surface.outside;
+        let at = positions(&scene.field, &Strategy::Uniform, SAMPLES, settings.seed)?;
+        let tried = at.len().max(1) as f64;
+        let map = PhotonMap::new(scene, &photons.surface, side, |p| p.bounces > 0, settings.estimate());
+        let begun = Instant::now();
+        let rays: u64 = at
+            .par_iter()
+            .enumerate()
+            .with_min_len(64)
+            .map_init(Neighbours::default, |scratch, (i, &position)| {
+                let p = position.as_dvec3();
+                let isovalue = scene.field.value(p) as f32;
+                let Some(normal) = scene.normal(p, side) else { return 0 };
+                map.irradiance(p, f64::from(isovalue), scratch);
+                let receiver = Receiver { position, normal, isovalue, departure: Departure::Surface(side) };
+                let key = (settings.seed, Stage::Cache, i as u64);
+                direct_irradiance(scene, &tracer, &receiver, settings.cache_shadow_rays, key).rays
+            })
+            .sum();
+        let per_node = begun.elapsed().as_secs_f64() / tried;
+        // Light reaches the other side of most surfaces, too.
+        let sides = if photons.surface.iter().any(|p| p.side != side) { 2.0 } else { 1.0 };
+        let nodes = if settings.gather_rays > 0 { sides * needed(&masks(&scene.field, scene.lattice())) } else { 0.0 };
+
+        let begun = Instant::now();
+        let empty = RadianceCache::from_parts([None, None], vec![None; flat::count(scene)]);
+        let indirect = match settings.gather_rays {
+            0 => Indirect::Map(&map),
+            rays => Indirect::Gather(&empty, rays),
+        };
+        let unsaved = checkpoint::Stage::UNSAVED;
+        let (shadow, seed) = (settings.shadow_rays, settings.seed);
+        let sampled = sample_radiance(scene, &tracer, &indirect, &at, side, shadow, seed, unsaved, &|_| true);
+        let seconds = begun.elapsed().as_secs_f64();
+        let lattice = settings.grid.lattice(scene.lattice())?;
+        let points = needed(&masks(&scene.field, &lattice));
+        let samples = match settings.strategy {
+            StrategyName::Nodes => points,
+            _ => settings.samples.map_or(points * settings.samples_per_point, |n| n as f64),
+        };
+
+        let texels: usize = (0..flat::count(scene))
+            .filter_map(|n| flat::flat(scene, n))
+            .map(|f| {
+                let dims = FlatTexture::resolution(f.lengths(), settings.wall_resolution, settings.wall_isovalues);
+                dims.iter().product::<usize>()
+            })
+            .sum();
+        let per_ray = seconds / (sampled.rays + rays).max(1) as f64;
+        let walls = texels as f64 * f64::from(settings.wall_shadow_rays) * per_ray;
+        stages.push(("cache", per_node * nodes + walls));
+        stages.push(("samples", seconds / tried * samples * scene.surface.stored_sides().len() as f64));
+        Ok(Some(Self { stages }))
+    }
+
+    /// All stages together, seconds.
+    pub fn total(&self) -> f64 {
+        self.stages.iter().map(|s| s.1).sum()
+    }
+}
+
+impl std::fmt::Display for TimeEstimate {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "about {:.0} s:", self.total().max(1.0))?;
+        let mut separator = " ";
+        for (name, seconds) in &self.stages {
+            write!(f, "{separator}{name} {seconds:.1}")?;
+            separator = ", ";
+        }
+        Ok(())
+    }
+}
