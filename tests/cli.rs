@@ -240,3 +240,15 @@ fn the_same_bits_for_any_number_of_threads() {
         assert_eq!(bits(&grids[0]), bits(other));
     }
 }
+
+#[test]
+fn a_pipe_that_nobody_reads_is_no_fault() {
+    let dir = tempfile::tempdir().unwrap();
+    ok(dir.path(), &["generate", "bumps", "--size", "9", "-o", "b.vti"]);
+    let mut command = Command::new(env!("CARGO_BIN_EXE_isolume"));
+    command.current_dir(dir.path()).args(["info", "b.vti", "--json"]);
+    let mut child = command.stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::piped()).spawn().unwrap();
+    drop(child.stdout.take());
+    let output = child.wait_with_output().unwrap();
+    assert!(output.status.success() && output.stderr.is_empty(), "{}", text(&output.stderr));
+}
