@@ -11,7 +11,7 @@ use crate::radiance_cache::RadianceCache;
 use crate::rng::Stage;
 use crate::scene::Scene;
 use crate::tracer::Tracer;
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -137,7 +137,9 @@ pub fn sample_radiance<T: Tracer>(
                     let scale = luminance(albedo) / std::f64::consts::PI;
                     Some(RadianceSample {
                         position,
-                        radiance: (reflected(albedo, direct.mean + mean) + scene.surface.emission).as_vec3(),
+                        // The cache's flats may be a little negative where few photons land.
+                        radiance: (reflected(albedo, (direct.mean + mean).max(DVec3::ZERO)) + scene.surface.emission)
+                            .as_vec3(),
                         variance: ((direct.variance + variance) * scale * scale) as f32,
                     })
                 })

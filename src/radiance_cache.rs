@@ -249,12 +249,13 @@ fn fill_flat<T: Tracer>(
     let texel = flat.area() / (dims[0] * dims[1]) as f64 / dims[2] as f64;
     let density: Vec<DVec3> = power.into_iter().map(|p| p / texel).collect();
     let per_texel = count as f64 / density.len() as f64;
-    let texture = |kernel: Kernel| {
+    let texture = |kernel: Kernel, least: f64| {
         let indirect = smooth_twice(&density, dims, kernel.passes(per_texel));
-        let light = direct.iter().zip(indirect).map(|(d, i)| reflected(flat.albedo, *d + i).as_vec3().to_array());
-        Some(FlatTexture { dims, texels: light.collect() })
+        let light = direct.iter().zip(indirect).map(|(d, i)| reflected(flat.albedo, (*d + i).max(DVec3::splat(least))));
+        Some(FlatTexture { dims, texels: light.map(|l| l.as_vec3().to_array()).collect() })
     };
-    (texture(GATHERED), texture(SHOWN))
+    // A texture to be averaged is not clamped at 0: that would brighten what few photons reach.
+    (texture(GATHERED, f64::NEG_INFINITY), texture(SHOWN, 0.0))
 }
 
 /// Power per texel of photons that were reflected before, and how many they are.
@@ -297,7 +298,6 @@ impl Kernel {
 fn smooth_twice(image: &[DVec3], dims: [usize; 3], passes: [usize; 3]) -> Vec<DVec3> {
     let once = smooth(image.to_vec(), dims, passes);
     let lost = smooth(image.iter().zip(&once).map(|(i, s)| *i - *s).collect(), dims, passes);
-    // Not clamped at 0: that would brighten what few photons reach.
     once.iter().zip(&lost).map(|(s, l)| *s + *l).collect()
 }
 

@@ -59,7 +59,8 @@ impl MemoryEstimate {
                 dims.iter().map(|&n| n as u64).product::<u64>()
             })
             .sum();
-        let flats = 12 * texels;
+        // As gathers and as pictures see them.
+        let flats = 24 * texels;
         let sample = size_of::<Option<RadianceSample>>() as u64;
         // A sample: position, owner, result in its chunk and joined, checkpoint.
         let per_sample = 12 + 8 + 2 * sample + 16;
