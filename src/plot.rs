@@ -169,24 +169,32 @@ impl Plot {
         ));
         for (n, series) in self.series.iter().enumerate() {
             let colour = COLOURS[n % COLOURS.len()];
+            // Colours that come again are dashed and hollow.
+            let (dash, fill) = match n / COLOURS.len() {
+                0 => ("", colour),
+                1 => (" stroke-dasharray=\"6 3\"", "white"),
+                _ => (" stroke-dasharray=\"2 3\"", "white"),
+            };
             let at: Vec<(f64, f64)> =
                 series.points.iter().filter(|p| usable(p)).map(|p| (x_axis.at(p.0), y_axis.at(p.1))).collect();
             if series.line && at.len() > 1 {
                 let path: Vec<String> = at.iter().map(|(x, y)| format!("{x:.1} {y:.1}")).collect();
                 put(format_args!(
-                    "<path d=\"M{}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"1.6\"/>\n",
+                    "<path d=\"M{}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"1.6\"{dash}/>\n",
                     path.join("L")
                 ));
             }
             if series.marks {
                 for (x, y) in &at {
-                    put(format_args!("<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"2.8\" fill=\"{colour}\"/>"));
+                    put(format_args!(
+                        "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"2.8\" fill=\"{fill}\" stroke=\"{colour}\"/>"
+                    ));
                 }
                 put(format_args!("\n"));
             }
             let (x, y) = (WIDTH - right + 14.0, top + 14.0 + 19.0 * n as f64);
             put(format_args!(
-                "<circle cx=\"{x}\" cy=\"{:.1}\" r=\"4\" fill=\"{colour}\"/><text x=\"{}\" y=\"{y}\">{}</text>\n",
+                "<circle cx=\"{x}\" cy=\"{:.1}\" r=\"4\" fill=\"{fill}\" stroke=\"{colour}\"/><text x=\"{}\" y=\"{y}\">{}</text>\n",
                 y - 4.0,
                 x + 10.0,
                 escaped(&series.name)

@@ -261,7 +261,8 @@ fn the_memory_estimate_is_near_the_peak() {
     assert!(text.contains("--max-memory") && text.contains("at its peak"), "{text}");
     let (output, text) = refused("64G");
     assert!(output.status.success() && text.contains("at its peak"), "{text}");
-    let time = text.lines().find(|l| l.trim_start().starts_with("time ")).unwrap_or_else(|| panic!("no time in {text}"));
+    let time =
+        text.lines().find(|l| l.trim_start().starts_with("time ")).unwrap_or_else(|| panic!("no time in {text}"));
     for stage in ["photons", "cache", "samples"] {
         let (_, after) = time.split_once(&format!("{stage} ")).unwrap_or_else(|| panic!("no {stage} in {time}"));
         let seconds: f64 = after.split(',').next().unwrap().trim().parse().unwrap();
