@@ -150,6 +150,12 @@ impl FlatTexture {
     }
 }
 
+/// Texels of the textures of all flats of a scene, at most: as [`FlatTexture::resolution`] sizes them.
+pub fn texels(scene: &Scene, across: usize, isovalues: usize) -> usize {
+    let flats = (0..count(scene)).filter_map(|n| flat(scene, n));
+    flats.map(|f| FlatTexture::resolution(f.lengths(), across, isovalues).iter().product::<usize>()).sum()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -38,8 +38,8 @@ pub struct RadianceCache {
     nodes: [Option<Vec<[f32; 3]>>; 2],
     /// What gather rays find: photons under the narrowest kernel, since many rays average their noise.
     flats: Vec<Option<FlatTexture>>,
-    /// What pictures show: the same light, photons smoothed until their noise is not seen.
-    shown: Vec<Option<FlatTexture>>,
+    /// What pictures show, if not the same: photons smoothed until their noise is not seen.
+    shown: Option<Vec<Option<FlatTexture>>>,
     /// Rays traced to fill it.
     pub rays: u64,
 }
@@ -70,13 +70,13 @@ impl RadianceCache {
             (with_nodes && used)
                 .then(|| fill_nodes(scene, tracer, photons, side, estimate, settings, saved[side.index()], tick, &rays))
         });
-        Self { nodes, flats, shown, rays: rays.into_inner() }
+        Self { nodes, flats, shown: Some(shown), rays: rays.into_inner() }
     }
 
     /// A cache of radiance known already: per side (lower, higher) RGB at the nodes of the scene's lattice, NaN where
     /// unknown, and the flats' textures.
     pub fn from_parts(nodes: [Option<Vec<[f32; 3]>>; 2], flats: Vec<Option<FlatTexture>>) -> Self {
-        Self { nodes, shown: flats.clone(), flats, rays: 0 }
+        Self { nodes, flats, shown: None, rays: 0 }
     }
 
     /// Total work units that `tick` will see, for a progress bar.
@@ -138,7 +138,7 @@ impl RadianceCache {
 
     /// The flats' textures for pictures, without the rest.
     pub fn into_shown_flats(self) -> Vec<Option<FlatTexture>> {
-        self.shown
+        self.shown.unwrap_or(self.flats)
     }
 }
 

@@ -3,7 +3,7 @@
 use super::{BakeSettings, Engine, StrategyName};
 use crate::embree::{Device, GraphTracer};
 use crate::error::{Error, Result};
-use crate::flat::{self, FlatTexture};
+use crate::flat;
 use crate::flattened::Side;
 use crate::mask::{Mask, masks};
 use crate::photon::{FlatPhoton, PhotonSettings, SurfacePhoton, trace_photons};
@@ -52,13 +52,7 @@ impl MemoryEstimate {
         let element = volume.samples().element_type().size() as u64;
         // Volume, field, the pyramid of min and max, and a mask.
         let base = PROGRAM + voxels * (element + 4) + voxels * 33 / 8 + points;
-        let texels: u64 = (0..flat::count(scene))
-            .filter_map(|n| flat::flat(scene, n))
-            .map(|f| {
-                let dims = FlatTexture::resolution(f.lengths(), settings.wall_resolution, settings.wall_isovalues);
-                dims.iter().map(|&n| n as u64).product::<u64>()
-            })
-            .sum();
+        let texels = flat::texels(scene, settings.wall_resolution, settings.wall_isovalues) as u64;
         // As gathers and as pictures see them.
         let flats = 24 * texels;
         let sample = size_of::<Option<RadianceSample>>() as u64;

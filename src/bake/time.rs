@@ -5,7 +5,7 @@ use crate::checkpoint;
 use crate::direct::{Receiver, direct_irradiance};
 use crate::embree::{Device, GraphTracer};
 use crate::error::Result;
-use crate::flat::{self, FlatTexture};
+use crate::flat;
 use crate::flattened::Departure;
 use crate::mask::{Mask, masks};
 use crate::nearest::Neighbours;
@@ -91,13 +91,7 @@ impl TimeEstimate {
             _ => settings.samples.map_or(points * settings.samples_per_point, |n| n as f64),
         };
 
-        let texels: usize = (0..flat::count(scene))
-            .filter_map(|n| flat::flat(scene, n))
-            .map(|f| {
-                let dims = FlatTexture::resolution(f.lengths(), settings.wall_resolution, settings.wall_isovalues);
-                dims.iter().product::<usize>()
-            })
-            .sum();
+        let texels = flat::texels(scene, settings.wall_resolution, settings.wall_isovalues);
         let per_ray = seconds / (sampled.rays + rays).max(1) as f64;
         let walls = texels as f64 * f64::from(settings.wall_shadow_rays) * per_ray;
         stages.push(("cache", per_node * nodes + walls));
