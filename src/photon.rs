@@ -222,6 +222,7 @@ fn trace_photon<T: Tracer>(
     let mut rng = Rng::stream(settings.seed, Stage::Photon, index);
     out.emitted += 1;
     let Some(mut photon) = emit(scene, settings, sources, total, index) else { return };
+    let surface_albedo = |photon: &Flight| scene.surface.albedo.at(f64::from(photon.isovalue));
     let lattice = scene.lattice();
     let bin = ((photon.isovalue * ENERGY_BINS as f32) as usize).min(ENERGY_BINS - 1);
     let energy = &mut out.energy[bin];
@@ -249,7 +250,7 @@ fn trace_photon<T: Tracer>(
                     bounces,
                     side,
                 });
-                (scene.surface.albedo, scene.normal(position.as_dvec3(), side), Departure::Surface(side))
+                (surface_albedo(&photon), scene.normal(position.as_dvec3(), side), Departure::Surface(side))
             }
             Target::Cap(face, side) => {
                 // The texture of a cap is its outer side's.
@@ -259,7 +260,7 @@ fn trace_photon<T: Tracer>(
                 }
                 let n = scene.face_normal(face);
                 let n = if side == Side::Lower { n } else { -n };
-                (scene.surface.albedo, Some(n), Departure::Cap(face, side))
+                (surface_albedo(&photon), Some(n), Departure::Cap(face, side))
             }
             Target::Polygon(id) => {
                 let p = &scene.polygons()[id as usize];

@@ -34,7 +34,8 @@ pub struct CacheSettings {
 
 /// Outgoing radiance (reflected and, for emitting level sets, emitted) wherever a gather ray can land.
 pub struct RadianceCache {
-    /// Per side (lower, higher): RGB at each node, NaN where neither the node nor its surroundings hold a surface.
+    /// Per side (lower, higher): what a white surface would reflect at each node, NaN where neither the node nor its
+    /// surroundings hold a surface. The albedo is that of the hit: isovalues may differ much from node to node.
     nodes: [Option<Vec<[f32; 3]>>; 2],
     /// What gather rays find: photons under the narrowest kernel, since many rays average their noise.
     flats: Vec<Option<FlatTexture>>,
@@ -73,8 +74,8 @@ impl RadianceCache {
         Self { nodes, flats, shown: Some(shown), rays: rays.into_inner() }
     }
 
-    /// A cache of radiance known already: per side (lower, higher) RGB at the nodes of the scene's lattice, NaN where
-    /// unknown, and the flats' textures.
+    /// A cache of light known already: per side (lower, higher) irradiance / π at the nodes of the scene's lattice, NaN
+    /// where unknown, and the flats' radiance.
     pub fn from_parts(nodes: [Option<Vec<[f32; 3]>>; 2], flats: Vec<Option<FlatTexture>>) -> Self {
         Self { nodes, flats, shown: None, rays: 0 }
     }
@@ -88,7 +89,10 @@ impl RadianceCache {
     /// if no node of the cell is filled.
     pub fn lookup(&self, scene: &Scene, target: Target, position: DVec3, isovalue: f32, misses: &mut u64) -> DVec3 {
         match target {
-            Target::Surface(side) => self.surface(scene, side, position, misses),
+            Target::Surface(side) => {
+                let albedo = scene.surface.albedo.at(f64::from(isovalue));
+                albedo * self.white(scene, side, position, misses) + scene.surface.emission
+            }
             Target::Cap(_, Side::Higher) => DVec3::ZERO,
             Target::Cap(face, Side::Lower) => {
                 let uv = flat::face_texture(scene, face, position);
@@ -105,9 +109,9 @@ impl RadianceCache {
         self.flats[number].as_ref().map_or(DVec3::ZERO, |t| t.lookup([u, v, f64::from(isovalue)]))
     }
 
-    /// Trilinear over the filled nodes of the cell.
-    fn surface(&self, scene: &Scene, side: Side, position: DVec3, misses: &mut u64) -> DVec3 {
-        let Some(nodes) = &self.nodes[side.index()] else { return scene.surface.emission };
+    /// What a white surface would reflect: trilinear over the filled nodes of the cell.
+    fn white(&self, scene: &Scene, side: Side, position: DVec3, misses: &mut u64) -> DVec3 {
+        let Some(nodes) = &self.nodes[side.index()] else { return DVec3::ZERO };
         let ([i, j, k], u) = scene.field.locate(position);
         let (mut sum, mut weight) = (DVec3::ZERO, 0.0);
         for corner in 0..8 {
@@ -128,7 +132,7 @@ impl RadianceCache {
             return sum / weight;
         }
         *misses += 1;
-        scene.surface.emission
+        DVec3::ZERO
     }
 
     /// The flats' radiance textures; `None` for flats that reflect nothing.
@@ -197,7 +201,7 @@ fn fill_nodes<T: Tracer>(
                 );
                 traced += direct.rays;
                 let indirect = map.irradiance(p, f64::from(isovalue), &mut scratch).mean;
-                sum += reflected(scene.surface.albedo, direct.mean + indirect) + scene.surface.emission;
+                sum += reflected(DVec3::ONE, direct.mean + indirect);
                 count += 1.0;
             }
             if count > 0.0 {
@@ -223,7 +227,7 @@ fn fill_flat<T: Tracer>(
     settings: &CacheSettings,
     rays: &AtomicU64,
 ) -> (Option<FlatTexture>, Option<FlatTexture>) {
-    let Some(flat) = flat::flat(scene, number).filter(|f| f.albedo != DVec3::ZERO) else { return (None, None) };
+    let Some(flat) = flat::flat(scene, number).filter(|f| !f.albedo.black()) else { return (None, None) };
     let dims = FlatTexture::resolution(flat.lengths(), settings.flat_resolution, settings.isovalue_resolution);
     let centres = FlatTexture::black(dims);
     let lattice = scene.lattice();
@@ -251,7 +255,11 @@ fn fill_flat<T: Tracer>(
     let per_texel = count as f64 / density.len() as f64;
     let texture = |kernel: Kernel, least: f64| {
         let indirect = smooth_twice(&density, dims, kernel.passes(per_texel));
-        let light = direct.iter().zip(indirect).map(|(d, i)| reflected(flat.albedo, (*d + i).max(DVec3::splat(least))));
+        let light = direct
+            .iter()
+            .zip(indirect)
+            .enumerate()
+            .map(|(n, (d, i))| reflected(flat.albedo.at(centres.centre(n)[2]), (*d + i).max(DVec3::splat(least))));
         Some(FlatTexture { dims, texels: light.map(|l| l.as_vec3().to_array()).collect() })
     };
     // A texture to be averaged is not clamped at 0: that would brighten what few photons reach.

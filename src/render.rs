@@ -179,9 +179,10 @@ fn radiance(baked: &BakedVolume, ray: &FlattenedRay, hit: FlattenedHit) -> Optio
 /// Headlight shading, already exposed: ρ (0.15 + 0.85 |cos|).
 fn local(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit, direction: DVec3) -> DVec3 {
     let p = ray.at(hit.t);
+    let surface_albedo = || scene.surface.albedo.at(f64::from(ray.isovalue));
     let (albedo, normal) = match hit.target {
-        Target::Surface(side) => (scene.surface.albedo, scene.normal(p, side)),
-        Target::Cap(face, _) => (scene.surface.albedo, Some(scene.face_normal(face))),
+        Target::Surface(side) => (surface_albedo(), scene.normal(p, side)),
+        Target::Cap(face, _) => (surface_albedo(), Some(scene.face_normal(face))),
         Target::Polygon(id) => {
             let polygon = &scene.polygons()[id as usize];
             if polygon.emission != DVec3::ZERO {

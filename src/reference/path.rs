@@ -44,7 +44,7 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
                 self.incoming(scene.ray(receiver.position, direction, receiver.isovalue, receiver.departure), &mut rng);
         }
         let indirect = sum * (std::f64::consts::PI / f64::from(samples.max(1)));
-        reflected(scene.surface.albedo, direct + indirect) + scene.surface.emission
+        reflected(scene.surface.albedo.at(f64::from(receiver.isovalue)), direct + indirect) + scene.surface.emission
     }
 
     /// Direct irradiance by `samples` points uniform over each luminaire:
@@ -147,14 +147,15 @@ pub(super) fn landing(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> O
     let position = ray.at(hit.t).as_vec3();
     let isovalue = ray.isovalue;
     let none = DVec3::ZERO;
+    let surface_albedo = || scene.surface.albedo.at(f64::from(isovalue));
     let (normal, departure, albedo, emission) = match hit.target {
         Target::Surface(side) => {
             let normal = scene.normal(position.as_dvec3(), side)?;
-            (normal, Departure::Surface(side), scene.surface.albedo, scene.surface.emission)
+            (normal, Departure::Surface(side), surface_albedo(), scene.surface.emission)
         }
         Target::Cap(face, side) => {
             let n = scene.face_normal(face);
-            (if side == Side::Lower { n } else { -n }, Departure::Free, scene.surface.albedo, none)
+            (if side == Side::Lower { n } else { -n }, Departure::Free, surface_albedo(), none)
         }
         Target::Polygon(id) => {
             let p = &scene.polygons()[id as usize];
