@@ -90,7 +90,7 @@ pub struct Irradiance {
 }
 
 impl<'a> PhotonMap<'a> {
-    /// Maps the photons of `side` that `keep` accepts.
+    /// Maps the photons of `side` of the scene's own field that `keep` accepts.
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     pub fn new(
         scene: &'a Scene,
@@ -101,7 +101,8 @@ impl<'a> PhotonMap<'a> {
     ) -> Self {
         let lattice = scene.lattice();
         let origin = scene.bounds()[0];
-        let kept: Vec<&SurfacePhoton> = photons.iter().filter(|p| p.side == side && keep(p)).collect();
+        let own = |p: &SurfacePhoton| usize::from(p.field) == scene.number() && p.side == side;
+        let kept: Vec<&SurfacePhoton> = photons.iter().filter(|p| own(p) && keep(p)).collect();
         // World metric relative to the scene's corner, so that f32 stays fine-grained.
         let positions: Vec<Vec3> =
             kept.par_iter().map(|p| (lattice.to_world(p.position.as_dvec3()) - origin).as_vec3()).collect();

@@ -159,9 +159,10 @@ fn radiance(baked: &BakedVolume, ray: &FlattenedRay, hit: FlattenedHit) -> Optio
     };
     match hit.target {
         Target::Surface(side) => baked.radiance(side, p),
+        Target::Companion(..) => None,
         Target::Cap(_, Side::Higher) => Some(DVec3::ZERO),
         Target::Cap(face, Side::Lower) => {
-            texture(scene.polygons().len() + usize::from(face), flat::face_texture(scene, face, p))
+            texture(flat::cap(scene, face), flat::face_texture(scene, face, p))
         }
         Target::Polygon(id) => {
             let polygon = &scene.polygons()[id as usize];
@@ -181,7 +182,11 @@ fn local(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit, direction: DVec3)
     let p = ray.at(hit.t);
     let (albedo, normal) = match hit.target {
         Target::Surface(side) => (scene.surface.albedo, scene.normal(p, side)),
-        Target::Cap(face, _) => (scene.surface.albedo, Some(scene.face_normal(face))),
+        Target::Companion(n, side) => {
+            let companion = &scene.companions()[usize::from(n)];
+            (companion.member.surface.albedo, companion.normal(p, side))
+        }
+        Target::Cap(face, _) => (scene.face_surface(face).albedo, Some(scene.face_normal(face))),
         Target::Polygon(id) => {
             let polygon = &scene.polygons()[id as usize];
             if polygon.emission != DVec3::ZERO {

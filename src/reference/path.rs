@@ -152,9 +152,14 @@ pub(super) fn landing(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> O
             let normal = scene.normal(position.as_dvec3(), side)?;
             (normal, Departure::Surface(side), scene.surface.albedo, scene.surface.emission)
         }
+        Target::Companion(n, side) => {
+            let companion = &scene.companions()[usize::from(n)];
+            let (normal, surface) = (companion.normal(position.as_dvec3(), side)?, &companion.member.surface);
+            (normal, Departure::Companion(n, side), surface.albedo, surface.emission)
+        }
         Target::Cap(face, side) => {
             let n = scene.face_normal(face);
-            (if side == Side::Lower { n } else { -n }, Departure::Free, scene.surface.albedo, none)
+            (if side == Side::Lower { n } else { -n }, Departure::Free, scene.face_surface(face).albedo, none)
         }
         Target::Polygon(id) => {
             let p = &scene.polygons()[id as usize];
