@@ -93,7 +93,7 @@ enum Arrangement<'a> {
 }
 
 impl<'a> PhotonMap<'a> {
-    /// Maps the photons of `side` that `keep` accepts.
+    /// Maps the photons of `side` of the scene's own field that `keep` accepts.
     pub fn new(
         scene: &'a Scene,
         photons: &[SurfacePhoton],
@@ -101,7 +101,7 @@ impl<'a> PhotonMap<'a> {
         keep: impl Fn(&SurfacePhoton) -> bool + Sync,
         settings: EstimateSettings,
     ) -> Self {
-        let keep = |p: &SurfacePhoton| p.side == side && keep(p);
+        let keep = |p: &SurfacePhoton| usize::from(p.field) == scene.number() && p.side == side && keep(p);
         Self(match settings.estimator {
             Estimator::Splat => Arrangement::Density(PhotonDensity::new(scene, photons, keep, settings)),
             Estimator::Nearest | Estimator::Radius => {

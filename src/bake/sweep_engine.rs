@@ -1,6 +1,6 @@
 //! The fast engine: line sweeps light every node; exact rays fill the points beside the sweep's ends.
 
-use super::photon_engine::{at_points, collect};
+use super::photon_engine::{Job, at_points, collect};
 use super::{BakeSettings, Lit, stages};
 use crate::brdf::reflected;
 use crate::checkpoint::Checkpoint;
@@ -23,10 +23,8 @@ use std::time::Instant;
 const STEPS: f64 = 1000.0;
 
 pub(super) fn light(
-    scene: &Scene,
+    Job { number, scene, lattice, masks }: &Job,
     settings: &BakeSettings,
-    lattice: &Lattice,
-    masks: &[Mask],
     device: &Device,
     progress: Progress,
     checkpoint: Option<&Checkpoint>,
@@ -64,11 +62,12 @@ pub(super) fn light(
     lit.seconds.build = begun.elapsed().as_secs_f64();
     let begun = Instant::now();
     let (at, owners) = at_points(&scene.field, lattice, settings.seed, |o| masks[o] == Mask::Filled);
+    let mut sides = Vec::new();
     for (s, white) in swept.sides.iter().zip(white) {
         let stage = progress.stage("samples", at.len() as u64);
         let indirect = Indirect::Gather(&cache, settings.gather_rays.max(1));
         let (shadow_rays, seed) = (settings.shadow_rays, settings.seed);
-        let saved = stages(checkpoint, 2)[s.side.index()];
+        let saved = stages(checkpoint, 4 * number + 2)[s.side.index()];
         let sampled =
             sample_radiance(scene, &tracer, &indirect, &at, s.side, shadow_rays, seed, saved, &|n| stage.tick(n));
         stage.end()?;
@@ -78,8 +77,9 @@ pub(super) fn light(
         lit.without_gradient += sampled.without_gradient;
         let mut grid = collect(masks, &owners, &sampled.samples);
         merge(&mut grid, masks, &outgoing(scene, white), &s.std_error);
-        lit.sides.push((s.side, grid));
+        sides.push((s.side, grid));
     }
+    lit.fields.push(sides);
     lit.seconds.samples = begun.elapsed().as_secs_f64();
     lit.flats = cache.into_shown_flats();
     Ok(lit)
