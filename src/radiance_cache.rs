@@ -217,7 +217,7 @@ fn fill_nodes<T: Tracer>(
             }
             let (mut sum, mut count) = (DVec3::ZERO, 0.0);
             for (stand_in, p) in
-                stand_ins(&scene.field, scene.lattice(), node, settings.seed).into_iter().flatten().enumerate()
+                stand_ins::<2>(&scene.field, scene.lattice(), node, settings.seed).into_iter().flatten().enumerate()
             {
                 let position = p.as_vec3();
                 let Some(normal) = scene.normal(position.as_dvec3(), side) else { continue };
