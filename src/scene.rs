@@ -3,7 +3,7 @@
 
 mod obj;
 
-pub use obj::read_obj;
+pub use obj::{Placement, read_context, read_obj};
 
 use crate::error::{Error, Result};
 use crate::field::Field;
