@@ -33,8 +33,8 @@ fn nearest<'a>(found: &str, known: &[&'a str]) -> Option<&'a str> {
 
 /// ` in [table]`, by the last header above.
 fn table_of(before: &str) -> String {
-    let header = before.lines().rev().map(str::trim).find(|l| l.starts_with('['));
-    header.and_then(|l| l.split(']').next()).map_or(String::new(), |l| format!(" in {l}]"))
+    let header = before.lines().rev().map(str::trim).find(|l| l.starts_with('[') && l.contains(']'));
+    header.and_then(|l| Some(&l[..=l.rfind(']')?])).map_or(String::new(), |h| format!(" in {h}"))
 }
 
 #[cfg(test)]

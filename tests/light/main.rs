@@ -3,6 +3,7 @@
 mod caps;
 mod closed_forms;
 mod colour;
+mod context;
 mod invariance;
 mod photons;
 mod samplers;
