@@ -2,18 +2,19 @@
 //! Ω's faces. Flat numbers are polygon numbers, then six caps (axis + 3 · far end) for each field.
 
 use crate::flattened::{Departure, Side};
+use crate::reflectance::Reflectance;
 use crate::scene::{Boundary, Scene};
 use glam::DVec3;
 
 /// A flat's place and material in the world.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub struct Flat {
     corner: DVec3,
     edges: [DVec3; 2],
     /// Unit normal of its lit side.
     pub normal: DVec3,
-    /// Diffuse reflectance.
-    pub albedo: DVec3,
+    /// Diffuse reflectance; a wall's is the same at every isovalue.
+    pub albedo: Reflectance,
     /// What rays from it start on.
     pub departure: Departure,
 }
@@ -31,7 +32,7 @@ pub fn flat(scene: &Scene, number: usize) -> Option<Flat> {
             corner: p.at([0.0, 0.0]),
             edges: p.texture_edges(),
             normal: p.normal(),
-            albedo: p.albedo,
+            albedo: p.albedo.into(),
             departure: Departure::Polygon(id),
         });
     }
@@ -50,7 +51,7 @@ pub fn flat(scene: &Scene, number: usize) -> Option<Flat> {
         corner: lattice.to_world(corner),
         edges: [edge((a + 1) % 3), edge((a + 2) % 3)],
         normal: scene.face_normal(face),
-        albedo: surface.albedo,
+        albedo: surface.albedo.clone(),
         departure: Departure::Cap(face, Side::Lower),
     })
 }

@@ -28,6 +28,7 @@ pub mod pyramid;
 pub mod isosurface;
 // What a hyperplane contains.
 pub mod brdf;
+pub mod reflectance;
 pub mod polygon;
 pub mod luminaire;
 pub mod scene;

@@ -252,7 +252,8 @@ fn trace_photon<T: Tracer>(
                     bounces,
                     side,
                 });
-                (scene.surface.albedo, scene.normal(position.as_dvec3(), side), Departure::Surface(side))
+                let albedo = scene.surface.albedo.at(f64::from(photon.isovalue));
+                (albedo, scene.normal(position.as_dvec3(), side), Departure::Surface(side))
             }
             Target::Companion(n, side) => {
                 let companion = &scene.companions()[usize::from(n)];
@@ -265,7 +266,8 @@ fn trace_photon<T: Tracer>(
                     side,
                 });
                 let normal = companion.normal(position.as_dvec3(), side);
-                (companion.member.surface.albedo, normal, Departure::Companion(n, side))
+                let albedo = companion.member.surface.albedo.at(f64::from(photon.isovalue));
+                (albedo, normal, Departure::Companion(n, side))
             }
             Target::Cap(face, side) => {
                 // The texture of a cap is its outer side's.
@@ -274,7 +276,8 @@ fn trace_photon<T: Tracer>(
                 }
                 let n = scene.face_normal(face);
                 let n = if side == Side::Lower { n } else { -n };
-                (scene.face_surface(face).albedo, Some(n), Departure::Cap(face, side))
+                let albedo = scene.face_surface(face).albedo.at(f64::from(photon.isovalue));
+                (albedo, Some(n), Departure::Cap(face, side))
             }
             Target::Polygon(id) => {
                 let p = &scene.polygons()[id as usize];

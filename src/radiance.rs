@@ -133,7 +133,7 @@ pub fn sample_radiance<T: Tracer>(
                             (e.mean, e.variance)
                         }
                     };
-                    let albedo = scene.surface.albedo;
+                    let albedo = scene.surface.albedo.at(isovalue);
                     let scale = luminance(albedo) / std::f64::consts::PI;
                     Some(RadianceSample {
                         position,

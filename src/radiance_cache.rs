@@ -33,12 +33,13 @@ pub struct CacheSettings {
     pub seed: u64,
 }
 
-/// Radiance at the nodes of a field's lattice, per side; `None` where nothing looks.
+/// What a white surface would reflect at the nodes of a field's lattice, per side; `None` where nothing looks.
 type Nodes = [Option<Vec<[f32; 3]>>; 2];
 
 /// Outgoing radiance (reflected and, for emitting level sets, emitted) wherever a gather ray can land.
 pub struct RadianceCache {
-    /// Per field and side (lower, higher): RGB at each node, NaN where neither the node nor its surroundings hold a surface.
+    /// Per field and side (lower, higher): what a white surface would reflect at each node, NaN where neither the node nor
+    /// its surroundings hold a surface. The albedo is that of the hit: isovalues may differ much from node to node.
     nodes: Vec<Nodes>,
     /// What gather rays find: photons under the narrowest kernel, since many rays average their noise.
     flats: Vec<Option<FlatTexture>>,
@@ -66,12 +67,8 @@ impl RadianceCache {
         let rays = AtomicU64::new(0);
         let (flats, shown) =
             (0..flat::count(scene)).map(|n| fill_flat(scene, tracer, n, &photons.flat, settings, &rays)).unzip();
-        let mut cache = Self {
-            nodes: vec![[None, None]; scene.fields()],
-            flats,
-            shown: Some(shown),
-            rays: rays.into_inner(),
-        };
+        let mut cache =
+            Self { nodes: vec![[None, None]; scene.fields()], flats, shown: Some(shown), rays: rays.into_inner() };
         if with_nodes {
             cache.fill(scene, tracer, photons, estimate, settings, saved, tick);
         }
@@ -102,8 +99,8 @@ impl RadianceCache {
         self.rays += rays.into_inner();
     }
 
-    /// A cache of radiance known already: per side (lower, higher) RGB at the nodes of the scene's lattice, NaN where
-    /// unknown, and the flats' textures.
+    /// A cache of light known already: per side (lower, higher) irradiance / π at the nodes of the scene's lattice, NaN
+    /// where unknown, and the flats' radiance.
     pub fn from_parts(nodes: Nodes, flats: Vec<Option<FlatTexture>>) -> Self {
         Self { nodes: vec![nodes], flats, shown: None, rays: 0 }
     }
@@ -118,12 +115,15 @@ impl RadianceCache {
     pub fn lookup(&self, scene: &Scene, target: Target, position: DVec3, isovalue: f32, misses: &mut u64) -> DVec3 {
         match target {
             Target::Surface(side) => {
-                self.surface(scene.number(), &scene.field, side, position, misses).unwrap_or(scene.surface.emission)
+                let surface = &scene.surface;
+                let white = self.white(scene.number(), &scene.field, side, position, misses);
+                surface.albedo.at(f64::from(isovalue)) * white + surface.emission
             }
             Target::Companion(n, side) => {
                 let c = &scene.companions()[usize::from(n)];
-                let found = self.surface(c.number, &c.member.field, side, c.to_index(position), misses);
-                found.unwrap_or(c.member.surface.emission)
+                let surface = &c.member.surface;
+                let white = self.white(c.number, &c.member.field, side, c.to_index(position), misses);
+                surface.albedo.at(f64::from(isovalue)) * white + surface.emission
             }
             Target::Cap(_, Side::Higher) => DVec3::ZERO,
             Target::Cap(face, Side::Lower) => {
@@ -141,9 +141,9 @@ impl RadianceCache {
         self.flats[number].as_ref().map_or(DVec3::ZERO, |t| t.lookup([u, v, f64::from(isovalue)]))
     }
 
-    /// Trilinear over the filled nodes of the cell of field `number`; `None` if there are none.
-    fn surface(&self, number: usize, field: &Field, side: Side, position: DVec3, misses: &mut u64) -> Option<DVec3> {
-        let nodes = self.nodes.get(number)?[side.index()].as_ref()?;
+    /// What a white surface of field `number` would reflect: trilinear over the filled nodes of the cell.
+    fn white(&self, number: usize, field: &Field, side: Side, position: DVec3, misses: &mut u64) -> DVec3 {
+        let Some(nodes) = self.nodes.get(number).and_then(|n| n[side.index()].as_ref()) else { return DVec3::ZERO };
         let ([i, j, k], u) = field.locate(position);
         let (mut sum, mut weight) = (DVec3::ZERO, 0.0);
         for corner in 0..8 {
@@ -161,10 +161,10 @@ impl RadianceCache {
             weight += w;
         }
         if weight > 0.0 {
-            return Some(sum / weight);
+            return sum / weight;
         }
         *misses += 1;
-        None
+        DVec3::ZERO
     }
 
     /// The flats' radiance textures; `None` for flats that reflect nothing.
@@ -233,7 +233,7 @@ fn fill_nodes<T: Tracer>(
                 );
                 traced += direct.rays;
                 let indirect = map.irradiance(p, f64::from(isovalue), &mut scratch).mean;
-                sum += reflected(scene.surface.albedo, direct.mean + indirect) + scene.surface.emission;
+                sum += reflected(DVec3::ONE, direct.mean + indirect);
                 count += 1.0;
             }
             if count > 0.0 {
@@ -259,7 +259,7 @@ fn fill_flat<T: Tracer>(
     settings: &CacheSettings,
     rays: &AtomicU64,
 ) -> (Option<FlatTexture>, Option<FlatTexture>) {
-    let Some(flat) = flat::flat(scene, number).filter(|f| f.albedo != DVec3::ZERO) else { return (None, None) };
+    let Some(flat) = flat::flat(scene, number).filter(|f| !f.albedo.black()) else { return (None, None) };
     let dims = FlatTexture::resolution(flat.lengths(), settings.flat_resolution, settings.isovalue_resolution);
     let centres = FlatTexture::black(dims);
     let lattice = scene.lattice();
@@ -287,7 +287,11 @@ fn fill_flat<T: Tracer>(
     let per_texel = count as f64 / density.len() as f64;
     let texture = |kernel: Kernel, least: f64| {
         let indirect = smooth_twice(&density, dims, kernel.passes(per_texel));
-        let light = direct.iter().zip(indirect).map(|(d, i)| reflected(flat.albedo, (*d + i).max(DVec3::splat(least))));
+        let light = direct
+            .iter()
+            .zip(indirect)
+            .enumerate()
+            .map(|(n, (d, i))| reflected(flat.albedo.at(centres.centre(n)[2]), (*d + i).max(DVec3::splat(least))));
         Some(FlatTexture { dims, texels: light.map(|l| l.as_vec3().to_array()).collect() })
     };
     // A texture to be averaged is not clamped at 0: that would brighten what few photons reach.

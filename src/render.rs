@@ -161,9 +161,7 @@ fn radiance(baked: &BakedVolume, ray: &FlattenedRay, hit: FlattenedHit) -> Optio
         Target::Surface(side) => baked.radiance(side, p),
         Target::Companion(..) => None,
         Target::Cap(_, Side::Higher) => Some(DVec3::ZERO),
-        Target::Cap(face, Side::Lower) => {
-            texture(flat::cap(scene, face), flat::face_texture(scene, face, p))
-        }
+        Target::Cap(face, Side::Lower) => texture(flat::cap(scene, face), flat::face_texture(scene, face, p)),
         Target::Polygon(id) => {
             let polygon = &scene.polygons()[id as usize];
             // From behind, only luminaires are seen: black.
@@ -180,13 +178,14 @@ fn radiance(baked: &BakedVolume, ray: &FlattenedRay, hit: FlattenedHit) -> Optio
 /// Headlight shading, already exposed: ρ (0.15 + 0.85 |cos|).
 fn local(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit, direction: DVec3) -> DVec3 {
     let p = ray.at(hit.t);
+    let isovalue = f64::from(ray.isovalue);
     let (albedo, normal) = match hit.target {
-        Target::Surface(side) => (scene.surface.albedo, scene.normal(p, side)),
+        Target::Surface(side) => (scene.surface.albedo.at(isovalue), scene.normal(p, side)),
         Target::Companion(n, side) => {
             let companion = &scene.companions()[usize::from(n)];
-            (companion.member.surface.albedo, companion.normal(p, side))
+            (companion.member.surface.albedo.at(isovalue), companion.normal(p, side))
         }
-        Target::Cap(face, _) => (scene.face_surface(face).albedo, Some(scene.face_normal(face))),
+        Target::Cap(face, _) => (scene.face_surface(face).albedo.at(isovalue), Some(scene.face_normal(face))),
         Target::Polygon(id) => {
             let polygon = &scene.polygons()[id as usize];
             if polygon.emission != DVec3::ZERO {

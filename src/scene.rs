@@ -12,6 +12,7 @@ use crate::field::Field;
 use crate::flattened::{Departure, FlattenedRay, MAX_POLYGONS, MAX_TARGETS, Side};
 use crate::luminaire::unoccluded;
 use crate::polygon::Polygon;
+use crate::reflectance::Reflectance;
 use crate::volume::Lattice;
 use glam::{DVec3, Vec3};
 use std::sync::Arc;
@@ -25,11 +26,11 @@ pub enum Boundary {
     Capped,
 }
 
-/// The isosurfaces' material and sides; the same for every isovalue.
+/// The isosurfaces' material and sides.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Surface {
-    /// Diffuse reflectance per channel on both sides, [0, 1].
-    pub albedo: DVec3,
+    /// Diffuse reflectance per channel on both sides, [0, 1], by isovalue.
+    pub albedo: Reflectance,
     /// Emitted radiance per channel, from both sides; 0 for ordinary surfaces.
     pub emission: DVec3,
     /// The side whose radiance is stored first.
@@ -40,7 +41,7 @@ pub struct Surface {
 
 impl Default for Surface {
     fn default() -> Self {
-        Self { albedo: DVec3::splat(0.75), emission: DVec3::ZERO, outside: Side::Lower, both_sides: false }
+        Self { albedo: DVec3::splat(0.75).into(), emission: DVec3::ZERO, outside: Side::Lower, both_sides: false }
     }
 }
 
@@ -73,8 +74,10 @@ pub struct Scene {
 /// Whether a field can stand among `polygons`.
 fn check(surface: &Surface, boundary: Boundary, lattice: &Lattice, polygons: &[Polygon]) -> Result<()> {
     let fail = |what: String| Err(Error::Invalid(what));
-    if !(surface.albedo.cmpge(DVec3::ZERO).all() && surface.albedo.cmple(DVec3::ONE).all()) {
-        return fail(format!("surface albedo {}: every channel must lie in [0, 1]", surface.albedo));
+    for (_, albedo) in surface.albedo.stops() {
+        if !(albedo.cmpge(DVec3::ZERO).all() && albedo.cmple(DVec3::ONE).all()) {
+            return fail(format!("surface albedo {albedo}: every channel must lie in [0, 1]"));
+        }
     }
     if !(surface.emission.cmpge(DVec3::ZERO).all() && surface.emission.is_finite()) {
         return fail(format!("surface emission {}: must be finite and not negative", surface.emission));
@@ -199,10 +202,10 @@ impl Scene {
         lights().map(|p| p.emission * unoccluded(p, centre, n)).sum::<DVec3>().max_element()
     }
 
-    /// Display exposure: rgb = radiance × π / (ρ_max E₀); 1 where that is undefined.
+    /// Display exposure: rgb = radiance × π / (ρ_max E₀), ρ_max over all channels and the sweep; 1 where that is undefined.
     pub fn exposure(&self) -> f64 {
-        let brightest = self.companions.iter().map(|c| c.member.surface.albedo.max_element());
-        let brightest = brightest.fold(self.surface.albedo.max_element(), f64::max);
+        let brightest = self.companions.iter().map(|c| c.member.surface.albedo.greatest().max_element());
+        let brightest = brightest.fold(self.surface.albedo.greatest().max_element(), f64::max);
         let scale = brightest * self.reference_irradiance() / std::f64::consts::PI;
         if scale > 0.0 { 1.0 / scale } else { 1.0 }
     }

@@ -9,6 +9,7 @@ use crate::error::{Error, Result};
 use crate::field::{Field, Sweep};
 use crate::flattened::Side;
 use crate::polygon::Polygon;
+use crate::reflectance::Reflectance;
 use crate::scene::{Boundary, Scene, Surface, cornell_box, read_obj};
 use crate::volume::generate::Generator;
 use crate::volume::raw::RawLayout;
@@ -148,6 +149,64 @@ impl std::str::FromStr for Rgb {
     }
 }
 
+/// `albedo`: a colour, or one at each of some isovalues.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Albedo {
+    /// The same at every isovalue.
+    Uniform(Rgb),
+    /// Linear in between, constant beyond.
+    Stops(Vec<ColourStop>),
+}
+
+/// A colour at an isovalue.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ColourStop {
+    /// In source units.
+    pub isovalue: f64,
+    /// Linear.
+    pub colour: Rgb,
+}
+
+impl Albedo {
+    /// In units of the sweep.
+    ///
+    /// # Errors
+    /// `Invalid` as [`Reflectance::new`].
+    fn reflectance(&self, sweep: Sweep) -> Result<Reflectance> {
+        match self {
+            Albedo::Uniform(colour) => Ok(colour.vector().into()),
+            Albedo::Stops(stops) => {
+                Reflectance::new(stops.iter().map(|s| (sweep.to_unit(s.isovalue), s.colour.vector())).collect())
+            }
+        }
+    }
+}
+
+impl std::str::FromStr for Albedo {
+    type Err = String;
+
+    fn from_str(text: &str) -> std::result::Result<Self, String> {
+        text.parse().map(Albedo::Uniform)
+    }
+}
+
+impl<'de> Deserialize<'de> for Albedo {
+    fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> std::result::Result<Self, D::Error> {
+        // By hand, since an untagged enum would only say that nothing fits.
+        let fail = |e: toml::de::Error| serde::de::Error::custom(e.message());
+        let value = toml::Value::deserialize(deserializer)?;
+        match value.as_array() {
+            Some(list) if list.iter().any(toml::Value::is_table) => value.try_into().map(Albedo::Stops).map_err(fail),
+            _ => value.try_into().map(Albedo::Uniform).map_err(|_| {
+                serde::de::Error::custom(
+                    "albedo: a colour is one number or [red, green, blue]; colours by isovalue are a list of { isovalue, colour }",
+                )
+            }),
+        }
+    }
+}
+
 /// Which side of the level sets is outside.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
@@ -183,7 +242,7 @@ pub enum BoundaryName {
 pub struct SurfaceOptions {
     /// Diffuse reflectance of the isosurfaces: one number or R,G,B in [0, 1] (default 0.75)
     #[arg(long, value_name = "RGB")]
-    pub albedo: Option<Rgb>,
+    pub albedo: Option<Albedo>,
     /// Radiance that the isosurfaces emit (default 0)
     #[arg(long, value_name = "RGB")]
     pub emission: Option<Rgb>,
@@ -308,7 +367,8 @@ pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
     let key = if file.surroundings.kind.is_some() { "kind" } else { "margin" };
     let polygons =
         surroundings(&file.surroundings, &options.surroundings, &folder, &field).map_err(blame(key, boxed))?;
-    let (surface, boundary) = surface(&file.surface, &options.surface);
+    let flag = options.surface.albedo.is_some();
+    let (surface, boundary) = surface(&file.surface, &options.surface, sweep).map_err(blame("albedo", flag))?;
     let scene =
         Scene::new(field, surface, boundary, polygons).map_err(|e| if is_scene { e.in_file(input) } else { e })?;
     Ok(Loaded { volume, scene, bake: file.bake })
@@ -345,14 +405,17 @@ fn surroundings(file: &BoxOptions, flags: &BoxOptions, folder: &Path, field: &Fi
     }
 }
 
-fn surface(file: &SurfaceOptions, flags: &SurfaceOptions) -> (Surface, Boundary) {
+fn surface(file: &SurfaceOptions, flags: &SurfaceOptions, sweep: Sweep) -> Result<(Surface, Boundary)> {
     let default = Surface::default();
     let outside = flags.outside.or(file.outside).map_or(default.outside, |o| match o {
         OutsideName::Lower => Side::Lower,
         OutsideName::Higher => Side::Higher,
     });
     let surface = Surface {
-        albedo: flags.albedo.or(file.albedo).map_or(default.albedo, Rgb::vector),
+        albedo: match flags.albedo.as_ref().or(file.albedo.as_ref()) {
+            Some(albedo) => albedo.reflectance(sweep)?,
+            None => default.albedo,
+        },
         emission: flags.emission.or(file.emission).map_or(default.emission, Rgb::vector),
         outside,
         both_sides: flags.sides.or(file.sides) == Some(SidesName::Both),
@@ -361,7 +424,7 @@ fn surface(file: &SurfaceOptions, flags: &SurfaceOptions) -> (Surface, Boundary)
         Some(BoundaryName::Capped) => Boundary::Capped,
         _ => Boundary::Open,
     };
-    (surface, boundary)
+    Ok((surface, boundary))
 }
 
 #[cfg(test)]
@@ -387,12 +450,41 @@ mod tests {
                     grid = \"2x\"\npreset = \"preview\"\n";
         std::fs::write(&path, text).unwrap();
         let loaded = load(&path, &SceneOptions::default()).unwrap();
-        assert_eq!(loaded.scene.surface.albedo, DVec3::new(0.1, 0.2, 0.3));
+        assert_eq!(loaded.scene.surface.albedo.uniform(), Some(DVec3::new(0.1, 0.2, 0.3)));
         assert_eq!((loaded.scene.surface.outside, loaded.scene.surface.both_sides), (Side::Higher, true));
         assert_eq!((loaded.scene.boundary, loaded.bake.gather_rays), (Boundary::Capped, Some(0)));
         assert_eq!(loaded.scene.field.sweep().hi(), 95.0);
         let options = SceneOptions { isovalues: Some(vec![10.0, 20.0]), ..SceneOptions::default() };
         assert_eq!(load(&path, &options).unwrap().scene.field.sweep().lo(), 10.0, "flags win");
+    }
+
+    #[test]
+    fn colours_by_isovalue() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scene.toml");
+        let text = "isovalues = [10, 90]\n[volume]\ngenerator = \"bumps\"\nsize = 9\n[surface]\nalbedo = [\n  \
+                    { isovalue = 50, colour = 0.5 },\n  { isovalue = 30, colour = [0.1, 0.2, 0.3] },\n]\n";
+        std::fs::write(&path, text).unwrap();
+        let albedo = |options: &SceneOptions| load(&path, options).unwrap().scene.surface.albedo;
+        let by_isovalue = albedo(&SceneOptions::default());
+        assert_eq!(by_isovalue.at(0.0), DVec3::new(0.1, 0.2, 0.3));
+        assert!(by_isovalue.at(0.375).abs_diff_eq(DVec3::new(0.3, 0.35, 0.4), 1e-12), "halfway");
+        let grey = SurfaceOptions { albedo: Some("0.2".parse().unwrap()), ..SurfaceOptions::default() };
+        let options = SceneOptions { surface: grey, ..SceneOptions::default() };
+        assert_eq!(albedo(&options).uniform(), Some(DVec3::splat(0.2)), "flags win");
+        let of = |albedo: &str| {
+            error_of(&format!("[volume]\ngenerator = \"bumps\"\nsize = 9\n[surface]\nalbedo = {albedo}\n"))
+        };
+        for (albedo, says) in [
+            ("[0.1, 0.2]", "list of { isovalue, colour }"),
+            ("\"red\"", "list of { isovalue, colour }"),
+            ("[{ isovalue = 3, color = 0.5 }]", "did you mean `colour`?"),
+            ("[{ isovalue = 3, colour = 0.5 }, { isovalue = 3, colour = 0.6 }]", "different"),
+            ("[{ isovalue = 3, colour = 1.5 }]", "[0, 1]"),
+        ] {
+            let e = of(albedo);
+            assert!(e.contains("scene.toml:") && e.contains(says) && !e.contains('\n'), "{albedo}: {e}");
+        }
     }
 
     #[test]

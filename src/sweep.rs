@@ -29,6 +29,7 @@ use crate::flattened::Side;
 use crate::scene::{Boundary, Scene};
 use flats::Flats;
 use gather::Pass;
+use glam::DVec3;
 use grid::{Geometry, Planes};
 use half::Half4;
 use rayon::prelude::*;
@@ -316,13 +317,20 @@ impl Run<'_> {
         scale: [f32; 3],
     ) -> (Vec<Vec<Half4>>, f32) {
         let surface = &self.scene.surface;
-        let rho: [f32; 3] = std::array::from_fn(|c| (surface.albedo[c] / std::f64::consts::PI) as f32);
+        let over_pi =
+            |albedo: DVec3| -> [f32; 3] { std::array::from_fn(|c| (albedo[c] / std::f64::consts::PI) as f32) };
+        // Of every stop: also a bound for nodes just outside the sweep.
+        let greatest = over_pi(surface.albedo.stops().iter().fold(DVec3::ZERO, |m, s| m.max(s.1)));
+        let by_node: Option<Vec<[f32; 3]>> = (surface.albedo.stops().len() > 1).then(|| {
+            let h = self.geometry.h.par_iter().with_min_len(1 << 12);
+            h.map(|&h| over_pi(surface.albedo.at(f64::from(h)))).collect()
+        });
         let emission = surface.emission.as_vec3().to_array();
         let mut most = flats.greatest();
         for (s, direct) in direct.iter().enumerate() {
             for c in 0..3 {
                 let indirect = indirect.map_or(0.0, |e| scale[c] * grid::greatest(&e[s][c]));
-                most = most.max(emission[c] + rho[c] * (grid::greatest(&direct[c]) + indirect));
+                most = most.max(emission[c] + greatest[c] * (grid::greatest(&direct[c]) + indirect));
             }
         }
         let unit = half::scale(most);
@@ -334,11 +342,19 @@ impl Run<'_> {
                 let range = chunk << 12..(chunk << 12) + b.len();
                 let lit = &self.geometry.lit[range.clone()];
                 for c in 0..3 {
-                    let (le, rho) = (unit * emission[c], unit * rho[c]);
+                    let (le, rho) = (unit * emission[c], unit * greatest[c]);
                     let direct = &direct[s][c][range.clone()];
+                    let indirect = indirect.map(|e| &e[s][c][range.clone()]);
+                    if let Some(by_node) = &by_node {
+                        for (n, (b, rho)) in b.iter_mut().zip(&by_node[range.clone()]).enumerate().filter(|n| lit[n.0])
+                        {
+                            let e = direct[n] + indirect.map_or(0.0, |e| scale[c] * e[n]);
+                            b[c] = half::encode(le + unit * rho[c] * e);
+                        }
+                        continue;
+                    }
                     match indirect {
                         Some(e) => {
-                            let e = &e[s][c][range.clone()];
                             for (((b, d), e), lit) in b.iter_mut().zip(direct).zip(e).zip(lit) {
                                 b[c] = half::encode(if *lit { le + rho * (d + scale[c] * e) } else { 0.0 });
                             }
@@ -437,12 +453,16 @@ impl Totals {
     #[allow(clippy::cast_possible_truncation, reason = "albedo")]
     fn add(&mut self, r: &Replicate, scene: &Scene) {
         self.count += 1.0;
-        let luminance: [f32; 3] =
-            std::array::from_fn(|c| [0.2126, 0.7152, 0.0722][c] * scene.surface.albedo[c] as f32 / PI);
+        let luminance = |albedo: DVec3| -> [f32; 3] {
+            std::array::from_fn(|c| [0.2126, 0.7152, 0.0722][c] * albedo[c] as f32 / PI)
+        };
+        let (albedo, h) = (&scene.surface.albedo, scene.field.samples());
+        let same = (albedo.stops().len() == 1).then(|| luminance(albedo.at(0.0)));
         for (s, spread) in self.spread.iter_mut().enumerate() {
             let (d, e) = (&r.direct[s], &r.indirect[s]);
             let count = self.count;
             spread.par_iter_mut().enumerate().with_min_len(1 << 12).for_each(|(i, m)| {
+                let luminance = same.unwrap_or_else(|| luminance(albedo.at(f64::from(h[i]))));
                 let x: f32 = (0..3).map(|c| luminance[c] * (d[c][i] + e[c][i])).sum();
                 let old = x - m[0];
                 m[0] += old / count;

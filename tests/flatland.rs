@@ -162,7 +162,7 @@ fn extruded(flat: &FlatScene, slices: usize) -> Scene {
             polygons.push(Polygon::new(&s.name, v, s.albedo, s.emission).unwrap());
         }
     }
-    let surface = Surface { albedo: flat.albedo, ..Surface::default() };
+    let surface = Surface { albedo: flat.albedo.into(), ..Surface::default() };
     Scene::new(field, surface, Boundary::Open, polygons).unwrap()
 }
 

@@ -149,7 +149,7 @@ fn integrating_sphere() {
     let square = vec![corner(-1., -1.), corner(-1., 1.), corner(1., 1.), corner(1., -1.)];
     let light = Polygon::new("light", square, DVec3::ZERO, DVec3::ONE).unwrap();
     let flux = std::f64::consts::PI * light.area();
-    let scene = balls(49, Surface { albedo: DVec3::splat(rho), ..Surface::default() }, vec![light]);
+    let scene = balls(49, Surface { albedo: DVec3::splat(rho).into(), ..Surface::default() }, vec![light]);
     let device = device();
     let c = (radius * radius) as f32;
     let tracer = SurfaceTracer::new(&device, &scene, c, 1).unwrap();
@@ -178,7 +178,7 @@ fn furnaces() {
     // Inside a closed level set of emission 1 − ρ and albedo ρ the radiance is 1.
     let (device, c) = (device(), 0.5);
     let rho = DVec3::new(0.7, 0.3, 0.5);
-    let scene = balls(25, Surface { albedo: rho, emission: DVec3::ONE - rho, ..Surface::default() }, Vec::new());
+    let scene = balls(25, Surface { albedo: rho.into(), emission: DVec3::ONE - rho, ..Surface::default() }, Vec::new());
     let tracer = SurfaceTracer::new(&device, &scene, c, 1).unwrap();
     let mesh = SurfaceMesh::extract(&scene, c, 1).unwrap();
     let settings = ReferenceSettings { samples: 512, batches: 16, vertices: Some(200), ..ReferenceSettings::default() };
@@ -206,7 +206,7 @@ fn furnaces() {
             walls.push(Polygon::new("wall", v, DVec3::ZERO, DVec3::ONE).unwrap());
         }
     }
-    let surface = Surface { albedo: rho, outside: Side::Higher, ..Surface::default() };
+    let surface = Surface { albedo: rho.into(), outside: Side::Higher, ..Surface::default() };
     let scene = balls(25, surface, walls);
     let tracer = GraphTracer::new(&device, &scene).unwrap();
     let mesh = SurfaceMesh::extract(&scene, c, 1).unwrap();

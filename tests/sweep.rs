@@ -91,7 +91,7 @@ fn exact_occlusion(tracer: &GraphTracer, scene: &Scene, o: usize, rays: u32) -> 
 
 #[test]
 fn swept_occlusion_agrees_with_exact_rays() {
-    let surface = Surface { albedo: DVec3::ZERO, emission: DVec3::ONE, ..Surface::default() };
+    let surface = Surface { albedo: DVec3::ZERO.into(), emission: DVec3::ONE, ..Surface::default() };
     let scene = Scene::new(bumps(101), surface, Boundary::Open, Vec::new()).unwrap();
     let device = Device::new(1).unwrap();
     let tracer = GraphTracer::new(&device, &scene).unwrap();
@@ -124,7 +124,7 @@ fn integrating_sphere() {
     let v = [(-s, -s), (-s, s), (s, s), (s, -s)].map(|(x, y)| DVec3::new(x, y, 0.004)).to_vec();
     let light = Polygon::new("light", v, DVec3::ZERO, DVec3::ONE).unwrap();
     let flux = PI * light.area();
-    let surface = Surface { albedo: DVec3::new(0.5, 0.8, 0.2), ..Surface::default() };
+    let surface = Surface { albedo: DVec3::new(0.5, 0.8, 0.2).into(), ..Surface::default() };
     let scene = Scene::new(field, surface, Boundary::Open, vec![light]).unwrap();
     let got =
         run(&scene, SweepSettings { directions: 128, light_points: 16, target: 1e-4, ..SweepSettings::default() });
@@ -174,7 +174,7 @@ fn furnaces() {
     // Everything emits what it absorbs: radiance 1 everywhere, whatever the level sets look like.
     let rho = 0.6;
     let a = 0.5;
-    let surface = Surface { albedo: DVec3::splat(rho), emission: DVec3::splat(1.0 - rho), ..Surface::default() };
+    let surface = Surface { albedo: DVec3::splat(rho).into(), emission: DVec3::splat(1.0 - rho), ..Surface::default() };
     let f = bumps(41);
     let walls = emissive_box(f.lattice(), a, 1.0 - a);
     let scene = Scene::new(f, surface, Boundary::Open, walls).unwrap();
@@ -252,7 +252,7 @@ fn a_long_wall_occludes_as_it_should() {
     for lattice in [aligned, permuted] {
         // Inside: below z = 6 − c or behind x = 20 + c … up to z = 46: one kink, the same shape for every c.
         let f = field(lattice, (-2.0, 2.0), |x| (6.0 - x.z).max((x.x - 40.0).min(46.0 - x.z)));
-        let surface = Surface { albedo: DVec3::ZERO, emission: DVec3::ONE, ..Surface::default() };
+        let surface = Surface { albedo: DVec3::ZERO.into(), emission: DVec3::ONE, ..Surface::default() };
         let scene = Scene::new(f, surface, Boundary::Open, Vec::new()).unwrap();
         let got = run(&scene, SweepSettings { directions: 2048, ..ONE_BOUNCE });
         let mut errors = Vec::new();

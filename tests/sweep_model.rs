@@ -102,7 +102,7 @@ fn what_level_sets_send_is_what_walls_and_level_sets_gather() {
     let lattice = cube(61, 0.0, 1.0);
     // The sweep ends above what reaches Ω's faces, so that every level set is closed.
     let f = field(lattice, (20.0, 95.0), bumps);
-    let surface = Surface { albedo: DVec3::ZERO, emission: DVec3::ONE, ..Surface::default() };
+    let surface = Surface { albedo: DVec3::ZERO.into(), emission: DVec3::ONE, ..Surface::default() };
     let walls = closed_box(f.lattice(), 0.0, 0.5, 0.0);
     let scene = Scene::new(f, surface, Boundary::Open, walls).unwrap();
     let cell = scene.lattice().cell_volume();
@@ -135,7 +135,7 @@ fn what_level_sets_send_is_what_walls_and_level_sets_gather() {
 fn a_convex_level_set_in_a_furnace_shows_its_albedo() {
     let (rho, lattice) = (0.3, cube(41, -1.0, 1.0));
     let f = field(lattice, (-0.8, -0.2), |x| -(x.length_squared() + 0.3 * x.x * x.x));
-    let surface = Surface { albedo: DVec3::splat(rho), ..Surface::default() };
+    let surface = Surface { albedo: DVec3::splat(rho).into(), ..Surface::default() };
     let walls = closed_box(f.lattice(), 0.0, 0.0, 1.0);
     let scene = Scene::new(f, surface, Boundary::Open, walls).unwrap();
     let got = run(&scene, SweepSettings { light_points: 64, ..ONE_BOUNCE });
@@ -205,7 +205,7 @@ fn a_floor_sees_a_long_wall_as_it_should() {
         let f = field(lattice, (-2.0, 2.0), |x| (x.x - 50.0).min(height - x.z));
         let v = [(0., 0.), (60., 0.), (60., 600.), (0., 600.)].map(|(x, y)| DVec3::new(x, y, 0.0)).to_vec();
         let floor = Polygon::new("floor", v, DVec3::splat(0.5), DVec3::ZERO).unwrap();
-        let surface = Surface { albedo: DVec3::ZERO, emission: DVec3::ONE, ..Surface::default() };
+        let surface = Surface { albedo: DVec3::ZERO.into(), emission: DVec3::ONE, ..Surface::default() };
         let scene = Scene::new(f, surface, Boundary::Open, vec![floor]).unwrap();
         // Few lines meet each texel: what counts is the mean.
         let settings = SweepSettings { directions: 1024, replicates: 8, flat_resolution: (150, 8), ..ONE_BOUNCE };
@@ -234,7 +234,7 @@ fn oblique_axes_change_nothing() {
         DVec3::new(0.0, -0.004, 0.011),
     );
     let lattice = Lattice::new([71, 61, 91], DVec3::new(0.95, 0.15, 0.0), axes).unwrap();
-    let surface = Surface { albedo: DVec3::ZERO, emission: DVec3::ONE, ..Surface::default() };
+    let surface = Surface { albedo: DVec3::ZERO.into(), emission: DVec3::ONE, ..Surface::default() };
     let scene = Scene::new(field(lattice, (3.6, 95.0), bumps), surface, Boundary::Open, Vec::new()).unwrap();
     let device = Device::new(1).unwrap();
     let tracer = GraphTracer::new(&device, &scene).unwrap();
@@ -298,7 +298,7 @@ fn caps_close_level_sets() {
     let (rho, lattice) = (0.4, cube(25, 0.0, 1.0));
     let f = field(lattice, (0.2, 0.8), |x| x.x + 0.1 * x.y);
     let walls = closed_box(f.lattice(), 0.3, 0.0, 1.0);
-    let surface = Surface { albedo: DVec3::splat(rho), ..Surface::default() };
+    let surface = Surface { albedo: DVec3::splat(rho).into(), ..Surface::default() };
     let scene = Scene::new(f, surface, Boundary::Capped, walls).unwrap();
     let got = run(&scene, SweepSettings { light_points: 64, ..ONE_BOUNCE });
     let errors: Vec<f64> = nodes(&scene, 1).iter().map(|&o| rho * (radiosity(&got, o) - 1.0)).collect();

@@ -32,7 +32,7 @@ pub fn interpolation_floor<T: Tracer>(
 ) -> Result<Accuracy> {
     let direct = |r: &Receiver, index: u64| {
         let e = direct_irradiance(scene, tracer, r, shadow_rays, (0, Stage::Direct, index)).mean;
-        reflected(scene.surface.albedo, e)
+        reflected(scene.surface.albedo.at(f64::from(r.isovalue)), e)
     };
     let chosen = subset(mesh.local.len(), vertices);
     let interpolated = through_grid(scene, mesh, &chosen, factor, &direct)?;

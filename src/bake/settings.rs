@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::illumination_grid::GridSize;
-use crate::photon_map::{EstimateSettings, Normalisation};
+use crate::photon_map::{EstimateSettings, Estimator, Normalisation};
 use crate::sampling::Strategy;
 use crate::sweep::SweepSettings;
 use serde::{Deserialize, Serialize};
@@ -94,7 +94,10 @@ pub struct BakeOptions {
     /// Reflections after which a photon is cut off (default: Russian roulette only)
     #[arg(long, value_name = "N")]
     pub bounces: Option<u16>,
-    /// Photons per irradiance estimate (k nearest)
+    /// Which photons an irradiance estimate looks at: bins of the lattice, the k nearest, or all within a radius
+    #[arg(long, value_name = "NAME")]
+    pub estimator: Option<Estimator>,
+    /// Photons per irradiance estimate (the bins': at least; within a radius: on average)
     #[arg(long, value_name = "K")]
     pub photons_per_estimate: Option<usize>,
     /// Largest isovalue difference of a photon to its estimate, as a fraction of the sweep
@@ -159,6 +162,7 @@ impl BakeOptions {
             light_points: self.light_points.or(other.light_points),
             photons: self.photons.or(other.photons),
             bounces: self.bounces.or(other.bounces),
+            estimator: self.estimator.or(other.estimator),
             photons_per_estimate: self.photons_per_estimate.or(other.photons_per_estimate),
             tau: self.tau.or(other.tau),
             samples: self.samples.or(other.samples),
@@ -189,6 +193,8 @@ pub struct BakeSettings {
     pub photons: u64,
     /// Reflections after which a photon is cut off.
     pub bounces: u16,
+    /// Which photons an estimate looks at.
+    pub estimator: Estimator,
     /// Photons per estimate.
     pub photons_per_estimate: usize,
     /// Isovalue window of an estimate.
@@ -254,6 +260,7 @@ impl BakeSettings {
             light_points: o.light_points.unwrap_or(light_points),
             photons: o.photons.unwrap_or(photons),
             bounces: o.bounces.unwrap_or(u16::MAX),
+            estimator: o.estimator.unwrap_or_default(),
             photons_per_estimate: o.photons_per_estimate.unwrap_or(64),
             tau: o.tau.unwrap_or(EstimateSettings::default().tau),
             samples: o.samples,
@@ -309,6 +316,7 @@ impl BakeSettings {
 
     pub(super) fn estimate(&self) -> EstimateSettings {
         EstimateSettings {
+            estimator: self.estimator,
             photons: self.photons_per_estimate,
             tau: self.tau,
             normalisation: self.normalisation,

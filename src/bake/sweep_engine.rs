@@ -12,7 +12,7 @@ use crate::mask::Mask;
 use crate::progress::Progress;
 use crate::radiance::{Indirect, sample_radiance};
 use crate::radiance_cache::RadianceCache;
-use crate::scene::Scene;
+use crate::scene::{Scene, Surface};
 use crate::sweep::{SweptSide, sweep};
 use crate::volume::Lattice;
 use glam::{DVec3, Vec3};
@@ -50,10 +50,10 @@ pub(super) fn light(
     lit.sweep_queries = swept.counts.gather_rays + swept.counts.shadow_rays;
 
     // What the sweep knows is also what rays from the other points gather.
-    let radiance: Vec<Vec<[f32; 3]>> = swept.sides.iter().map(|s| outgoing(scene, masks, s)).collect();
+    let white: Vec<Vec<[f32; 3]>> = swept.sides.iter().map(|s| white(masks, s)).collect();
     let nodes = [Side::Lower, Side::Higher].map(|side| {
         let stored = swept.sides.iter().position(|s| s.side == side)?;
-        Some(widened(lattice, masks, &radiance[stored]))
+        Some(widened(lattice, masks, &white[stored]))
     });
     let cache = RadianceCache::from_parts(nodes, swept.flats);
 
@@ -63,7 +63,7 @@ pub(super) fn light(
     let begun = Instant::now();
     let (at, owners) = at_points(&scene.field, lattice, settings.seed, |o| masks[o] == Mask::Filled);
     let mut sides = Vec::new();
-    for (s, radiance) in swept.sides.iter().zip(radiance) {
+    for (s, white) in swept.sides.iter().zip(white) {
         let stage = progress.stage("samples", at.len() as u64);
         let indirect = Indirect::Gather(&cache, settings.gather_rays.max(1));
         let (shadow_rays, seed) = (settings.shadow_rays, settings.seed);
@@ -76,7 +76,7 @@ pub(super) fn light(
         lit.samples += at.len() as u64 - sampled.without_gradient;
         lit.without_gradient += sampled.without_gradient;
         let mut grid = collect(masks, &owners, &sampled.samples);
-        merge(&mut grid, masks, radiance, &s.std_error);
+        merge(&mut grid, masks, &outgoing(scene, white), &s.std_error);
         sides.push((s.side, grid));
     }
     lit.fields.push(sides);
@@ -85,8 +85,18 @@ pub(super) fn light(
     Ok(lit)
 }
 
-/// Outgoing radiance at valid nodes, NaN elsewhere.
-fn outgoing(scene: &Scene, masks: &[Mask], s: &SweptSide) -> Vec<[f32; 3]> {
+/// Outgoing radiance at nodes of which `white` tells what a white surface would reflect.
+fn outgoing(scene: &Scene, mut white: Vec<[f32; 3]>) -> Vec<[f32; 3]> {
+    let Surface { albedo, emission, .. } = &scene.surface;
+    white.par_iter_mut().zip(scene.field.samples()).with_min_len(1 << 14).for_each(|(x, &h)| {
+        let radiance = albedo.at(f64::from(h)) * DVec3::from_array(x.map(f64::from)) + emission;
+        *x = radiance.as_vec3().to_array();
+    });
+    white
+}
+
+/// What a white surface would reflect at valid nodes, NaN elsewhere.
+fn white(masks: &[Mask], s: &SweptSide) -> Vec<[f32; 3]> {
     let vector = |v: [f32; 3]| DVec3::from_array(v.map(f64::from));
     (0..masks.len())
         .into_par_iter()
@@ -95,7 +105,7 @@ fn outgoing(scene: &Scene, masks: &[Mask], s: &SweptSide) -> Vec<[f32; 3]> {
                 return [f32::NAN; 3];
             }
             let e = vector(s.direct[o]) + vector(s.indirect[o]);
-            (reflected(scene.surface.albedo, e) + scene.surface.emission).as_vec3().to_array()
+            reflected(DVec3::ONE, e).as_vec3().to_array()
         })
         .collect()
 }
@@ -127,8 +137,8 @@ fn widened(lattice: &Lattice, masks: &[Mask], nodes: &[[f32; 3]]) -> Vec<[f32; 3
 }
 
 /// Puts what the sweep knows over what rays filled.
-fn merge(grid: &mut IlluminationGrid, masks: &[Mask], swept: Vec<[f32; 3]>, std_error: &[f32]) {
-    for (o, radiance) in swept.into_iter().enumerate().filter(|(o, _)| masks[*o] == Mask::Valid) {
+fn merge(grid: &mut IlluminationGrid, masks: &[Mask], swept: &[[f32; 3]], std_error: &[f32]) {
+    for (o, &radiance) in swept.iter().enumerate().filter(|(o, _)| masks[*o] == Mask::Valid) {
         grid.radiance[o] = radiance;
         grid.std_error[o] = std_error.get(o).copied().unwrap_or(0.0);
         grid.mask[o] = Mask::Valid;

@@ -11,7 +11,7 @@ use std::path::PathBuf;
 
 #[derive(clap::Args, Debug)]
 #[command(after_help = "\
-Colours are linear radiance × π / (albedo × E0), clamped to [0, 1]; percent_rms = 100 sqrt(mean |difference|²) over the
+Colours are linear radiance × π / (largest albedo × E0), clamped to [0, 1]; percent_rms = 100 sqrt(mean |difference|²) over the
 reference's vertices, the squared Euclidean norm over three channels (BB09's printed formula leaves the square out).
 One reference adds its own noise to the result (noise_floor); two of different seeds do not.
 

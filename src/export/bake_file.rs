@@ -10,6 +10,7 @@ use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, local_position};
 use crate::polygon::Polygon;
+use crate::reflectance::Reflectance;
 use crate::scene::{Boundary, Scene, Surface};
 use crate::volume::vti::{VtiArray, VtiFile, VtiWriter};
 use crate::volume::{Lattice, Samples, Volume};
@@ -29,7 +30,8 @@ pub const SPACE: &str = "space";
 struct Description {
     isovalues: [f64; 2],
     exposure: f64,
-    albedo: DVec3,
+    /// Stops, if any, in units of the sweep.
+    albedo: Reflectance,
     emission: DVec3,
     outside: String,
     both_sides: bool,
@@ -97,7 +99,7 @@ pub fn write(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
     let description = Description {
         isovalues: [sweep.lo(), sweep.hi()],
         exposure: bake.exposure,
-        albedo: scene.surface.albedo,
+        albedo: scene.surface.albedo.clone(),
         emission: scene.surface.emission,
         outside: if scene.surface.outside == Side::Lower { "lower" } else { "higher" }.into(),
         both_sides: scene.surface.both_sides,

@@ -44,7 +44,7 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
                 self.incoming(scene.ray(receiver.position, direction, receiver.isovalue, receiver.departure), &mut rng);
         }
         let indirect = sum * (std::f64::consts::PI / f64::from(samples.max(1)));
-        reflected(scene.surface.albedo, direct + indirect) + scene.surface.emission
+        reflected(scene.surface.albedo.at(f64::from(receiver.isovalue)), direct + indirect) + scene.surface.emission
     }
 
     /// Direct irradiance by `samples` points uniform over each luminaire:
@@ -150,16 +150,17 @@ pub(super) fn landing(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> O
     let (normal, departure, albedo, emission) = match hit.target {
         Target::Surface(side) => {
             let normal = scene.normal(position.as_dvec3(), side)?;
-            (normal, Departure::Surface(side), scene.surface.albedo, scene.surface.emission)
+            (normal, Departure::Surface(side), scene.surface.albedo.at(f64::from(isovalue)), scene.surface.emission)
         }
         Target::Companion(n, side) => {
             let companion = &scene.companions()[usize::from(n)];
             let (normal, surface) = (companion.normal(position.as_dvec3(), side)?, &companion.member.surface);
-            (normal, Departure::Companion(n, side), surface.albedo, surface.emission)
+            (normal, Departure::Companion(n, side), surface.albedo.at(f64::from(ray.isovalue)), surface.emission)
         }
         Target::Cap(face, side) => {
             let n = scene.face_normal(face);
-            (if side == Side::Lower { n } else { -n }, Departure::Free, scene.face_surface(face).albedo, none)
+            let albedo = scene.face_surface(face).albedo.at(f64::from(ray.isovalue));
+            (if side == Side::Lower { n } else { -n }, Departure::Free, albedo, none)
         }
         Target::Polygon(id) => {
             let p = &scene.polygons()[id as usize];

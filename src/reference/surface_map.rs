@@ -191,7 +191,7 @@ impl SurfaceMap {
         }
         *rays += paths.rays;
         let indirect = sum * (std::f64::consts::PI / f64::from(samples.max(1)));
-        reflected(scene.surface.albedo, direct + indirect) + scene.surface.emission
+        reflected(scene.surface.albedo.at(f64::from(receiver.isovalue)), direct + indirect) + scene.surface.emission
     }
 
     /// Irradiance of reflected photons: Σ w K / ∫_A K dA with K = 1 − (d/r)², r the distance of the k-th photon and A

@@ -74,7 +74,7 @@ fn input(name: &'static str) -> Input {
 /// The inputs. Each one is baked by both engines.
 fn inputs() -> Vec<Input> {
     let with = |name, h: fn([usize; 3], DVec3) -> f64| Input { h: Box::new(h), ..input(name) };
-    let albedo = |a: f64| Surface { albedo: DVec3::splat(a), ..Surface::default() };
+    let albedo = |a: f64| Surface { albedo: DVec3::splat(a).into(), ..Surface::default() };
     let inside = DVec3::new(0.5, 0.5, 0.38);
     vec![
         input("plain bumps"),

@@ -16,8 +16,8 @@ use std::f32::consts::PI;
 pub(super) struct Texture {
     /// Texels along u, v and isovalues.
     pub dims: [usize; 3],
-    /// Diffuse reflectance.
-    pub albedo: [f32; 3],
+    /// Diffuse reflectance at every isovalue.
+    pub albedo: Vec<[f32; 3]>,
     /// World area of a texel.
     pub texel_area: f64,
     /// Direct irradiance; where a texel lies inside the solid at an isovalue, that of its part outside.
@@ -120,7 +120,7 @@ impl Flats {
         let textures = (0..flat::count(scene))
             .map(|number| {
                 let flat = flat::flat(scene, number)?;
-                if flat.albedo == DVec3::ZERO {
+                if flat.albedo.black() {
                     return None;
                 }
                 let dims = FlatTexture::resolution(flat.lengths(), across, isovalues);
@@ -129,7 +129,9 @@ impl Flats {
                 next += texels * isovalues;
                 Some(Texture {
                     dims,
-                    albedo: flat.albedo.as_vec3().to_array(),
+                    albedo: (0..isovalues)
+                        .map(|i| flat.albedo.at((i as f64 + 0.5) / isovalues as f64).as_vec3().to_array())
+                        .collect(),
                     texel_area: flat.area() / texels as f64,
                     direct: vec![0.0; n],
                     indirect: vec![0.0; n],
@@ -236,8 +238,8 @@ impl Flats {
             for texel in 0..t.dims[0] * t.dims[1] {
                 for c in 0..3 {
                     let row = (3 * texel + c) * nc..(3 * texel + c + 1) * nc;
-                    for i in row {
-                        t.radiance[i] = t.albedo[c] / PI * (t.direct[i] + scale[c] * t.indirect[i]);
+                    for (i, albedo) in row.zip(&t.albedo) {
+                        t.radiance[i] = albedo[c] / PI * (t.direct[i] + scale[c] * t.indirect[i]);
                     }
                 }
             }

@@ -24,6 +24,13 @@ function fail(text) {
 
 const toSource = (u) => scene.isovalues[0] + u * (scene.isovalues[1] - scene.isovalues[0]);
 const toUnit = (v) => (v - scene.isovalues[0]) / (scene.isovalues[1] - scene.isovalues[0]);
+/// Linear between stops [isovalue, colour], constant beyond, at the isovalue shown.
+function albedo(stops) {
+  const next = stops.findIndex(([c]) => c >= state.iso);
+  if (next <= 0) return stops.at(next)[1];
+  const [[c0, a], [c1, b]] = stops.slice(next - 1, next + 1);
+  return add(a, add(b, a, -1), (state.iso - c0) / (c1 - c0));
+}
 const digits = (v) => String(Number(v.toPrecision(5)));
 
 async function unpack() {
@@ -198,7 +205,7 @@ function draw() {
     if (!f.cap && !state.walls) continue;
     bind(1, f.wall);
     programs.flat.set({
-      u_normal: f.normal, u_albedo: f.albedo, u_emission: f.emission, u_corner: f.corner, u_du: f.du, u_dv: f.dv,
+      u_normal: f.normal, u_albedo: albedo(f.albedo), u_emission: f.emission, u_corner: f.corner, u_du: f.du, u_dv: f.dv,
       u_cap: f.cap ? 1 : 0, u_textured: f.texture ? 1 : 0,
     });
     gl.bindVertexArray(f.vertex_array);
@@ -210,7 +217,7 @@ function draw() {
   bind(2, textures.lights.at(-1));
   bind(3, textures.blocks);
   programs.volume.set({
-    ...common, u_light: 1, u_other: 2, u_blocks: 3, u_block_count: textures.count, u_albedo: scene.albedo,
+    ...common, u_light: 1, u_other: 2, u_blocks: 3, u_block_count: textures.count, u_albedo: albedo(scene.albedo),
     u_most_steps: 2 * (scene.dims[0] + scene.dims[1] + scene.dims[2]) + 64, u_capped: scene.capped ? 1 : 0,
     u_both: textures.lights.length > 1 ? 1 : 0, u_outside_lower: scene.outside_lower ? 1 : 0,
   });

@@ -2,6 +2,7 @@
 
 mod caps;
 mod closed_forms;
+mod colour;
 mod companions;
 mod invariance;
 mod photons;

@@ -53,7 +53,7 @@ pub(crate) fn closed_box(lo: DVec3, hi: DVec3, albedo: f64, emission: f64) -> Ve
 
 /// A grey surface.
 pub(crate) fn grey(albedo: f64, outside: Side) -> Surface {
-    Surface { albedo: DVec3::splat(albedo), outside, ..Surface::default() }
+    Surface { albedo: DVec3::splat(albedo).into(), outside, ..Surface::default() }
 }
 
 /// An open scene.

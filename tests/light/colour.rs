@@ -1,0 +1,154 @@
+//! Albedo by isovalue: every hyperplane has its own, in all that light does.
+
+use crate::support::*;
+use glam::DVec3;
+use isolume::bake::{Bake, BakeSettings, Engine};
+use isolume::embree::{Device, GraphTracer};
+use isolume::flattened::Side;
+use isolume::luminaire::unoccluded;
+use isolume::reference::{ReferenceSettings, reference};
+use isolume::reflectance::Reflectance;
+use isolume::scene::{Boundary, Scene, Surface, cornell_box};
+use isolume::stats::Moments;
+use isolume::surface_mesh::SurfaceMesh;
+use std::f64::consts::PI;
+
+/// Dark red, grey, light blue, and back: kinks at 0.3 and 0.6 of the sweep.
+fn rainbow() -> Reflectance {
+    let colour = |c, r, g, b| (c, DVec3::new(r, g, b));
+    Reflectance::new(vec![
+        colour(0.0, 0.3, 0.05, 0.0),
+        colour(0.3, 0.5, 0.5, 0.5),
+        colour(0.6, 0.1, 0.4, 0.9),
+        colour(1.0, 0.3, 0.05, 0.0),
+    ])
+    .unwrap()
+}
+
+/// Black walls of radiance 1 give planes exactly ρ(c), node by node, by either engine.
+#[test]
+fn a_furnace_shows_the_albedo_of_every_isovalue() {
+    let (lo, hi) = (DVec3::ZERO, DVec3::ONE);
+    let planes = field(lattice([17; 3], lo, hi), 0.0, 1.0, |x| 0.2 * x.x + 0.3 * x.y + 0.5 * x.z);
+    let surface = Surface { albedo: rainbow(), outside: Side::Higher, ..Surface::default() };
+    let scene = scene(planes, surface, closed_box(lo, hi, 0.0, 1.0));
+    let white = Surface { albedo: DVec3::ONE.into(), ..scene.surface.clone() };
+    let white = Scene::new(scene.field.clone(), white, Boundary::Open, scene.polygons().to_vec()).unwrap();
+    for engine in [Engine::Photon, Engine::Sweep] {
+        let settings = BakeSettings { engine, gather_rays: 8, ..at_nodes(3) };
+        let (bake, white_bake) = (run(&scene, &settings), run(&white, &settings));
+        let (mut worst, mut count) = (0f64, 0);
+        for (o, x, h, ..) in valid(&bake, &scene) {
+            if within(x, lo, hi, 1e-6) {
+                let radiance = |b: &Bake| DVec3::from_array(b.sides[0].1.radiance[o].map(f64::from));
+                let expected = scene.surface.albedo.at(h);
+                // What a sweep misses of the furnace, it misses of a white plane too.
+                let light = if engine == Engine::Sweep { radiance(&white_bake) } else { DVec3::ONE };
+                worst = worst.max((radiance(&bake) - expected * light).abs().max_element());
+                count += 1;
+            }
+        }
+        println!("{engine:?}: worst {worst:.1e} of {count} nodes");
+        assert!(count > 3000 && worst < 2e-6, "{engine:?}");
+    }
+    assert!((bake_exposure(&scene) - 0.9).abs() < 1e-12, "the largest albedo of the sweep exposes");
+}
+
+/// ρ_max of the display's exposure.
+fn bake_exposure(scene: &Scene) -> f64 {
+    PI / (scene.exposure() * scene.reference_irradiance())
+}
+
+/// A small lamp in the middle of balls of every isovalue: indirect E = ρΦ/(4πR²(1 − ρ)) with ρ(c). Photons with
+/// and without gather, sweeps and the path tracer must find each isovalue's own ρ.
+#[test]
+fn a_cavity_reflects_by_the_albedo_of_its_own_isovalue() {
+    const N: usize = 33;
+    let bulge = 0.5 * (2.5f64 / (N - 1) as f64).powi(2);
+    let (lo, hi) = (0.49, 1.3225);
+    let h = field(lattice([N; 3], DVec3::splat(-1.25), DVec3::splat(1.25)), lo, hi, |x| x.length_squared());
+    let light = rectangle("lamp", DVec3::new(0.0, 0.0, 0.013), 0.03 * DVec3::X, 0.03 * DVec3::Y, 0.0, 1.0);
+    let flux = PI * light.area();
+    // A cell spans a sixth of the sweep, and light is interpolated in it: no kinks here.
+    let stops = vec![(0.0, DVec3::new(0.3, 0.45, 0.6)), (1.0, DVec3::new(0.6, 0.4, 0.3))];
+    let surface = Surface { albedo: Reflectance::new(stops).unwrap(), ..Surface::default() };
+    let scene = scene(h, surface, vec![light.clone()]);
+    // Indirect irradiance relative to its closed form, mean over channels.
+    let ratio = |radiance: DVec3, x: DVec3, c: f64| {
+        let albedo = scene.surface.albedo.at(c);
+        let absorbed = 4.0 * PI * (lo + c * (hi - lo) - bulge) * (DVec3::ONE - albedo) + 2.0 * light.area() * albedo;
+        let indirect = PI * radiance / albedo - unoccluded(&light, x, -x.normalize());
+        (indirect * absorbed / (albedo * flux)).element_sum() / 3.0
+    };
+    let mut family = Family::new("a cavity of each colour", 0.015);
+    let engines = [(Engine::Photon, 32), (Engine::Photon, 0), (Engine::Sweep, 32)];
+    for (engine, gather_rays) in engines {
+        // Away from the sweep's ends, where albedo is small and nodes light each other by colours they do not have.
+        let mut shells = [Moments::default(); 4];
+        for seed in 1..4 {
+            let settings = BakeSettings { engine, photons: 1 << 18, gather_rays, shadow_rays: 4, ..at_nodes(seed) };
+            let bake = run(&scene, &settings);
+            let mut sums = [(0.0, 0.0); 4];
+            for (o, x, c, ..) in valid(&bake, &scene) {
+                if (0.2..0.8).contains(&c) {
+                    let s = ((c - 0.2) / 0.15) as usize;
+                    let r = ratio(DVec3::from_array(bake.sides[0].1.radiance[o].map(f64::from)), x, c);
+                    sums[s] = (sums[s].0 + r, sums[s].1 + 1.0);
+                }
+            }
+            sums.iter().zip(&mut shells).for_each(|((a, n), m)| m.push(a / n));
+        }
+        shells.iter().enumerate().for_each(|(s, m)| family.ratios(format!("{engine:?}, gather {gather_rays}, {s}"), m));
+    }
+    let device = Device::new(1).unwrap();
+    let tracer = GraphTracer::new(&device, &scene).unwrap();
+    for c in [0.25f32, 0.75] {
+        let mesh = SurfaceMesh::extract(&scene, c, 1).unwrap();
+        let settings = ReferenceSettings { samples: 64, vertices: Some(400), ..ReferenceSettings::default() };
+        let paths = reference(&scene, &tracer, &mesh, c, &settings, &|_| true);
+        let mut m = Moments::default();
+        for v in (0..mesh.local.len()).filter(|&v| paths.sampled[v]) {
+            m.push(ratio(paths.radiance[v], mesh.positions[v], f64::from(c)));
+        }
+        family.ratios(format!("path tracer at {c}"), &m);
+    }
+    family.accept();
+}
+
+/// Another colour at another isovalue changes no bit: of no photon path between stops that stay, and of no grid point
+/// further from the change than the estimates reach (τ, and a cell).
+#[test]
+fn colours_of_other_isovalues_change_nothing() {
+    let with = |last: DVec3| {
+        let grey = DVec3::splat(0.6);
+        let albedo = Reflectance::new(vec![(0.6, grey), (0.7, last)]).unwrap();
+        let h = field(lattice([21; 3], DVec3::ZERO, DVec3::ONE), 0.0, 0.4, |x| 0.4 - (x - 0.5).length_squared());
+        let walls = cornell_box(h.lattice(), 0.0).unwrap();
+        scene(h, Surface { albedo, ..Surface::default() }, walls)
+    };
+    let (a, b) = (with(DVec3::splat(0.6)), with(DVec3::new(0.9, 0.0, 0.1)));
+    let below = |scene: &Scene| {
+        let all = photons(scene, &emission(1 << 16, 5));
+        let total = all.surface.len();
+        let kept: Vec<_> = all.surface.into_iter().filter(|p| p.isovalue <= 0.6).collect();
+        (total, kept)
+    };
+    let ((total_a, photons_a), (total_b, photons_b)) = (below(&a), below(&b));
+    assert!(photons_a == photons_b && photons_a.len() > 10_000, "{} photons", photons_a.len());
+    assert_ne!(total_a, total_b, "above, roulette decides otherwise");
+    let settings = BakeSettings { photons: 1 << 15, gather_rays: 16, wall_resolution: 8, ..at_nodes(1) };
+    let (bake_a, bake_b) = (run(&a, &settings), run(&b, &settings));
+    let (mut same, mut changed) = (0, 0);
+    for ((o, _, h, ..), _) in valid(&bake_a, &a).into_iter().zip(valid(&bake_b, &b)) {
+        let equal = bake_a.sides[0].1.radiance[o] == bake_b.sides[0].1.radiance[o];
+        // A cell spans up to 0.2 of the sweep here; walls have texels and a kernel in c.
+        if h < 0.2 {
+            assert!(equal, "node {o} at {h}");
+            same += 1;
+        } else if !equal {
+            changed += 1;
+        }
+    }
+    println!("{same} points below keep every bit, {changed} above do not");
+    assert!(same > 100 && changed > 1000, "{same} {changed}");
+}
