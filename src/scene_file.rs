@@ -361,7 +361,9 @@ pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
         move |e: Error| source.map_or_else(|| Error::Invalid(e.to_string()), |s| s.blame(key, &e))
     };
     if file.policy.is_some() {
-        return Err(blame("policy", false)(Error::Invalid("there is only one volume; list several as [[volume]]".into())));
+        return Err(blame("policy", false)(Error::Invalid(
+            "there is only one volume; list several as [[volume]]".into(),
+        )));
     }
     let key = if single.file.is_some() { "file" } else { "generator" };
     let volume = load_volume(single, &folder, &options.raw).map_err(blame(key, false))?;
@@ -376,8 +378,7 @@ pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
     let boxed = options.surroundings.kind.is_some() || options.surroundings.margin.is_some();
     let key = if file.surroundings.kind.is_some() { "kind" } else { "margin" };
     let polygons =
-        surroundings(&file.surroundings, &options.surroundings, &folder, field.lattice())
-            .map_err(blame(key, boxed))?;
+        surroundings(&file.surroundings, &options.surroundings, &folder, field.lattice()).map_err(blame(key, boxed))?;
     let flag = options.surface.albedo.is_some();
     let (surface, boundary) = surface(&file.surface, &options.surface, sweep).map_err(blame("albedo", flag))?;
     let scene =

@@ -133,12 +133,7 @@ impl VolumeEntry {
 }
 
 /// Loads the volumes of a scene file and what surrounds them.
-pub(super) fn load(
-    entries: &[VolumeEntry],
-    file: &SceneFile,
-    input: &Path,
-    options: &SceneOptions,
-) -> Result<Loaded> {
+pub(super) fn load(entries: &[VolumeEntry], file: &SceneFile, input: &Path, options: &SceneOptions) -> Result<Loaded> {
     let folder = input.parent().unwrap_or(Path::new(""));
     let s = &options.surface;
     let flags = [
@@ -242,7 +237,10 @@ mod tests {
     #[test]
     fn errors_name_the_volume() {
         let e = error_of("[[volume]]\nname = \"a\"\ngenerator = \"bumps\"\ncolour = 3\n");
-        assert!(e.contains("scene.toml:4: unknown key `colour` in [[volume]]; known: name") && !e.contains('\n'), "{e}");
+        assert!(
+            e.contains("scene.toml:4: unknown key `colour` in [[volume]]; known: name") && !e.contains('\n'),
+            "{e}"
+        );
         let e = error_of(&TWO.replace("\"sphere\"", "\"spere\""));
         assert!(e.contains("volume 'b': generator `spere`"), "{e}");
         let e = error_of(&TWO.replace("name = \"b\"", "name = \"a\""));

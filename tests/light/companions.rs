@@ -63,15 +63,13 @@ fn two(white: Lattice) -> Scene {
     let red = field(unit(25), 0.1, 0.9, large);
     let walls = cornell_box(red.lattice(), 0.0).unwrap();
     let white = field(white, 0.15, 0.9, small);
-    joint(
-        vec![member("red", red, coloured([0.8, 0.1, 0.1])), member("white", white, coloured([0.8, 0.8, 0.8]))],
-        walls,
-    )
+    joint(vec![member("red", red, coloured([0.8, 0.1, 0.1])), member("white", white, coloured([0.8, 0.8, 0.8]))], walls)
 }
 
 /// An oblique lattice that covers the two small bumps at the sweep's isovalues.
 fn oblique() -> Lattice {
-    let axes = DMat3::from_cols(DVec3::new(0.03, 0.008, 0.0), DVec3::new(-0.009, 0.03, 0.004), DVec3::new(0.0, -0.004, 0.03));
+    let axes =
+        DMat3::from_cols(DVec3::new(0.03, 0.008, 0.0), DVec3::new(-0.009, 0.03, 0.004), DVec3::new(0.0, -0.004, 0.03));
     let far = DVec3::new(29.0, 23.0, 19.0);
     Lattice::new([30, 24, 20], DVec3::new(0.49, 0.48, 0.71) - axes * far * 0.5, axes).unwrap()
 }
@@ -117,7 +115,11 @@ fn the_nearest_hit_of_all_fields_wins() {
         let (mut rays, mut expected, mut met) = (Vec::new(), Vec::new(), [0; 3]);
         let mut cast = |ray: FlattenedRay| {
             let plain = FlattenedRay {
-                departure: if matches!(ray.departure, Departure::Companion(..)) { Departure::Free } else { ray.departure },
+                departure: if matches!(ray.departure, Departure::Companion(..)) {
+                    Departure::Free
+                } else {
+                    ray.departure
+                },
                 ..ray
             };
             let (a, b) = (own_tracer.intersect(&plain), other_tracer.intersect(&companion.ray_to_index(&ray)));
@@ -264,10 +266,8 @@ fn a_field_cut_in_two_has_the_same_light() {
     let walls = || cornell_box(&unit(n), 0.0).unwrap();
     let surface = || coloured([0.9, 0.6, 0.3]);
     let single = scene(on(unit(n)), surface(), walls());
-    let parts = joint(
-        vec![member("near", on(half(false)), surface()), member("far", on(half(true)), surface())],
-        walls(),
-    );
+    let parts =
+        joint(vec![member("near", on(half(false)), surface()), member("far", on(half(true)), surface())], walls());
     let mut ratios = vec![Moments::default(); 24];
     for seed in 1..=4 {
         let (a, b) = (run(&single, &quick(seed)), run_fields(&parts, &quick(seed + 10)));
@@ -298,9 +298,11 @@ fn lattices_do_not_matter() {
             let (a, b) = (run_fields(&aligned, &quick(seed)), run_fields(&other, &quick(seed + 10)));
             for k in 0..2 {
                 // Where both lattices hold nodes.
-                let inside = |x: DVec3| k == 0 || {
-                    let p = oblique().to_index(x);
-                    p.min_element() > 0.0 && (oblique().far() - p).min_element() > 0.0
+                let inside = |x: DVec3| {
+                    k == 0 || {
+                        let p = oblique().to_index(x);
+                        p.min_element() > 0.0 && (oblique().far() - p).min_element() > 0.0
+                    }
                 };
                 let (x, y) = (means(&a[k], &aligned.seen_from(k), inside), means(&b[k], &other.seen_from(k), inside));
                 (0..12).for_each(|i| ratios[12 * k + i].push(y[i] / x[i]));
@@ -323,8 +325,7 @@ fn an_integrating_sphere_of_one_field_around_a_source_of_another() {
     let ball_step: f64 = 1.0 / 24.0;
     let cavity = |lo: f64, hi: f64| squares(lattice([33; 3], DVec3::splat(-1.3), DVec3::splat(1.3)), lo, hi);
     let ball = |lo: f64, hi: f64| squares(lattice([25; 3], DVec3::splat(-0.5), DVec3::splat(0.5)), lo, hi);
-    let source =
-        Surface { emission: DVec3::splat(glow), outside: Side::Higher, ..coloured([ball_albedo; 3]) };
+    let source = Surface { emission: DVec3::splat(glow), outside: Side::Higher, ..coloured([ball_albedo; 3]) };
     let scene = joint(
         vec![
             member("cavity", cavity(0.7, 1.3), Surface { outside: Side::Lower, ..coloured([albedo; 3]) }),
@@ -350,7 +351,10 @@ fn an_integrating_sphere_of_one_field_around_a_source_of_another() {
             (0..4).for_each(|b| moments[4 * k + b].push(sums[b].0 / sums[b].1));
         }
     }
-    moments.iter().enumerate().for_each(|(i, m)| families.ratios(["cavity", "ball"][i / 4].to_owned() + &format!(" {}", i % 4), m));
+    moments
+        .iter()
+        .enumerate()
+        .for_each(|(i, m)| families.ratios(["cavity", "ball"][i / 4].to_owned() + &format!(" {}", i % 4), m));
     families.accept();
 }
 
@@ -374,9 +378,8 @@ fn cross_light_agrees_with_paths_between_two_meshes() {
             seed,
             ..ReferenceSettings::default()
         };
-        let paths = [1, 2].map(|seed| {
-            reference(&seen, &tracer, &mesh, c, &settings(Integrator::Path, seed), &|_| true)
-        });
+        let paths =
+            [1, 2].map(|seed| reference(&seen, &tracer, &mesh, c, &settings(Integrator::Path, seed), &|_| true));
         let photons = reference(&seen, &tracer, &mesh, c, &settings(Integrator::Photon, 3), &|_| true);
         let exposure = scene.exposure();
         let (mut square, mut bias, mut mean, mut n) = (0.0, DVec3::ZERO, DVec3::ZERO, 0.0);
