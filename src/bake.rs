@@ -248,7 +248,11 @@ fn finish(jobs: &[Job], mut lit: Lit, exposure: f64, settings: &BakeSettings, de
             grid: job.lattice.dims(),
             settings: settings.clone(),
         };
-        Ok(Bake { lattice: job.lattice.clone(), sides, flats: lit.flats.clone(), exposure, report })
+        // Each bake stands for itself: walls, and the caps of its own field.
+        let walls = job.scene.polygons().len();
+        let caps = walls + 6 * job.scene.number();
+        let flats = lit.flats[..walls].iter().chain(&lit.flats[caps..caps + 6]).cloned().collect();
+        Ok(Bake { lattice: job.lattice.clone(), sides, flats, exposure, report })
     };
     jobs.iter().zip(fields).map(bake).collect()
 }

@@ -1,8 +1,10 @@
 //! Scene files (TOML), and how a volume, a scene file and flags become a [`Scene`].
 
 mod fault;
+mod several;
 
 pub use fault::fault;
+pub use several::{PolicyName, VolumeEntry, Volumes};
 
 use crate::bake::BakeOptions;
 use crate::error::{Error, Result};
@@ -14,7 +16,7 @@ use crate::scene::{Boundary, Placement, Scene, Surface, cornell_box, read_contex
 use crate::volume::generate::Generator;
 use crate::volume::raw::RawLayout;
 use crate::volume::statistics::VolumeStatistics;
-use crate::volume::{ElementType, Endian, Volume};
+use crate::volume::{ElementType, Endian, Lattice, Volume};
 use glam::DVec3;
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
@@ -23,8 +25,10 @@ use std::path::{Path, PathBuf};
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
 pub struct SceneFile {
-    /// The volume.
-    pub volume: VolumeSource,
+    /// The volume, or several.
+    pub volume: Volumes,
+    /// How several volumes share light (default joint).
+    pub policy: Option<PolicyName>,
     /// The sweep [lo, hi] in source units; a suggestion from the data if absent.
     pub isovalues: Option<[f64; 2]>,
     /// Material and sides.
@@ -323,8 +327,10 @@ pub struct SceneOptions {
 
 /// A scene ready to bake, and the volume it came from.
 pub struct Loaded {
-    /// The volume in source units.
+    /// The volume in source units; of several, the first.
     pub volume: Volume,
+    /// The other volumes, in the order of the scene's fields.
+    pub companions: Vec<Volume>,
     /// The scene.
     pub scene: Scene,
     /// The file's `[bake]` table.
@@ -377,23 +383,29 @@ pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
         Some(source) => (source.parse()?, input.parent().unwrap_or(Path::new("")).to_path_buf()),
         None => {
             let volume = VolumeSource { file: Some(input.to_path_buf()), ..VolumeSource::default() };
-            (SceneFile { volume, ..SceneFile::default() }, PathBuf::new())
+            (SceneFile { volume: Volumes::One(volume), ..SceneFile::default() }, PathBuf::new())
         }
+    };
+    let single = match &file.volume {
+        Volumes::One(single) => single,
+        Volumes::Several(entries) => return several::load(entries, &file, input, options),
     };
     // What a flag brought is the flag's fault, the rest its key's.
     let blame = |key: &'static str, flag: bool| {
         let source = source.as_ref().filter(|_| !flag);
         move |e: Error| source.map_or_else(|| Error::Invalid(e.to_string()), |s| s.blame(key, &e))
     };
-    let key = if file.volume.file.is_some() { "file" } else { "generator" };
-    let volume = load_volume(&file.volume, &folder, &options.raw).map_err(blame(key, false))?;
+    if file.policy.is_some() {
+        return Err(blame("policy", false)(Error::Invalid(
+            "there is only one volume; list several as [[volume]]".into(),
+        )));
+    }
+    let key = if single.file.is_some() { "file" } else { "generator" };
+    let volume = load_volume(single, &folder, &options.raw).map_err(blame(key, false))?;
     let isovalues = match (options.isovalues.as_deref(), file.isovalues) {
         (Some(&[lo, hi]), _) => [lo, hi],
         (_, Some(range)) => range,
-        _ => VolumeStatistics::of(&volume).sweep.ok_or_else(|| match volume.range() {
-            None => Error::invalid(&volume.name, "none of its samples is finite"),
-            Some((v, _)) => Error::invalid(&volume.name, format!("every sample is {v}: it holds no isosurface")),
-        })?,
+        _ => suggested(&volume)?,
     };
     let given = options.isovalues.is_some() || file.isovalues.is_none();
     let sweep = Sweep::new(isovalues[0], isovalues[1]).map_err(blame("isovalues", given))?;
@@ -401,15 +413,26 @@ pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
     let boxed = options.surroundings.kind.is_some() || options.surroundings.margin.is_some();
     let key = if file.surroundings.kind.is_some() { "kind" } else { "margin" };
     let mut polygons =
-        surroundings(&file.surroundings, &options.surroundings, &folder, &field).map_err(blame(key, boxed))?;
-    for context in &file.context {
-        polygons.extend(context.polygons(&folder).map_err(blame("[[context]]", false))?);
-    }
+        surroundings(&file.surroundings, &options.surroundings, &folder, field.lattice()).map_err(blame(key, boxed))?;
+    polygons.extend(context(&file.context, &folder).map_err(blame("[[context]]", false))?);
     let flag = options.surface.albedo.is_some();
     let (surface, boundary) = surface(&file.surface, &options.surface, sweep).map_err(blame("albedo", flag))?;
     let scene =
         Scene::new(field, surface, boundary, polygons).map_err(|e| if is_scene { e.in_file(input) } else { e })?;
-    Ok(Loaded { volume, scene, bake: file.bake })
+    Ok(Loaded { volume, companions: Vec::new(), scene, bake: file.bake })
+}
+
+/// Polygons of all context geometry.
+fn context(entries: &[ContextOptions], folder: &Path) -> Result<Vec<Polygon>> {
+    Ok(entries.iter().map(|c| c.polygons(folder)).collect::<Result<Vec<_>>>()?.concat())
+}
+
+/// The sweep that the data suggest.
+fn suggested(volume: &Volume) -> Result<[f64; 2]> {
+    VolumeStatistics::of(volume).sweep.ok_or_else(|| match volume.range() {
+        None => Error::invalid(&volume.name, "none of its samples is finite"),
+        Some((v, _)) => Error::invalid(&volume.name, format!("every sample is {v}: it holds no isosurface")),
+    })
 }
 
 fn load_volume(source: &VolumeSource, folder: &Path, raw: &RawOptions) -> Result<Volume> {
@@ -427,7 +450,7 @@ fn load_volume(source: &VolumeSource, folder: &Path, raw: &RawOptions) -> Result
     }
 }
 
-fn surroundings(file: &BoxOptions, flags: &BoxOptions, folder: &Path, field: &Field) -> Result<Vec<Polygon>> {
+fn surroundings(file: &BoxOptions, flags: &BoxOptions, folder: &Path, lattice: &Lattice) -> Result<Vec<Polygon>> {
     let margin = flags.margin.or(file.margin);
     // A path in a scene file is relative to it, one in a flag to the working folder.
     let (kind, folder) = match (&flags.kind, &file.kind) {
@@ -436,7 +459,7 @@ fn surroundings(file: &BoxOptions, flags: &BoxOptions, folder: &Path, field: &Fi
         (None, None) => ("cornell", folder),
     };
     match kind {
-        "cornell" => cornell_box(field.lattice(), margin.unwrap_or(0.0)),
+        "cornell" => cornell_box(lattice, margin.unwrap_or(0.0)),
         _ if margin.is_some() => Err(Error::Invalid(format!("box margin: only the Cornell box has one, not '{kind}'"))),
         "none" => Ok(Vec::new()),
         path => read_obj(&folder.join(path)),
