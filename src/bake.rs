@@ -87,6 +87,8 @@ pub struct BakeReport {
     pub commit: &'static str,
     /// Points of the illumination grid.
     pub grid: [usize; 3],
+    /// Digest of what determines the bits.
+    pub job: String,
     /// Settings.
     pub settings: BakeSettings,
 }
@@ -194,9 +196,17 @@ pub fn bake_resumable(
         embree: device.version(),
         commit: env!("ISOLUME_COMMIT"),
         grid: lattice.dims(),
+        job: digest(&job(scene, settings)),
         settings: settings.clone(),
     };
     Ok(Bake { lattice, sides: lit.sides, flats: lit.flats, exposure: scene.exposure(), report })
+}
+
+/// A [`job`] in eight letters.
+pub fn digest(job: &str) -> String {
+    let mut crc = flate2::Crc::new();
+    crc.update(job.as_bytes());
+    format!("{:08x}", crc.sum())
 }
 
 /// What determines a bake's bits, as lines of `key: value`: for [`Checkpoint::new`].

@@ -11,6 +11,7 @@ use crate::flattened::Side;
 use crate::polygon::Polygon;
 use crate::reflectance::Reflectance;
 use crate::scene::{Boundary, Placement, Scene, Surface, cornell_box, read_context, read_obj};
+use crate::series::Series;
 use crate::volume::generate::Generator;
 use crate::volume::raw::RawLayout;
 use crate::volume::statistics::VolumeStatistics;
@@ -77,8 +78,12 @@ impl ContextOptions {
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
 pub struct VolumeSource {
-    /// A volume file, relative to the scene file.
+    /// A volume file, relative to the scene file, or the pattern of a series: `rho_%04d.vti`.
     pub file: Option<PathBuf>,
+    /// The files of a series instead.
+    pub files: Option<Vec<PathBuf>>,
+    /// When each file of a series is.
+    pub times: Option<Vec<f64>>,
     /// How to read a headerless file.
     pub raw: Option<RawOptions>,
     /// Name of a generator instead of a file.
@@ -310,6 +315,9 @@ pub struct SceneOptions {
     /// The sweep: lowest and highest isovalue, in the volume's units (default: suggested from the data)
     #[arg(long, num_args = 2, value_names = ["LO", "HI"], allow_negative_numbers = true)]
     pub isovalues: Option<Vec<f64>>,
+    /// The moment of a series of volumes; between two of its frames, their blend
+    #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
+    pub time: Option<f64>,
     #[command(flatten)]
     #[allow(missing_docs, reason = "a doc comment would become the group's help")]
     pub surface: SurfaceOptions,
@@ -371,25 +379,40 @@ impl Source {
 /// # Errors
 /// `Io`, `Invalid` or `NotSupported`; messages name the file and what is wrong in it.
 pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
-    let is_scene = input.extension().is_some_and(|e| e.eq_ignore_ascii_case("toml"));
-    let source = if is_scene { Some(Source::read(input)?) } else { None };
-    let (file, folder) = match &source {
-        Some(source) => (source.parse()?, input.parent().unwrap_or(Path::new("")).to_path_buf()),
-        None => {
-            let volume = VolumeSource { file: Some(input.to_path_buf()), ..VolumeSource::default() };
-            (SceneFile { volume, ..SceneFile::default() }, PathBuf::new())
-        }
-    };
+    let (source, file, folder) = parse(input)?;
+    let is_scene = source.is_some();
     // What a flag brought is the flag's fault, the rest its key's.
     let blame = |key: &'static str, flag: bool| {
         let source = source.as_ref().filter(|_| !flag);
         move |e: Error| source.map_or_else(|| Error::Invalid(e.to_string()), |s| s.blame(key, &e))
     };
-    let key = if file.volume.file.is_some() { "file" } else { "generator" };
-    let volume = load_volume(&file.volume, &folder, &options.raw).map_err(blame(key, false))?;
+    let key = match &file.volume {
+        VolumeSource { files: Some(_), .. } => "files",
+        VolumeSource { file: Some(_), .. } => "file",
+        _ => "generator",
+    };
+    let series = file.volume.series(&folder).map_err(blame(key, false))?;
+    let read = |path: &Path| read_volume(path, &file.volume, &options.raw);
+    let volume = match (&series, options.time) {
+        (None, None) => load_volume(&file.volume, &folder, &options.raw).map_err(blame(key, false))?,
+        (Some(series), Some(time)) => series.at(time, read).map_err(blame(key, true))?,
+        (Some(series), None) => {
+            return Err(Error::invalid(
+                input,
+                format!("is a series of {} volumes; choose a moment with --time", series.times().len()),
+            ));
+        }
+        (None, Some(time)) => {
+            return Err(Error::invalid(input, format!("is a single volume: --time {time} chooses of a series")));
+        }
+    };
     let isovalues = match (options.isovalues.as_deref(), file.isovalues) {
         (Some(&[lo, hi]), _) => [lo, hi],
         (_, Some(range)) => range,
+        _ if series.is_some() => series
+            .as_ref()
+            .map_or(Ok(None), |s| s.check(read))?
+            .ok_or_else(|| Error::invalid(input, "no frame holds an isosurface"))?,
         _ => VolumeStatistics::of(&volume).sweep.ok_or_else(|| match volume.range() {
             None => Error::invalid(&volume.name, "none of its samples is finite"),
             Some((v, _)) => Error::invalid(&volume.name, format!("every sample is {v}: it holds no isosurface")),
@@ -412,16 +435,58 @@ pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
     Ok(Loaded { volume, scene, bake: file.bake })
 }
 
+/// The series of volumes that `input` is, if it is one.
+///
+/// # Errors
+/// As [`load`]; `Invalid` also if its frames do not share a lattice.
+pub fn load_series(input: &Path, options: &SceneOptions) -> Result<Option<Series>> {
+    let (source, file, folder) = parse(input)?;
+    let blame = |e: Error| source.as_ref().map_or_else(|| e.to_string(), |s| s.blame("file", &e).to_string());
+    let series = file.volume.series(&folder).map_err(|e| Error::Invalid(blame(e)))?;
+    if let Some(series) = &series {
+        series.check(|path| read_volume(path, &file.volume, &options.raw))?;
+    }
+    Ok(series)
+}
+
+/// The scene file that `input` is or stands for, its text if it is one, and where its paths begin.
+fn parse(input: &Path) -> Result<(Option<Source>, SceneFile, PathBuf)> {
+    if input.extension().is_some_and(|e| e.eq_ignore_ascii_case("toml")) {
+        let source = Source::read(input)?;
+        let file = source.parse()?;
+        return Ok((Some(source), file, input.parent().unwrap_or(Path::new("")).to_path_buf()));
+    }
+    let volume = VolumeSource { file: Some(input.to_path_buf()), ..VolumeSource::default() };
+    Ok((None, SceneFile { volume, ..SceneFile::default() }, PathBuf::new()))
+}
+
+impl VolumeSource {
+    fn series(&self, folder: &Path) -> Result<Option<Series>> {
+        let times = self.times.clone();
+        let series = match (&self.files, &self.file) {
+            (Some(_), Some(_)) => return Err(Error::Invalid("[volume] needs either file or files".into())),
+            (Some(files), None) => Some(Series::new(files.iter().map(|f| folder.join(f)).collect(), times)?),
+            (None, Some(file)) => Series::find(&folder.join(file), times)?,
+            (None, None) => None,
+        };
+        match &self.times {
+            Some(_) if series.is_none() => Err(Error::Invalid("times are for a series of files".into())),
+            _ => Ok(series),
+        }
+    }
+}
+
+fn read_volume(path: &Path, source: &VolumeSource, raw: &RawOptions) -> Result<Volume> {
+    let layout = if raw.given() { Some(raw) } else { source.raw.as_ref() };
+    match layout {
+        Some(layout) => layout.layout(path)?.read(path),
+        None => Volume::open(path),
+    }
+}
+
 fn load_volume(source: &VolumeSource, folder: &Path, raw: &RawOptions) -> Result<Volume> {
     match (&source.file, &source.generator) {
-        (Some(file), None) => {
-            let path = folder.join(file);
-            let layout = if raw.given() { Some(raw) } else { source.raw.as_ref() };
-            match layout {
-                Some(layout) => layout.layout(&path)?.read(&path),
-                None => Volume::open(&path),
-            }
-        }
+        (Some(file), None) => read_volume(&folder.join(file), source, raw),
         (None, Some(name)) => Generator::from_name(name)?.sample([source.size.unwrap_or(101); 3]),
         _ => Err(Error::Invalid("[volume] needs either file or generator".into())),
     }
