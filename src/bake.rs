@@ -1,5 +1,6 @@
 //! The main job: from a scene to its illumination grid, by either engine, with counts and seconds.
 
+mod grid_points;
 mod memory;
 mod photon_engine;
 mod settings;
@@ -18,8 +19,9 @@ use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, masks};
 use crate::progress::Progress;
-use crate::scene::Scene;
+use crate::scene::{Policy, Scene};
 use crate::volume::Lattice;
+use photon_engine::Job;
 use serde::Serialize;
 
 /// Wall seconds per stage.
@@ -110,7 +112,8 @@ pub struct Bake {
 /// What an engine gave.
 #[derive(Default)]
 struct Lit {
-    sides: Vec<(Side, IlluminationGrid)>,
+    /// The stored sides of each field.
+    fields: Vec<Vec<(Side, IlluminationGrid)>>,
     flats: Vec<Option<FlatTexture>>,
     seconds: Seconds,
     rays: u64,
@@ -147,59 +150,122 @@ pub fn bake_resumable(
     progress: Progress,
     checkpoint: Option<&Checkpoint>,
 ) -> Result<Bake> {
-    let lattice = settings.grid.lattice(scene.lattice())?;
-    let masks = masks(&scene.field, &lattice);
-    if masks.iter().all(|&m| m == Mask::Empty) {
-        return Err(Error::Invalid(
-            "no isosurface of the sweep has a gradient anywhere: the volume is constant there; choose other isovalues"
-                .into(),
-        ));
-    }
-    let mut lit = match settings.engine {
-        Engine::Photon => photon_engine::light(scene, settings, &lattice, &masks, device, progress, checkpoint)?,
-        Engine::Sweep => sweep_engine::light(scene, settings, &lattice, &masks, device, progress, checkpoint)?,
+    bake_fields(scene, settings, device, progress, checkpoint)?
+        .into_iter()
+        .next()
+        .ok_or_else(|| Error::Invalid("the scene holds no field".into()))
+}
+
+/// As [`bake_resumable`], for each field of a scene by number. Fields that light each other share photons, walls and
+/// counts; the reports differ in what belongs to a grid.
+///
+/// # Errors
+/// As [`bake`]; `NotSupported` for several fields that light each other by the sweep engine.
+pub fn bake_fields(
+    scene: &Scene,
+    settings: &BakeSettings,
+    device: &Device,
+    progress: Progress,
+    checkpoint: Option<&Checkpoint>,
+) -> Result<Vec<Bake>> {
+    let digest = digest(&job(scene, settings));
+    let job = |number: u32| -> Result<Job> {
+        let scene = scene.lit(number as usize);
+        let named = |e: Error| if scene.name.is_empty() { e } else { e.in_file(format!("volume '{}'", scene.name)) };
+        let lattice = settings.grid.lattice(scene.lattice()).map_err(named)?;
+        let masks = masks(&scene.field, &lattice);
+        if masks.iter().all(|&m| m == Mask::Empty) {
+            return Err(named(Error::Invalid(
+                "no isosurface of the sweep has a gradient anywhere: the volume is constant there; choose other \
+                 isovalues"
+                    .into(),
+            )));
+        }
+        Ok(Job { number, scene, lattice, masks })
     };
-    if lit.sides.iter().all(|(_, grid)| grid.mask.iter().all(|&m| m == Mask::Empty)) {
-        return Err(Error::Invalid(
-            "no grid point lies on or beside an isosurface of the sweep: its values are too close together for this \
-             volume; widen --isovalues, or refine --grid"
-                .into(),
-        ));
+    let jobs = (0..).take(scene.fields()).map(job).collect::<Result<Vec<_>>>()?;
+    let groups: Vec<&[Job]> = match scene.policy() {
+        Policy::Joint => vec![&jobs],
+        Policy::Independent => jobs.chunks(1).collect(),
+    };
+    let mut bakes = Vec::new();
+    for group in groups {
+        let lit = match settings.engine {
+            Engine::Photon => photon_engine::light(group, settings, device, progress, checkpoint)?,
+            Engine::Sweep if group.len() == 1 => {
+                sweep_engine::light(&group[0], settings, device, progress, checkpoint)?
+            }
+            Engine::Sweep => {
+                return Err(Error::NotSupported(
+                    "engine = \"sweep\" lights one volume at a time; several that light each other need engine = \
+                     \"photon\" (or policy = \"independent\")"
+                        .into(),
+                ));
+            }
+        };
+        bakes.extend(finish(group, lit, scene.exposure(), &digest, settings, device)?);
     }
-    let mut non_finite = 0;
-    for (_, grid) in &mut lit.sides {
-        for (rgb, mask) in grid.radiance.iter_mut().zip(&mut grid.mask) {
-            if !rgb.iter().all(|x| x.is_finite()) {
-                (*rgb, *mask) = ([0.0; 3], Mask::Empty);
-                non_finite += 1;
+    Ok(bakes)
+}
+
+/// Bakes with their reports from what an engine gave.
+fn finish(
+    jobs: &[Job],
+    mut lit: Lit,
+    exposure: f64,
+    digest: &str,
+    settings: &BakeSettings,
+    device: &Device,
+) -> Result<Vec<Bake>> {
+    let s = lit.seconds;
+    let fields = std::mem::take(&mut lit.fields);
+    let bake = |(job, mut sides): (&Job, Vec<(Side, IlluminationGrid)>)| {
+        if sides.iter().all(|(_, grid)| grid.mask.iter().all(|&m| m == Mask::Empty)) {
+            return Err(Error::Invalid(
+                "no grid point lies on or beside an isosurface of the sweep: its values are too close together for this \
+                 volume; widen --isovalues, or refine --grid"
+                    .into(),
+            ));
+        }
+        let mut non_finite = 0;
+        for (_, grid) in &mut sides {
+            for (rgb, mask) in grid.radiance.iter_mut().zip(&mut grid.mask) {
+                if !rgb.iter().all(|x| x.is_finite()) {
+                    (*rgb, *mask) = ([0.0; 3], Mask::Empty);
+                    non_finite += 1;
+                }
             }
         }
-    }
-    let count = |m: Mask| lit.sides[0].1.mask.iter().filter(|&&x| x == m).count() as u64;
-    let (empty, filled) = (count(Mask::Empty), count(Mask::Filled));
-    let s = lit.seconds;
-    let report = BakeReport {
-        seconds: s,
-        rays: lit.rays,
-        sweep_queries: lit.sweep_queries,
-        rays_per_second: (lit.rays + lit.sweep_queries) as f64 / (s.photons + s.cache + s.sweep + s.samples),
-        photons: lit.photons,
-        samples: lit.samples,
-        samples_without_gradient: lit.without_gradient,
-        masked: empty + filled,
-        filled,
-        misses: lit.misses,
-        non_finite,
-        non_finite_voxels: scene.field.samples().iter().filter(|s| !s.is_finite()).count() as u64,
-        threads: rayon::current_num_threads(),
-        seed: settings.seed,
-        embree: device.version(),
-        commit: env!("ISOLUME_COMMIT"),
-        grid: lattice.dims(),
-        job: digest(&job(scene, settings)),
-        settings: settings.clone(),
+        let count = |m: Mask| sides[0].1.mask.iter().filter(|&&x| x == m).count() as u64;
+        let (empty, filled) = (count(Mask::Empty), count(Mask::Filled));
+        let report = BakeReport {
+            seconds: s,
+            rays: lit.rays,
+            sweep_queries: lit.sweep_queries,
+            rays_per_second: (lit.rays + lit.sweep_queries) as f64 / (s.photons + s.cache + s.sweep + s.samples),
+            photons: lit.photons,
+            samples: lit.samples,
+            samples_without_gradient: lit.without_gradient,
+            masked: empty + filled,
+            filled,
+            misses: lit.misses,
+            non_finite,
+            non_finite_voxels: job.scene.field.samples().iter().filter(|s| !s.is_finite()).count() as u64,
+            threads: rayon::current_num_threads(),
+            seed: settings.seed,
+            embree: device.version(),
+            commit: env!("ISOLUME_COMMIT"),
+            grid: job.lattice.dims(),
+            job: digest.to_owned(),
+            settings: settings.clone(),
+        };
+        // Each bake stands for itself: walls, and the caps of its own field.
+        let walls = job.scene.polygons().len();
+        let caps = walls + 6 * job.scene.number();
+        let flats = lit.flats[..walls].iter().chain(&lit.flats[caps..caps + 6]).cloned().collect();
+        Ok(Bake { lattice: job.lattice.clone(), sides, flats, exposure, report })
     };
-    Ok(Bake { lattice, sides: lit.sides, flats: lit.flats, exposure: scene.exposure(), report })
+    jobs.iter().zip(fields).map(bake).collect()
 }
 
 /// A [`job`] in eight letters.
@@ -217,14 +283,18 @@ pub fn job(scene: &Scene, settings: &BakeSettings) -> String {
         settings.iter().for_each(|(key, value)| add(key, value.to_string()));
     }
     add("normalisation", format!("{:?}", settings.normalisation));
-    let lattice = scene.lattice();
-    add("lattice", format!("{:?} {:?} {:?}", lattice.dims(), lattice.origin(), lattice.axes()));
-    add("isovalues", format!("{:?}", scene.field.sweep()));
-    let mut crc = flate2::Crc::new();
-    scene.field.samples().iter().for_each(|s| crc.update(&s.to_le_bytes()));
-    add("samples' checksum", format!("{:08x}", crc.sum()));
-    add("surface", format!("{:?}", scene.surface));
-    add("boundary", format!("{:?}", scene.boundary));
+    add("policy", format!("{:?}", scene.policy()));
+    for member in scene.members() {
+        let lattice = member.field.lattice();
+        add("volume", member.name);
+        add("lattice", format!("{:?} {:?} {:?}", lattice.dims(), lattice.origin(), lattice.axes()));
+        add("isovalues", format!("{:?}", member.field.sweep()));
+        let mut crc = flate2::Crc::new();
+        member.field.samples().iter().for_each(|s| crc.update(&s.to_le_bytes()));
+        add("samples' checksum", format!("{:08x}", crc.sum()));
+        add("surface", format!("{:?}", member.surface));
+        add("boundary", format!("{:?}", member.boundary));
+    }
     for p in scene.polygons() {
         add(&format!("polygon '{}'", p.name), format!("{:?} {} {}", p.vertices(), p.albedo, p.emission));
     }

@@ -18,6 +18,7 @@ use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
 use crate::progress::{self, Progress};
 use crate::render::{Camera, Rendered, Shading, render};
+use crate::scene::{Policy, Scene};
 use crate::scene_file::{RawOptions, SceneOptions, load};
 use crate::volume::statistics::VolumeStatistics;
 use clap::{Parser, Subcommand};
@@ -122,11 +123,15 @@ Examples:
   isolume render lit.vti --isovalue 80 -o side.exr --eye 90,-300,120 --target 90,108,90
   isolume render lit.vti --isovalue 80 -o truth.png --reference --samples 256")]
 struct Render {
-    /// A bake (.vti); with --reference or --local also a volume or scene file
+    /// A bake (.vti, .vtm); with --reference or --local also a volume or scene file
     file: PathBuf,
     /// The isosurface to draw, in the volume's units
     #[arg(long, value_name = "C", allow_negative_numbers = true)]
     isovalue: f64,
+    /// Of several volumes, the one that --isovalue speaks of: its name (default: the first). The others are drawn at the
+    /// same share of their own ranges
+    #[arg(long, value_name = "NAME")]
+    field: Option<String>,
     /// Output: .png (exposed, sRGB) or .exr (linear radiance)
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
@@ -252,6 +257,17 @@ fn triple(values: Option<&Vec<f64>>, name: &str) -> Result<Option<DVec3>> {
     }
 }
 
+/// The isovalue of a scene's first volume where the one named `name` has `isovalue`.
+fn first_isovalue(scene: &Scene, name: &str, isovalue: f64) -> Result<f64> {
+    let member = scene.members().swap_remove(scene.field_named(name)?);
+    let sweep = member.field.sweep();
+    if !(sweep.lo()..=sweep.hi()).contains(&isovalue) {
+        let (lo, hi) = (sweep.lo(), sweep.hi());
+        return Err(Error::Invalid(format!("--isovalue {isovalue}: outside the range of '{name}', {lo} … {hi}")));
+    }
+    Ok(scene.field.sweep().from_unit(sweep.to_unit(isovalue)))
+}
+
 impl Render {
     fn run(self, progress: Progress) -> Result<()> {
         expect_extension(&self.output, &["png", "exr"])?;
@@ -272,6 +288,10 @@ impl Render {
             None => Some(load(&self.file, &self.scene)?.scene),
         };
         let scene = baked.as_ref().map(|b| &b.scene).or(loaded.as_ref()).expect("one of the two was read");
+        let isovalue = match &self.field {
+            None => self.isovalue,
+            Some(name) => first_isovalue(scene, name, self.isovalue).map_err(|e| e.in_file(&self.file))?,
+        };
         let mut camera = Camera::facing(scene, self.height);
         camera.fov = self.fov;
         if let Some(width) = self.width {
@@ -288,15 +308,21 @@ impl Render {
             camera.target = target;
         }
         let exposure = baked.as_ref().map_or_else(|| scene.exposure(), |b| b.exposure);
+        if self.reference && scene.fields() > 1 && scene.policy() == Policy::Independent {
+            return Err(Error::not_supported(
+                &self.file,
+                "policy = \"independent\": paths see all volumes; a picture of one needs a scene of one",
+            ));
+        }
         let rendered = if self.reference {
-            let picture = reference::picture(scene, self.isovalue, &camera, self.samples, &device()?)?;
+            let picture = reference::picture(scene, isovalue, &camera, self.samples, &device()?)?;
             Rendered { picture, unbaked: 0.0 }
         } else {
             let shading = match &baked {
                 Some(baked) if !self.local => Shading::Baked(baked),
                 _ => Shading::Local(exposure),
             };
-            render(scene, self.isovalue, &camera, shading, self.samples, &device()?)?
+            render(scene, isovalue, &camera, shading, self.samples, &device()?)?
         };
         let exposure = exposure * self.exposure;
         if self.output.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr")) {

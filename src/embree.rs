@@ -24,5 +24,5 @@ mod triangles;
 pub use abi::{Hit, Hit16, INVALID_ID, Ray, Ray16, RayHit, RayHit16, RayView, Valid16};
 pub use bvh::{Quality, Scene, SceneBuilder, UserGeometry, UserHit, UserHits16};
 pub use device::Device;
-pub use hexahedra::GraphTracer;
+pub use hexahedra::{GraphTracer, pyramids};
 pub use triangles::SurfaceTracer;

@@ -3,6 +3,7 @@
 
 pub mod bake_file;
 pub mod glb;
+pub mod multi_block;
 pub mod obj;
 pub mod picture;
 pub mod ply;

@@ -1,5 +1,5 @@
 //! Flats: everything planar that holds a (u, v, isovalue) texture of light – walls, luminaires' fronts, and the caps of
-//! Ω's faces. Flat numbers are polygon numbers, then six caps (axis + 3 · far end).
+//! Ω's faces. Flat numbers are polygon numbers, then six caps (axis + 3 · far end) for each field.
 
 use crate::flattened::{Departure, Side};
 use crate::reflectance::Reflectance;
@@ -36,7 +36,7 @@ pub struct Texel {
 
 /// Number of flats of a scene, caps included.
 pub fn count(scene: &Scene) -> usize {
-    scene.polygons().len() + 6
+    scene.polygons().len() + 6 * scene.fields()
 }
 
 /// Flat number `number` of `scene`; `None` for caps of an open boundary.
@@ -57,14 +57,14 @@ pub fn flat(scene: &Scene, number: usize) -> Option<Flat> {
             },
         });
     }
-    if scene.boundary == Boundary::Open {
+    let (face, lattice, surface, boundary) = scene.numbered_face(number - scene.polygons().len());
+    if boundary == Boundary::Open {
         return None;
     }
-    let face = u8::try_from(number - scene.polygons().len()).expect("six caps");
-    let (lattice, a) = (scene.lattice(), usize::from(face % 3));
+    let a = usize::from(face % 3);
     let far = lattice.far();
     let mut corner = DVec3::ZERO;
-    if face >= 3 {
+    if face % 6 >= 3 {
         corner[a] = far[a];
     }
     let edge = |b: usize| lattice.axes().col(b) * far[b];
@@ -75,7 +75,7 @@ pub fn flat(scene: &Scene, number: usize) -> Option<Flat> {
         outline: None,
         span: longest(edges),
         normal: scene.face_normal(face),
-        albedo: scene.surface.albedo.clone(),
+        albedo: surface.albedo.clone(),
         departure: Departure::Cap(face, Side::Lower),
     })
 }
@@ -166,10 +166,17 @@ fn area_and_centroid(points: &[[f64; 2]]) -> (f64, [f64; 2]) {
     if area > 0.0 { (area, sum.map(|x| x / area)) } else { (0.0, [0.5; 2]) }
 }
 
+/// The number of the flat that is a cap on this face of Ω ([`crate::flattened::face_of`]).
+#[inline]
+pub fn cap(scene: &Scene, face: u8) -> usize {
+    scene.polygons().len() + scene.face_number(face)
+}
+
 /// Texture coordinates on a face of Ω of local `p`: the two other axes in cyclic order, scaled to [0, 1].
 #[inline]
 pub fn face_texture(scene: &Scene, face: u8, p: DVec3) -> [f64; 2] {
-    let far = scene.lattice().far();
+    let (p, lattice) = scene.to_face_index(face, p);
+    let far = lattice.far();
     let a = usize::from(face % 3);
     let (b, c) = ((a + 1) % 3, (a + 2) % 3);
     [p[b] / far[b], p[c] / far[c]]

@@ -41,8 +41,10 @@ pub enum Departure {
     Surface(Side),
     /// A polygon of the scene, by number.
     Polygon(u32),
-    /// A cap, axis + 3 · far end, leaving into `Side`. The origin counts as on the face whatever its f32 coordinates.
+    /// A cap, by face, leaving into `Side`. The origin counts as on the face whatever its f32 coordinates.
     Cap(u8, Side),
+    /// The level set of companion number n ([`crate::scene::Companion`]), leaving into `Side`: as `Surface` for that field.
+    Companion(u8, Side),
 }
 
 /// A ray confined to the hyperplane at height `isovalue`.
@@ -62,10 +64,24 @@ pub struct FlattenedRay {
     pub target: Option<u32>,
 }
 
+/// A face of Ω as caps and departures number it: axis + 3 · far end; of companion n's Ω: 6 (n + 1) more.
+#[inline]
+pub fn face_of(companion: u8, face: u8) -> u8 {
+    face + 6 * (companion + 1)
+}
+
+/// The companion whose face this is, `None` for the scene's own, and the face in [0, 6).
+#[inline]
+pub fn split_face(face: u8) -> (Option<u8>, u8) {
+    ((face / 6).checked_sub(1), face % 6)
+}
+
 /// Polygons that can be a ray's departure: numbers below this.
 pub const MAX_POLYGONS: u32 = 1 << 16;
 /// Polygons that can be a ray's target: numbers below this.
 pub const MAX_TARGETS: u32 = (1 << 12) - 1;
+/// Fields beside a scene's own that rays can tell apart: numbers below this.
+pub const MAX_COMPANIONS: u8 = 30;
 
 impl FlattenedRay {
     /// A ray from a point of space, of infinite reach.
@@ -73,14 +89,15 @@ impl FlattenedRay {
         Self { origin, direction, isovalue, reach: f32::INFINITY, departure: Departure::Free, target: None }
     }
 
-    /// Departure and target in 32 bits, for the spare word of an Embree ray: 2 bits of kind, 1 of side or 17 of polygon or 4 of cap,
-    /// 12 of target + 1.
+    /// Departure and target in 32 bits, for the spare word of an Embree ray: 2 bits of kind, 18 of polygon, of side and face, or of side and
+    /// companion + 1, 12 of target + 1.
     #[inline]
     pub fn pack_ends(&self) -> u32 {
         let departure = match self.departure {
             Departure::Free => 0,
             Departure::Surface(Side::Lower) => 1,
             Departure::Surface(Side::Higher) => 1 | 1 << 2,
+            Departure::Companion(n, side) => 1 | ((u32::from(n) + 1) << 1 | side.index() as u32) << 2,
             Departure::Polygon(id) => 2 | id << 2,
             Departure::Cap(face, side) => 3 | (u32::from(face) << 1 | side.index() as u32) << 2,
         };
@@ -91,13 +108,15 @@ impl FlattenedRay {
     #[inline]
     pub fn unpack_ends(bits: u32) -> (Departure, Option<u32>) {
         let payload = bits >> 2 & 0x3_ffff;
+        let side = if payload & 1 == 0 { Side::Lower } else { Side::Higher };
+        #[allow(clippy::cast_possible_truncation, reason = "packed from bytes")]
+        let number = (payload >> 1) as u8;
         let departure = match bits & 3 {
             0 => Departure::Free,
-            1 if payload & 1 == 0 => Departure::Surface(Side::Lower),
-            1 => Departure::Surface(Side::Higher),
+            1 if number == 0 => Departure::Surface(side),
+            1 => Departure::Companion(number - 1, side),
             2 => Departure::Polygon(payload),
-            #[allow(clippy::cast_possible_truncation, reason = "a face is below 6")]
-            _ => Departure::Cap((payload >> 1) as u8, if payload & 1 == 0 { Side::Lower } else { Side::Higher }),
+            _ => Departure::Cap(number, side),
         };
         (departure, (bits >> 20).checked_sub(1))
     }
@@ -114,11 +133,13 @@ impl FlattenedRay {
 pub enum Target {
     /// The level set, from `Side`.
     Surface(Side),
-    /// A face of Ω with h ≥ c behind it, seen from outside or inside ([`crate::scene::Boundary::Capped`] only):
-    /// axis + 3 · (far end), and the side it was met from.
+    /// A face of Ω with h ≥ c behind it, seen from outside or inside ([`crate::scene::Boundary::Capped`] only): the face
+    /// ([`face_of`]), and the side it was met from.
     Cap(u8, Side),
     /// A polygon's front, or a luminaire's back.
     Polygon(u32),
+    /// The level set of companion number n, from `Side`.
+    Companion(u8, Side),
 }
 
 /// The nearest hit of a ray.
@@ -144,6 +165,9 @@ mod tests {
             Departure::Polygon(MAX_POLYGONS - 1),
             Departure::Cap(0, Side::Higher),
             Departure::Cap(5, Side::Lower),
+            Departure::Cap(face_of(MAX_COMPANIONS - 1, 5), Side::Higher),
+            Departure::Companion(0, Side::Lower),
+            Departure::Companion(MAX_COMPANIONS - 1, Side::Higher),
         ];
         for departure in departures {
             for target in [None, Some(0), Some(7), Some(MAX_TARGETS - 1)] {

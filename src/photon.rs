@@ -14,12 +14,14 @@ use std::ops::AddAssign;
 /// A photon that landed on a level set.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SurfacePhoton {
-    /// Where, local frame.
+    /// Where, in the index space of the field.
     pub position: Vec3,
     /// Height c of its hyperplane, [0, 1].
     pub isovalue: f32,
     /// Power × isovalue per channel, before reflection.
     pub power: Vec3,
+    /// The number of the field whose level set it is.
+    pub field: u8,
     /// Reflections before this landing: 0 is direct light of a luminaire. Light of emitting level sets starts at 1,
     /// since no receiver counts it apart.
     pub bounces: u16,
@@ -126,14 +128,14 @@ const CHUNK: u64 = 1 << 14;
 enum Source {
     /// A luminaire, by polygon number.
     Luminaire(u32, DVec3),
-    /// The emitting level sets.
-    Field(DVec3),
+    /// The emitting level sets of a field, by its number.
+    Field(usize, DVec3),
 }
 
 impl Source {
     fn power(&self) -> DVec3 {
         match self {
-            Source::Luminaire(_, p) | Source::Field(p) => *p,
+            Source::Luminaire(_, p) | Source::Field(_, p) => *p,
         }
     }
 }
@@ -188,12 +190,12 @@ fn sources(scene: &Scene) -> Vec<Source> {
             Source::Luminaire(l, PI * p.area() * p.emission)
         })
         .collect();
-    if scene.surface.emission != DVec3::ZERO {
+    for (number, member) in scene.members().iter().enumerate().filter(|(_, m)| m.surface.emission != DVec3::ZERO) {
         // Both sides emit π L_e |∇h| per volume; |∇h| multiplies the single photon. The mean slope of the sweep across
         // Ω's diagonal only balances this source against luminaires.
-        let lattice = scene.lattice();
+        let lattice = member.field.lattice();
         let diagonal = (lattice.axes() * lattice.far()).length();
-        sources.push(Source::Field(2.0 * PI * scene.surface.emission * lattice.world_volume() / diagonal));
+        sources.push(Source::Field(number, 2.0 * PI * member.surface.emission * lattice.world_volume() / diagonal));
     }
     sources
 }
@@ -222,7 +224,6 @@ fn trace_photon<T: Tracer>(
     let mut rng = Rng::stream(settings.seed, Stage::Photon, index);
     out.emitted += 1;
     let Some(mut photon) = emit(scene, settings, sources, total, index) else { return };
-    let surface_albedo = |photon: &Flight| scene.surface.albedo.at(f64::from(photon.isovalue));
     let lattice = scene.lattice();
     let bin = ((photon.isovalue * ENERGY_BINS as f32) as usize).min(ENERGY_BINS - 1);
     let energy = &mut out.energy[bin];
@@ -247,20 +248,36 @@ fn trace_photon<T: Tracer>(
                     position,
                     isovalue: photon.isovalue,
                     power: photon.power.as_vec3(),
+                    field: scene.number() as u8,
                     bounces,
                     side,
                 });
-                (surface_albedo(&photon), scene.normal(position.as_dvec3(), side), Departure::Surface(side))
+                let albedo = scene.surface.albedo.at(f64::from(photon.isovalue));
+                (albedo, scene.normal(position.as_dvec3(), side), Departure::Surface(side))
+            }
+            Target::Companion(n, side) => {
+                let companion = &scene.companions()[usize::from(n)];
+                out.surface.push(SurfacePhoton {
+                    position: companion.to_index(position.as_dvec3()).as_vec3(),
+                    isovalue: photon.isovalue,
+                    power: photon.power.as_vec3(),
+                    field: companion.number as u8,
+                    bounces,
+                    side,
+                });
+                let normal = companion.normal(position.as_dvec3(), side);
+                let albedo = companion.member.surface.albedo.at(f64::from(photon.isovalue));
+                (albedo, normal, Departure::Companion(n, side))
             }
             Target::Cap(face, side) => {
                 // The texture of a cap is its outer side's.
                 if side == Side::Lower {
-                    let number = scene.polygons().len() as u32 + u32::from(face);
-                    store_flat(number, crate::flat::face_texture(scene, face, local));
+                    store_flat(crate::flat::cap(scene, face) as u32, crate::flat::face_texture(scene, face, local));
                 }
                 let n = scene.face_normal(face);
                 let n = if side == Side::Lower { n } else { -n };
-                (surface_albedo(&photon), Some(n), Departure::Cap(face, side))
+                let albedo = scene.face_surface(face).albedo.at(f64::from(photon.isovalue));
+                (albedo, Some(n), Departure::Cap(face, side))
             }
             Target::Polygon(id) => {
                 let p = &scene.polygons()[id as usize];
@@ -327,10 +344,15 @@ fn emit(scene: &Scene, settings: &PhotonSettings, sources: &[Source], total: f64
                 bounces: 0,
             })
         }
-        Source::Field(_) => {
+        Source::Field(number, _) => {
+            // By the field's own lattice, from whatever field the scene is seen.
+            let companion = scene.companions().iter().position(|c| c.number == number);
+            let other = companion.map(|n| &scene.companions()[n]);
+            let field = other.map_or(&scene.field, |c| &c.member.field);
+            let lattice = field.lattice();
             let [v, w] = set.point2(i, 1);
-            let origin = (scene.lattice().far() * DVec3::new(set.coordinate(i, 0), v, w)).as_vec3();
-            let h = scene.field.value(origin.as_dvec3());
+            let origin = (lattice.far() * DVec3::new(set.coordinate(i, 0), v, w)).as_vec3();
+            let h = field.value(origin.as_dvec3());
             if !(0.0..=1.0).contains(&h) {
                 return None;
             }
@@ -340,15 +362,20 @@ fn emit(scene: &Scene, settings: &PhotonSettings, sources: &[Source], total: f64
             } else {
                 Side::Higher
             };
-            let normal = scene.normal(origin.as_dvec3(), side)?;
-            let lattice = scene.lattice();
+            let falling = field.falling_normal(origin.as_dvec3())?;
+            let normal = if side == Side::Lower { falling } else { -falling };
             let diagonal = (lattice.axes() * lattice.far()).length();
+            let power = share * field.gradient(origin.as_dvec3()).length() * diagonal;
+            let (origin, departure) = match (companion, other) {
+                (Some(n), Some(c)) => (c.from_index(origin.as_dvec3()).as_vec3(), Departure::Companion(n as u8, side)),
+                _ => (origin, Departure::Surface(side)),
+            };
             Some(Flight {
                 origin,
                 direction: Frame::new(normal).to_world(direction),
                 isovalue: h as f32,
-                departure: Departure::Surface(side),
-                power: share * scene.field.gradient(origin.as_dvec3()).length() * diagonal,
+                departure,
+                power,
                 bounces: 1,
             })
         }

@@ -32,6 +32,10 @@ pub struct RadianceSample {
     pub radiance: Vec3,
     /// Variance of the luminance.
     pub variance: f32,
+    /// Indirect irradiance by either half of the gather rays; 0 without gather.
+    pub indirect: [Vec3; 2],
+    /// The part of `variance` that is theirs.
+    pub indirect_variance: f32,
 }
 
 /// Samples and what they cost.
@@ -48,14 +52,16 @@ pub struct RadianceSamples {
 
 impl RadianceSample {
     /// Bytes of a sample in a checkpoint, without its position.
-    const SAVED: usize = 16;
+    const SAVED: usize = 44;
 }
 
-/// Samples as a block: rays, misses, and radiance and variance of each; a variance of −1 stands for none.
+/// Samples as a block: rays, misses, and the numbers of each; a variance of −1 stands for none.
 fn to_block(counts: [u64; 2], samples: &[Option<RadianceSample>]) -> Vec<u8> {
-    let numbers = samples.iter().flat_map(|s| match s {
-        Some(s) => [s.radiance.x, s.radiance.y, s.radiance.z, s.variance],
-        None => [0.0, 0.0, 0.0, -1.0],
+    let numbers = samples.iter().flat_map(|s| {
+        let s = s.unwrap_or(RadianceSample { variance: -1.0, ..RadianceSample::default() });
+        let [a, b] = s.indirect;
+        let r = s.radiance;
+        [r.x, r.y, r.z, s.variance, a.x, a.y, a.z, b.x, b.y, b.z, s.indirect_variance]
     });
     counts.into_iter().flat_map(u64::to_le_bytes).chain(numbers.flat_map(f32::to_le_bytes)).collect()
 }
@@ -65,8 +71,15 @@ fn from_block(bytes: &[u8], positions: &[Vec3]) -> ([u64; 2], Vec<Option<Radianc
     let (counts, numbers) = bytes.split_at(16);
     let counts = counts.as_chunks().0.iter().map(|b| u64::from_le_bytes(*b)).collect::<Vec<_>>();
     let samples = numbers.as_chunks::<{ RadianceSample::SAVED }>().0.iter().zip(positions).map(|(b, &position)| {
-        let [x, y, z, variance] = std::array::from_fn(|i| f32::from_le_bytes(std::array::from_fn(|n| b[4 * i + n])));
-        (variance != -1.0).then(|| RadianceSample { position, radiance: Vec3::new(x, y, z), variance })
+        let n: [f32; 11] = std::array::from_fn(|i| f32::from_le_bytes(std::array::from_fn(|k| b[4 * i + k])));
+        let vector = |i: usize| Vec3::new(n[i], n[i + 1], n[i + 2]);
+        (n[3] != -1.0).then(|| RadianceSample {
+            position,
+            radiance: vector(0),
+            variance: n[3],
+            indirect: [vector(4), vector(7)],
+            indirect_variance: n[10],
+        })
     });
     ([counts[0], counts[1]], samples.collect())
 }
@@ -121,13 +134,16 @@ pub fn sample_radiance<T: Tracer>(
                     let direct =
                         direct_irradiance(scene, tracer, &receiver, shadow_rays, (key.1, Stage::Direct, key.0));
                     traced += direct.rays;
+                    let mut halves = [DVec3::ZERO; 2];
                     let (mean, variance) = match indirect {
                         Indirect::Map(map) => {
                             let e = map.irradiance(p, isovalue, &mut scratch);
                             (e.mean, e.variance)
                         }
                         Indirect::Gather(cache, rays) => {
-                            let e = gathered_irradiance(scene, tracer, cache, &receiver, *rays, (key.1, key.0));
+                            let g = gathered_irradiance(scene, tracer, cache, &receiver, *rays, (key.1, key.0));
+                            halves = g.halves;
+                            let e = g.estimate;
                             traced += e.rays;
                             missed += e.misses;
                             (e.mean, e.variance)
@@ -141,6 +157,8 @@ pub fn sample_radiance<T: Tracer>(
                         radiance: (reflected(albedo, (direct.mean + mean).max(DVec3::ZERO)) + scene.surface.emission)
                             .as_vec3(),
                         variance: ((direct.variance + variance) * scale * scale) as f32,
+                        indirect: halves.map(|h| h.as_vec3()),
+                        indirect_variance: (variance * scale * scale) as f32,
                     })
                 })
                 .collect::<Vec<_>>();

@@ -4,11 +4,12 @@
 use crate::brdf::reflected;
 use crate::checkpoint;
 use crate::direct::{Receiver, direct_irradiance};
+use crate::field::Field;
 use crate::flat::{self, FlatTexture, Texel};
 use crate::flattened::{Departure, Side, Target};
 use crate::mask::{Mask, masks, stand_ins};
 use crate::nearest::Neighbours;
-use crate::photon::{FlatPhoton, Photons};
+use crate::photon::{FlatPhoton, Photons, SurfacePhoton};
 use crate::photon_map::{EstimateSettings, PhotonMap};
 use crate::rng::Stage;
 use crate::scene::Scene;
@@ -32,11 +33,14 @@ pub struct CacheSettings {
     pub seed: u64,
 }
 
+/// What a white surface would reflect at the nodes of a field's lattice, per side; `None` where nothing looks.
+type Nodes = [Option<Vec<[f32; 3]>>; 2];
+
 /// Outgoing radiance (reflected and, for emitting level sets, emitted) wherever a gather ray can land.
 pub struct RadianceCache {
-    /// Per side (lower, higher): what a white surface would reflect at each node, NaN where neither the node nor its
-    /// surroundings hold a surface. The albedo is that of the hit: isovalues may differ much from node to node.
-    nodes: [Option<Vec<[f32; 3]>>; 2],
+    /// Per field and side (lower, higher): what a white surface would reflect at each node, NaN where neither the node nor
+    /// its surroundings hold a surface. The albedo is that of the hit: isovalues may differ much from node to node.
+    nodes: Vec<Nodes>,
     /// What gather rays find: photons under the narrowest kernel, since many rays average their noise.
     flats: Vec<Option<FlatTexture>>,
     /// What pictures show, if not the same: photons smoothed until their noise is not seen.
@@ -66,21 +70,42 @@ impl RadianceCache {
             .into_par_iter()
             .map(|n| fill_flat(scene, tracer, n, photons_of.flat(n), settings, &rays))
             .unzip();
+        let mut cache =
+            Self { nodes: vec![[None, None]; scene.fields()], flats, shown: Some(shown), rays: rays.into_inner() };
+        if with_nodes {
+            cache.fill(scene, tracer, photons, estimate, settings, saved, tick);
+        }
+        cache
+    }
+
+    /// Fills the nodes of the scene's own field; of a scene of several, seen from each in turn.
+    #[allow(clippy::too_many_arguments, reason = "one call per bake and field")]
+    pub fn fill<T: Tracer>(
+        &mut self,
+        scene: &Scene,
+        tracer: &T,
+        photons: &Photons,
+        estimate: EstimateSettings,
+        settings: &CacheSettings,
+        saved: [checkpoint::Stage<'_>; 2],
+        tick: &(dyn Fn(u64) -> bool + Sync),
+    ) {
+        let rays = AtomicU64::new(0);
+        let own = |p: &SurfacePhoton| usize::from(p.field) == scene.number();
         // A side is filled if photons reach it, or light can: the outside always.
-        let nodes = [Side::Lower, Side::Higher].map(|side| {
+        self.nodes[scene.number()] = [Side::Lower, Side::Higher].map(|side| {
             let used = side == scene.surface.outside
                 || scene.surface.both_sides
-                || photons.surface.iter().any(|p| p.side == side);
-            (with_nodes && used)
-                .then(|| fill_nodes(scene, tracer, photons, side, estimate, settings, saved[side.index()], tick, &rays))
+                || photons.surface.iter().any(|p| own(p) && p.side == side);
+            used.then(|| fill_nodes(scene, tracer, photons, side, estimate, settings, saved[side.index()], tick, &rays))
         });
-        Self { nodes, flats, shown: Some(shown), rays: rays.into_inner() }
+        self.rays += rays.into_inner();
     }
 
     /// A cache of light known already: per side (lower, higher) irradiance / π at the nodes of the scene's lattice, NaN
     /// where unknown, and the flats' radiance.
-    pub fn from_parts(nodes: [Option<Vec<[f32; 3]>>; 2], flats: Vec<Option<FlatTexture>>) -> Self {
-        Self { nodes, flats, shown: None, rays: 0 }
+    pub fn from_parts(nodes: Nodes, flats: Vec<Option<FlatTexture>>) -> Self {
+        Self { nodes: vec![nodes], flats, shown: None, rays: 0 }
     }
 
     /// Total work units that `tick` will see, for a progress bar.
@@ -93,13 +118,20 @@ impl RadianceCache {
     pub fn lookup(&self, scene: &Scene, target: Target, position: DVec3, isovalue: f32, misses: &mut u64) -> DVec3 {
         match target {
             Target::Surface(side) => {
-                let albedo = scene.surface.albedo.at(f64::from(isovalue));
-                albedo * self.white(scene, side, position, misses) + scene.surface.emission
+                let surface = &scene.surface;
+                let white = self.white(scene.number(), &scene.field, side, position, misses);
+                surface.albedo.at(f64::from(isovalue)) * white + surface.emission
+            }
+            Target::Companion(n, side) => {
+                let c = &scene.companions()[usize::from(n)];
+                let surface = &c.member.surface;
+                let white = self.white(c.number, &c.member.field, side, c.to_index(position), misses);
+                surface.albedo.at(f64::from(isovalue)) * white + surface.emission
             }
             Target::Cap(_, Side::Higher) => DVec3::ZERO,
             Target::Cap(face, Side::Lower) => {
                 let uv = flat::face_texture(scene, face, position);
-                self.flat(scene.polygons().len() + usize::from(face), uv, isovalue)
+                self.flat(flat::cap(scene, face), uv, isovalue)
             }
             Target::Polygon(id) => {
                 let uv = scene.polygons()[id as usize].texture(scene.lattice().to_world(position));
@@ -112,14 +144,14 @@ impl RadianceCache {
         self.flats[number].as_ref().map_or(DVec3::ZERO, |t| t.lookup([u, v, f64::from(isovalue)]))
     }
 
-    /// What a white surface would reflect: trilinear over the filled nodes of the cell.
-    fn white(&self, scene: &Scene, side: Side, position: DVec3, misses: &mut u64) -> DVec3 {
-        let Some(nodes) = &self.nodes[side.index()] else { return DVec3::ZERO };
-        let ([i, j, k], u) = scene.field.locate(position);
+    /// What a white surface of field `number` would reflect: trilinear over the filled nodes of the cell.
+    fn white(&self, number: usize, field: &Field, side: Side, position: DVec3, misses: &mut u64) -> DVec3 {
+        let Some(nodes) = self.nodes.get(number).and_then(|n| n[side.index()].as_ref()) else { return DVec3::ZERO };
+        let ([i, j, k], u) = field.locate(position);
         let (mut sum, mut weight) = (DVec3::ZERO, 0.0);
         for corner in 0..8 {
             let [x, y, z] = [corner & 1, corner >> 1 & 1, corner >> 2];
-            let value = nodes[scene.lattice().offset(i + x, j + y, k + z)];
+            let value = nodes[field.lattice().offset(i + x, j + y, k + z)];
             if value[0].is_nan() {
                 continue;
             }
@@ -188,7 +220,7 @@ fn fill_nodes<T: Tracer>(
             }
             let (mut sum, mut count) = (DVec3::ZERO, 0.0);
             for (stand_in, p) in
-                stand_ins(&scene.field, scene.lattice(), node, settings.seed).into_iter().flatten().enumerate()
+                stand_ins::<2>(&scene.field, scene.lattice(), node, settings.seed).into_iter().flatten().enumerate()
             {
                 let position = p.as_vec3();
                 let Some(normal) = scene.normal(position.as_dvec3(), side) else { continue };

@@ -126,6 +126,16 @@ pub fn receiver(scene: &Scene, p: DVec3, isovalue: f32, side: Side) -> Option<Re
     Some(Receiver { position, normal, isovalue, departure: Departure::Surface(side) })
 }
 
+/// The scene seen from each companion, with its isosurface, which may be empty.
+fn companion_meshes(scene: &Scene, isovalue: f32) -> Vec<(Scene, SurfaceMesh)> {
+    let seen = scene.companions().iter().map(|c| scene.seen_from(c.number));
+    seen.map(|s| {
+        let mesh = SurfaceMesh::extract(&s, isovalue, 1).unwrap_or_default();
+        (s, mesh)
+    })
+    .collect()
+}
+
 /// Outgoing radiance of the outside at the vertices of `mesh`, the isosurface at `isovalue` (units of the sweep).
 /// `tick(n)` reports n of batches × vertices done; returning false stops early.
 #[allow(clippy::cast_possible_truncation, reason = "batches are few")]
@@ -138,6 +148,10 @@ pub fn reference<T: Tracer>(
     tick: &(dyn Fn(u64) -> bool + Sync),
 ) -> Reference {
     let side = scene.surface.outside;
+    let companions = match settings.integrator {
+        Integrator::Path => Vec::new(),
+        Integrator::Photon => companion_meshes(scene, isovalue),
+    };
     let chosen = subset(mesh.local.len(), settings.vertices);
     let receivers: Vec<Option<Receiver>> =
         chosen.iter().map(|&v| receiver(scene, mesh.local[v], isovalue, side)).collect();
@@ -160,7 +174,7 @@ pub fn reference<T: Tracer>(
                 &|_| tick(0),
             );
             rays.fetch_add(photons.rays, Ordering::Relaxed);
-            SurfaceMap::new(scene, mesh, isovalue, &photons, settings.map)
+            SurfaceMap::new(scene, mesh, &companions, isovalue, &photons, settings.map)
         });
         let estimates: Vec<DVec3> = chosen
             .par_iter()

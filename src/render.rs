@@ -6,7 +6,7 @@ use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
 use crate::export::picture::Picture;
 use crate::flat;
-use crate::flattened::{FlattenedHit, FlattenedRay, Side, Target};
+use crate::flattened::{FlattenedHit, FlattenedRay, Side, Target, split_face};
 use crate::rng::{Sobol, Stage};
 use crate::scene::Scene;
 use crate::tracer::Tracer;
@@ -153,15 +153,22 @@ pub fn trace_picture<T: Tracer>(
 fn radiance(baked: &BakedVolume, ray: &FlattenedRay, hit: FlattenedHit) -> Option<DVec3> {
     let scene = &baked.scene;
     let p = ray.at(hit.t);
-    let texture = |number: usize, uv: [f64; 2]| {
+    let texture = |baked: &BakedVolume, number: usize, uv: [f64; 2]| {
         let t = baked.flats.get(number)?.as_ref()?;
         Some(t.lookup([uv[0], uv[1], f64::from(ray.isovalue)]))
     };
     match hit.target {
         Target::Surface(side) => baked.radiance(side, p),
+        Target::Companion(n, side) => {
+            let companion = &scene.companions()[usize::from(n)];
+            baked.companions[usize::from(n)].radiance(side, companion.to_index(p))
+        }
         Target::Cap(_, Side::Higher) => Some(DVec3::ZERO),
         Target::Cap(face, Side::Lower) => {
-            texture(scene.polygons().len() + usize::from(face), flat::face_texture(scene, face, p))
+            // Each bake holds its own caps.
+            let (companion, own) = split_face(face);
+            let baked = companion.map_or(baked, |n| &baked.companions[usize::from(n)]);
+            texture(baked, scene.polygons().len() + usize::from(own), flat::face_texture(scene, face, p))
         }
         Target::Polygon(id) => {
             let polygon = &scene.polygons()[id as usize];
@@ -171,7 +178,7 @@ fn radiance(baked: &BakedVolume, ray: &FlattenedRay, hit: FlattenedHit) -> Optio
                 return Some(DVec3::ZERO);
             }
             let uv = polygon.texture(scene.lattice().to_world(p));
-            Some(polygon.emission + texture(id as usize, uv).unwrap_or(DVec3::ZERO))
+            Some(polygon.emission + texture(baked, id as usize, uv).unwrap_or(DVec3::ZERO))
         }
     }
 }
@@ -179,10 +186,14 @@ fn radiance(baked: &BakedVolume, ray: &FlattenedRay, hit: FlattenedHit) -> Optio
 /// Headlight shading, already exposed: ρ (0.15 + 0.85 |cos|).
 fn local(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit, direction: DVec3) -> DVec3 {
     let p = ray.at(hit.t);
-    let surface_albedo = || scene.surface.albedo.at(f64::from(ray.isovalue));
+    let isovalue = f64::from(ray.isovalue);
     let (albedo, normal) = match hit.target {
-        Target::Surface(side) => (surface_albedo(), scene.normal(p, side)),
-        Target::Cap(face, _) => (surface_albedo(), Some(scene.face_normal(face))),
+        Target::Surface(side) => (scene.surface.albedo.at(isovalue), scene.normal(p, side)),
+        Target::Companion(n, side) => {
+            let companion = &scene.companions()[usize::from(n)];
+            (companion.member.surface.albedo.at(isovalue), companion.normal(p, side))
+        }
+        Target::Cap(face, _) => (scene.face_surface(face).albedo.at(isovalue), Some(scene.face_normal(face))),
         Target::Polygon(id) => {
             let polygon = &scene.polygons()[id as usize];
             if polygon.emission != DVec3::ZERO {

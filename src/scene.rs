@@ -1,8 +1,10 @@
 //! What one hyperplane contains: the level set, walls, luminaires; and the Cornell box that fits itself around any
 //! volume.
 
+mod companion;
 mod obj;
 
+pub use companion::{Companion, Member, Policy};
 pub use obj::{Placement, read_context, read_obj};
 
 use crate::error::{Error, Result};
@@ -13,6 +15,7 @@ use crate::polygon::Polygon;
 use crate::reflectance::Reflectance;
 use crate::volume::Lattice;
 use glam::{DVec3, Vec3};
+use std::sync::Arc;
 
 /// What the faces of Ω do to a level set that runs into them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -53,14 +56,50 @@ impl Surface {
 #[derive(Clone, Debug)]
 pub struct Scene {
     /// h, its lattice and the sweep.
-    pub field: Field,
+    pub field: Arc<Field>,
     /// Material and sides of the isosurfaces.
     pub surface: Surface,
     /// What Ω's faces do.
     pub boundary: Boundary,
+    /// The name of its field; empty if there is no other.
+    pub name: String,
+    number: usize,
+    companions: Vec<Companion>,
+    policy: Policy,
     polygons: Vec<Polygon>,
     luminaires: Vec<u32>,
     interior: [DVec3; 2],
+}
+
+/// Whether a field can stand among `polygons`.
+fn check(surface: &Surface, boundary: Boundary, lattice: &Lattice, polygons: &[Polygon]) -> Result<()> {
+    let fail = |what: String| Err(Error::Invalid(what));
+    for (_, albedo) in surface.albedo.stops() {
+        if !(albedo.cmpge(DVec3::ZERO).all() && albedo.cmple(DVec3::ONE).all()) {
+            return fail(format!("surface albedo {albedo}: every channel must lie in [0, 1]"));
+        }
+    }
+    if !(surface.emission.cmpge(DVec3::ZERO).all() && surface.emission.is_finite()) {
+        return fail(format!("surface emission {}: must be finite and not negative", surface.emission));
+    }
+    if boundary == Boundary::Capped {
+        // A cap is a surface of its own: a wall in the same plane would hide it or be hidden.
+        let far = lattice.far();
+        for p in polygons {
+            let local: Vec<DVec3> = p.vertices().iter().map(|&x| lattice.to_index(x)).collect();
+            for a in 0..3 {
+                for plane in [0.0, far[a]] {
+                    if local.iter().all(|v| (v[a] - plane).abs() < 1e-6 * far[a]) {
+                        return fail(format!(
+                            "boundary = \"capped\": polygon '{}' lies in a face of the volume; give the box a margin",
+                            p.name
+                        ));
+                    }
+                }
+            }
+        }
+    }
+    Ok(())
 }
 
 impl Scene {
@@ -68,42 +107,23 @@ impl Scene {
     ///
     /// # Errors
     /// `Invalid` for an albedo outside [0, 1], a negative emission, too many polygons, or capped faces that touch a wall.
-    pub fn new(field: Field, surface: Surface, boundary: Boundary, polygons: Vec<Polygon>) -> Result<Self> {
-        let fail = |what: String| Err(Error::Invalid(what));
-        for (_, albedo) in surface.albedo.stops() {
-            if !(albedo.cmpge(DVec3::ZERO).all() && albedo.cmple(DVec3::ONE).all()) {
-                return fail(format!("surface albedo {albedo}: every channel must lie in [0, 1]"));
-            }
-        }
-        if !(surface.emission.cmpge(DVec3::ZERO).all() && surface.emission.is_finite()) {
-            return fail(format!("surface emission {}: must be finite and not negative", surface.emission));
-        }
+    pub fn new(
+        field: impl Into<Arc<Field>>,
+        surface: Surface,
+        boundary: Boundary,
+        polygons: Vec<Polygon>,
+    ) -> Result<Self> {
+        let field = field.into();
         let (mut polygons, walls): (Vec<_>, Vec<_>) = polygons.into_iter().partition(|p| p.emission != DVec3::ZERO);
         let count = polygons.len();
         polygons.extend(walls);
+        let lattice = field.lattice();
+        check(&surface, boundary, lattice, &polygons)?;
         if count > MAX_TARGETS as usize || polygons.len() > MAX_POLYGONS as usize {
-            return fail(format!(
+            return Err(Error::Invalid(format!(
                 "{count} luminaires among {} polygons: at most {MAX_TARGETS} among {MAX_POLYGONS} are possible",
                 polygons.len()
-            ));
-        }
-        let lattice = field.lattice();
-        if boundary == Boundary::Capped {
-            // A cap is a surface of its own: a wall in the same plane would hide it or be hidden.
-            let far = lattice.far();
-            for p in &polygons {
-                let local: Vec<DVec3> = p.vertices().iter().map(|&x| lattice.to_index(x)).collect();
-                for a in 0..3 {
-                    for plane in [0.0, far[a]] {
-                        if local.iter().all(|v| (v[a] - plane).abs() < 1e-6 * far[a]) {
-                            return fail(format!(
-                                "boundary = \"capped\": polygon '{}' lies in a face of the volume; give the box a margin",
-                                p.name
-                            ));
-                        }
-                    }
-                }
-            }
+            )));
         }
         let mut lo = DVec3::INFINITY;
         let mut hi = DVec3::NEG_INFINITY;
@@ -113,13 +133,26 @@ impl Scene {
             (lo, hi) = (lo.min(x), hi.max(x));
         }
         let luminaires = (0..u32::try_from(count).expect("checked above")).collect();
-        Ok(Self { field, surface, boundary, polygons, luminaires, interior: [lo, hi] })
+        Ok(Self {
+            field,
+            surface,
+            boundary,
+            name: String::new(),
+            number: 0,
+            companions: Vec::new(),
+            policy: Policy::default(),
+            polygons,
+            luminaires,
+            interior: [lo, hi],
+        })
     }
 
     /// The same scene with its field on another lattice over the same Ω ([`Field::resampled`]).
     #[must_use]
     pub fn resampled(&self, lattice: &Lattice) -> Self {
-        Self { field: self.field.resampled(lattice), ..self.clone() }
+        let field = Arc::new(self.field.resampled(lattice));
+        let companions = self.companions.iter().map(|c| c.seen_on(lattice)).collect();
+        Self { field, companions, ..self.clone() }
     }
 
     /// Walls and luminaires; luminaires come first.
@@ -156,15 +189,11 @@ impl Scene {
         FlattenedRay { departure, ..FlattenedRay::free(origin, direction, isovalue) }
     }
 
-    /// World normal of Ω's face `face` (axis + 3 · far end), pointing out of Ω.
-    pub fn face_normal(&self, face: u8) -> DVec3 {
-        outward_normal(self.lattice(), usize::from(face % 3), face >= 3)
-    }
-
-    /// E₀: the unoccluded irradiance of a patch at the centre of the scene that faces the strongest luminaire; the largest
+    /// E₀: the unoccluded irradiance of a patch at the centre of the (first) volume that faces the strongest luminaire; the largest
     /// channel of the sum over all luminaires. 0 without luminaires.
     pub fn reference_irradiance(&self) -> f64 {
-        let centre = self.lattice().to_world(0.5 * self.lattice().far());
+        let first = self.companions.iter().find(|c| c.number == 0).map_or(self.lattice(), |c| c.member.field.lattice());
+        let centre = first.to_world(0.5 * first.far());
         let flux = |p: &Polygon| p.emission.max_element() * p.area();
         let lights = || self.luminaires.iter().map(|&l| &self.polygons[l as usize]);
         let Some(strongest) = lights().max_by(|a, b| flux(a).total_cmp(&flux(b))) else { return 0.0 };
@@ -175,7 +204,9 @@ impl Scene {
 
     /// Display exposure: rgb = radiance × π / (ρ_max E₀), ρ_max over all channels and the sweep; 1 where that is undefined.
     pub fn exposure(&self) -> f64 {
-        let scale = self.surface.albedo.greatest().max_element() * self.reference_irradiance() / std::f64::consts::PI;
+        let brightest = self.companions.iter().map(|c| c.member.surface.albedo.greatest().max_element());
+        let brightest = brightest.fold(self.surface.albedo.greatest().max_element(), f64::max);
+        let scale = brightest * self.reference_irradiance() / std::f64::consts::PI;
         if scale > 0.0 { 1.0 / scale } else { 1.0 }
     }
 }

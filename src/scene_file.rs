@@ -1,8 +1,12 @@
 //! Scene files (TOML), and how a volume, a scene file and flags become a [`Scene`].
 
 mod fault;
+mod frames;
+mod several;
 
 pub use fault::fault;
+pub use frames::load_series;
+pub use several::{PolicyName, VolumeEntry, Volumes};
 
 use crate::bake::BakeOptions;
 use crate::error::{Error, Result};
@@ -11,11 +15,10 @@ use crate::flattened::Side;
 use crate::polygon::Polygon;
 use crate::reflectance::Reflectance;
 use crate::scene::{Boundary, Placement, Scene, Surface, cornell_box, read_context, read_obj};
-use crate::series::Series;
 use crate::volume::generate::Generator;
 use crate::volume::raw::RawLayout;
 use crate::volume::statistics::VolumeStatistics;
-use crate::volume::{ElementType, Endian, Volume};
+use crate::volume::{ElementType, Endian, Lattice, Volume};
 use glam::DVec3;
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
@@ -24,8 +27,10 @@ use std::path::{Path, PathBuf};
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
 pub struct SceneFile {
-    /// The volume.
-    pub volume: VolumeSource,
+    /// The volume, or several.
+    pub volume: Volumes,
+    /// How several volumes share light (default joint).
+    pub policy: Option<PolicyName>,
     /// The sweep [lo, hi] in source units; a suggestion from the data if absent.
     pub isovalues: Option<[f64; 2]>,
     /// Material and sides.
@@ -331,8 +336,10 @@ pub struct SceneOptions {
 
 /// A scene ready to bake, and the volume it came from.
 pub struct Loaded {
-    /// The volume in source units.
+    /// The volume in source units; of several, the first.
     pub volume: Volume,
+    /// The other volumes, in the order of the scene's fields.
+    pub companions: Vec<Volume>,
     /// The scene.
     pub scene: Scene,
     /// The file's `[bake]` table.
@@ -381,42 +388,37 @@ impl Source {
 pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
     let (source, file, folder) = parse(input)?;
     let is_scene = source.is_some();
+    let single = match &file.volume {
+        Volumes::One(single) => single,
+        Volumes::Several(entries) => return several::load(entries, &file, input, options),
+    };
     // What a flag brought is the flag's fault, the rest its key's.
     let blame = |key: &'static str, flag: bool| {
         let source = source.as_ref().filter(|_| !flag);
         move |e: Error| source.map_or_else(|| Error::Invalid(e.to_string()), |s| s.blame(key, &e))
     };
-    let key = match &file.volume {
-        VolumeSource { files: Some(_), .. } => "files",
-        VolumeSource { file: Some(_), .. } => "file",
-        _ => "generator",
-    };
-    let series = file.volume.series(&folder).map_err(blame(key, false))?;
-    let read = |path: &Path| read_volume(path, &file.volume, &options.raw);
+    if file.policy.is_some() {
+        return Err(blame("policy", false)(Error::Invalid(
+            "there is only one volume; list several as [[volume]]".into(),
+        )));
+    }
+    let key = single.key();
+    let series = single.series(&folder).map_err(blame(key, false))?;
+    let read = |path: &Path| frames::read_volume(path, single, &options.raw);
     let volume = match (&series, options.time) {
-        (None, None) => load_volume(&file.volume, &folder, &options.raw).map_err(blame(key, false))?,
-        (Some(series), Some(time)) => series.at(time, read).map_err(blame(key, true))?,
-        (Some(series), None) => {
-            return Err(Error::invalid(
-                input,
-                format!("is a series of {} volumes; choose a moment with --time", series.times().len()),
-            ));
-        }
+        (Some(series), time) => frames::moment(series, time, input, read).map_err(blame(key, true))?,
+        (None, None) => load_volume(single, &folder, &options.raw).map_err(blame(key, false))?,
         (None, Some(time)) => {
             return Err(Error::invalid(input, format!("is a single volume: --time {time} chooses of a series")));
         }
     };
-    let isovalues = match (options.isovalues.as_deref(), file.isovalues) {
-        (Some(&[lo, hi]), _) => [lo, hi],
-        (_, Some(range)) => range,
-        _ if series.is_some() => series
-            .as_ref()
-            .map_or(Ok(None), |s| s.check(read))?
-            .ok_or_else(|| Error::invalid(input, "no frame holds an isosurface"))?,
-        _ => VolumeStatistics::of(&volume).sweep.ok_or_else(|| match volume.range() {
-            None => Error::invalid(&volume.name, "none of its samples is finite"),
-            Some((v, _)) => Error::invalid(&volume.name, format!("every sample is {v}: it holds no isosurface")),
-        })?,
+    let isovalues = match (options.isovalues.as_deref(), file.isovalues, &series) {
+        (Some(&[lo, hi]), ..) => [lo, hi],
+        (_, Some(range), _) => range,
+        (.., Some(series)) => {
+            series.check(read)?.ok_or_else(|| Error::invalid(input, "no frame holds an isosurface"))?
+        }
+        _ => suggested(&volume)?,
     };
     let given = options.isovalues.is_some() || file.isovalues.is_none();
     let sweep = Sweep::new(isovalues[0], isovalues[1]).map_err(blame("isovalues", given))?;
@@ -424,29 +426,26 @@ pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
     let boxed = options.surroundings.kind.is_some() || options.surroundings.margin.is_some();
     let key = if file.surroundings.kind.is_some() { "kind" } else { "margin" };
     let mut polygons =
-        surroundings(&file.surroundings, &options.surroundings, &folder, &field).map_err(blame(key, boxed))?;
-    for context in &file.context {
-        polygons.extend(context.polygons(&folder).map_err(blame("[[context]]", false))?);
-    }
+        surroundings(&file.surroundings, &options.surroundings, &folder, field.lattice()).map_err(blame(key, boxed))?;
+    polygons.extend(context(&file.context, &folder).map_err(blame("[[context]]", false))?);
     let flag = options.surface.albedo.is_some();
     let (surface, boundary) = surface(&file.surface, &options.surface, sweep).map_err(blame("albedo", flag))?;
     let scene =
         Scene::new(field, surface, boundary, polygons).map_err(|e| if is_scene { e.in_file(input) } else { e })?;
-    Ok(Loaded { volume, scene, bake: file.bake })
+    Ok(Loaded { volume, companions: Vec::new(), scene, bake: file.bake })
 }
 
-/// The series of volumes that `input` is, if it is one.
-///
-/// # Errors
-/// As [`load`]; `Invalid` also if its frames do not share a lattice.
-pub fn load_series(input: &Path, options: &SceneOptions) -> Result<Option<Series>> {
-    let (source, file, folder) = parse(input)?;
-    let blame = |e: Error| source.as_ref().map_or_else(|| e.to_string(), |s| s.blame("file", &e).to_string());
-    let series = file.volume.series(&folder).map_err(|e| Error::Invalid(blame(e)))?;
-    if let Some(series) = &series {
-        series.check(|path| read_volume(path, &file.volume, &options.raw))?;
-    }
-    Ok(series)
+/// Polygons of all context geometry.
+fn context(entries: &[ContextOptions], folder: &Path) -> Result<Vec<Polygon>> {
+    Ok(entries.iter().map(|c| c.polygons(folder)).collect::<Result<Vec<_>>>()?.concat())
+}
+
+/// The sweep that the data suggest.
+fn suggested(volume: &Volume) -> Result<[f64; 2]> {
+    VolumeStatistics::of(volume).sweep.ok_or_else(|| match volume.range() {
+        None => Error::invalid(&volume.name, "none of its samples is finite"),
+        Some((v, _)) => Error::invalid(&volume.name, format!("every sample is {v}: it holds no isosurface")),
+    })
 }
 
 /// The scene file that `input` is or stands for, its text if it is one, and where its paths begin.
@@ -457,42 +456,18 @@ fn parse(input: &Path) -> Result<(Option<Source>, SceneFile, PathBuf)> {
         return Ok((Some(source), file, input.parent().unwrap_or(Path::new("")).to_path_buf()));
     }
     let volume = VolumeSource { file: Some(input.to_path_buf()), ..VolumeSource::default() };
-    Ok((None, SceneFile { volume, ..SceneFile::default() }, PathBuf::new()))
-}
-
-impl VolumeSource {
-    fn series(&self, folder: &Path) -> Result<Option<Series>> {
-        let times = self.times.clone();
-        let series = match (&self.files, &self.file) {
-            (Some(_), Some(_)) => return Err(Error::Invalid("[volume] needs either file or files".into())),
-            (Some(files), None) => Some(Series::new(files.iter().map(|f| folder.join(f)).collect(), times)?),
-            (None, Some(file)) => Series::find(&folder.join(file), times)?,
-            (None, None) => None,
-        };
-        match &self.times {
-            Some(_) if series.is_none() => Err(Error::Invalid("times are for a series of files".into())),
-            _ => Ok(series),
-        }
-    }
-}
-
-fn read_volume(path: &Path, source: &VolumeSource, raw: &RawOptions) -> Result<Volume> {
-    let layout = if raw.given() { Some(raw) } else { source.raw.as_ref() };
-    match layout {
-        Some(layout) => layout.layout(path)?.read(path),
-        None => Volume::open(path),
-    }
+    Ok((None, SceneFile { volume: Volumes::One(volume), ..SceneFile::default() }, PathBuf::new()))
 }
 
 fn load_volume(source: &VolumeSource, folder: &Path, raw: &RawOptions) -> Result<Volume> {
     match (&source.file, &source.generator) {
-        (Some(file), None) => read_volume(&folder.join(file), source, raw),
+        (Some(file), None) => frames::read_volume(&folder.join(file), source, raw),
         (None, Some(name)) => Generator::from_name(name)?.sample([source.size.unwrap_or(101); 3]),
         _ => Err(Error::Invalid("[volume] needs either file or generator".into())),
     }
 }
 
-fn surroundings(file: &BoxOptions, flags: &BoxOptions, folder: &Path, field: &Field) -> Result<Vec<Polygon>> {
+fn surroundings(file: &BoxOptions, flags: &BoxOptions, folder: &Path, lattice: &Lattice) -> Result<Vec<Polygon>> {
     let margin = flags.margin.or(file.margin);
     // A path in a scene file is relative to it, one in a flag to the working folder.
     let (kind, folder) = match (&flags.kind, &file.kind) {
@@ -501,7 +476,7 @@ fn surroundings(file: &BoxOptions, flags: &BoxOptions, folder: &Path, field: &Fi
         (None, None) => ("cornell", folder),
     };
     match kind {
-        "cornell" => cornell_box(field.lattice(), margin.unwrap_or(0.0)),
+        "cornell" => cornell_box(lattice, margin.unwrap_or(0.0)),
         _ if margin.is_some() => Err(Error::Invalid(format!("box margin: only the Cornell box has one, not '{kind}'"))),
         "none" => Ok(Vec::new()),
         path => read_obj(&folder.join(path)),

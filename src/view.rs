@@ -58,6 +58,9 @@ impl Payload {
     #[allow(clippy::cast_possible_truncation, reason = "colours are f32")]
     pub fn new(baked: &BakedVolume, title: &str) -> Result<Self> {
         let scene = &baked.scene;
+        if scene.fields() > 1 {
+            return Err(Error::NotSupported("holds several volumes; name the .vti of one of them".into()));
+        }
         let lattice = scene.lattice();
         if lattice.len() > MOST_POINTS {
             let [x, y, z] = lattice.dims();

@@ -41,24 +41,35 @@ impl MemoryEstimate {
     /// # Errors
     /// `Invalid` if the grid has too many points; `Embree`.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "an estimate of positive numbers")]
-    pub fn new(scene: &Scene, volume: &Volume, settings: &BakeSettings, device: &Device) -> Result<Self> {
-        let lattice = settings.grid.lattice(scene.lattice())?;
-        let (voxels, points) = (scene.lattice().len() as u64, lattice.len() as u64);
-        // On the volume's own lattice: a finer one needs about the same share of its points.
-        let masks = masks(&scene.field, scene.lattice());
-        let needed = masks.iter().filter(|&&m| m != Mask::Empty).count() as u64;
-        let filled = masks.iter().filter(|&&m| m == Mask::Filled).count() as u64;
-        let stored = scene.surface.stored_sides().len() as u64;
-        let element = volume.samples().element_type().size() as u64;
-        // Volume, field, the pyramid of min and max, and a mask.
-        let base = PROGRAM + voxels * (element + 4) + voxels * 33 / 8 + points;
+    pub fn new(scene: &Scene, volumes: &[&Volume], settings: &BakeSettings, device: &Device) -> Result<Self> {
+        let mut base = PROGRAM;
+        // Of all fields; sides stored of any.
+        let (mut voxels, mut points, mut filled, mut samples, mut grids, mut stored) = (0, 0, 0, 0, 0, 0);
+        for (member, volume) in scene.members().iter().zip(volumes) {
+            let lattice = settings.grid.lattice(member.field.lattice())?;
+            let (own_voxels, own_points) = (member.field.lattice().len() as u64, lattice.len() as u64);
+            // On the volume's own lattice: a finer one needs about the same share of its points.
+            let masks = masks(&member.field, member.field.lattice());
+            let needed = masks.iter().filter(|&&m| m != Mask::Empty).count() as u64;
+            let own_filled = masks.iter().filter(|&&m| m == Mask::Filled).count() as u64;
+            let sides = member.surface.stored_sides().len() as u64;
+            let element = volume.samples().element_type().size() as u64;
+            // Volume, field, the pyramid of min and max, and a mask.
+            base += own_voxels * (element + 4) + own_voxels * 33 / 8 + own_points;
+            samples += match (settings.strategy, settings.samples) {
+                (StrategyName::Nodes, _) => needed * own_points / own_voxels + own_filled * own_points / own_voxels,
+                (_, Some(n)) => n,
+                (_, None) => (needed as f64 * settings.samples_per_point) as u64,
+            };
+            (voxels, points) = (voxels + own_voxels, points + own_points);
+            (filled, grids, stored) = (filled + own_filled, grids + own_points * 17 * sides, sides.max(stored));
+        }
         let texels = flat::texels(scene, settings.wall_resolution, settings.wall_isovalues) as u64;
         // As gathers and as pictures see them.
         let flats = 24 * texels;
         let sample = size_of::<Option<RadianceSample>>() as u64;
         // A sample: position, owner, result in its chunk and joined, checkpoint.
         let per_sample = 12 + 8 + 2 * sample + 16;
-        let grids = points * 17 * stored;
         let export = grids + flats + points * (4 + 13 * stored) + WRITER.min(points * (5 + 29 * stored) * 2);
         let stages = match settings.engine {
             Engine::Photon => {
@@ -68,11 +79,6 @@ impl MemoryEstimate {
                 let gather = settings.gather_rays > 0;
                 // Nodes of both sides, and the same in the checkpoint.
                 let nodes = if gather { 4 * 12 * voxels } else { 0 };
-                let samples = match (settings.strategy, settings.samples) {
-                    (StrategyName::Nodes, _) => needed * points / voxels + filled * points / voxels,
-                    (_, Some(n)) => n,
-                    (_, None) => (needed as f64 * settings.samples_per_point) as u64,
-                };
                 let map = if gather { 0 } else { (mapped * MAP) as u64 };
                 vec![
                     ("photons", base + photons * 9 / 8),

@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::illumination_grid::GridSize;
-use crate::photon_map::{EstimateSettings, Normalisation};
+use crate::photon_map::{EstimateSettings, Estimator, Normalisation};
 use crate::sampling::Strategy;
 use crate::sweep::SweepSettings;
 use serde::{Deserialize, Serialize};
@@ -94,7 +94,10 @@ pub struct BakeOptions {
     /// Reflections after which a photon is cut off (default: Russian roulette only)
     #[arg(long, value_name = "N")]
     pub bounces: Option<u16>,
-    /// Photons per irradiance estimate (k nearest)
+    /// Which photons an irradiance estimate looks at: bins of the lattice, the k nearest, or all within a radius
+    #[arg(long, value_name = "NAME")]
+    pub estimator: Option<Estimator>,
+    /// Photons per irradiance estimate (the bins': at least; within a radius: on average)
     #[arg(long, value_name = "K")]
     pub photons_per_estimate: Option<usize>,
     /// Largest isovalue difference of a photon to its estimate, as a fraction of the sweep
@@ -113,6 +116,9 @@ pub struct BakeOptions {
     #[arg(long = "gather", value_name = "M")]
     #[serde(rename = "gather")]
     pub gather_rays: Option<u32>,
+    /// Whether light gathered at the grid's points is smoothed over neighbouring ones where that lowers its error
+    #[arg(long, value_name = "BOOL")]
+    pub smoothing: Option<bool>,
     /// Nearest samples that Shepard interpolation blends
     #[arg(long, value_name = "K")]
     pub neighbours: Option<usize>,
@@ -159,12 +165,14 @@ impl BakeOptions {
             light_points: self.light_points.or(other.light_points),
             photons: self.photons.or(other.photons),
             bounces: self.bounces.or(other.bounces),
+            estimator: self.estimator.or(other.estimator),
             photons_per_estimate: self.photons_per_estimate.or(other.photons_per_estimate),
             tau: self.tau.or(other.tau),
             samples: self.samples.or(other.samples),
             strategy: self.strategy.or(other.strategy),
             shadow_rays: self.shadow_rays.or(other.shadow_rays),
             gather_rays: self.gather_rays.or(other.gather_rays),
+            smoothing: self.smoothing.or(other.smoothing),
             neighbours: self.neighbours.or(other.neighbours),
             interpolation: self.interpolation.or(other.interpolation),
             grid: self.grid.or(other.grid),
@@ -189,6 +197,8 @@ pub struct BakeSettings {
     pub photons: u64,
     /// Reflections after which a photon is cut off.
     pub bounces: u16,
+    /// Which photons an estimate looks at.
+    pub estimator: Estimator,
     /// Photons per estimate.
     pub photons_per_estimate: usize,
     /// Isovalue window of an estimate.
@@ -205,6 +215,8 @@ pub struct BakeSettings {
     pub gather_rays: u32,
     /// Shadow rays per cached node and luminaire.
     pub cache_shadow_rays: u32,
+    /// Whether gathered light is smoothed over the grid's points.
+    pub smoothing: bool,
     /// Samples blended per grid point.
     pub neighbours: usize,
     /// How samples become grid values.
@@ -254,6 +266,7 @@ impl BakeSettings {
             light_points: o.light_points.unwrap_or(light_points),
             photons: o.photons.unwrap_or(photons),
             bounces: o.bounces.unwrap_or(u16::MAX),
+            estimator: o.estimator.unwrap_or_default(),
             photons_per_estimate: o.photons_per_estimate.unwrap_or(64),
             tau: o.tau.unwrap_or(EstimateSettings::default().tau),
             samples: o.samples,
@@ -267,6 +280,7 @@ impl BakeSettings {
             shadow_rays: o.shadow_rays.unwrap_or(shadow),
             gather_rays: o.gather_rays.unwrap_or(gather),
             cache_shadow_rays: cache,
+            smoothing: o.smoothing.unwrap_or(true),
             neighbours: o.neighbours.unwrap_or(8),
             interpolation: o.interpolation.unwrap_or_default(),
             grid: o.grid.unwrap_or(GridSize::Factor(1)),
@@ -309,6 +323,7 @@ impl BakeSettings {
 
     pub(super) fn estimate(&self) -> EstimateSettings {
         EstimateSettings {
+            estimator: self.estimator,
             photons: self.photons_per_estimate,
             tau: self.tau,
             normalisation: self.normalisation,

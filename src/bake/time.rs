@@ -3,13 +3,13 @@
 use super::{BakeSettings, Engine, StrategyName};
 use crate::checkpoint;
 use crate::direct::{Receiver, direct_irradiance};
-use crate::embree::{Device, GraphTracer};
+use crate::embree::{Device, GraphTracer, pyramids};
 use crate::error::Result;
 use crate::flat;
 use crate::flattened::Departure;
 use crate::mask::{Mask, masks};
 use crate::nearest::Neighbours;
-use crate::photon::{PhotonSettings, trace_photons};
+use crate::photon::{PhotonSettings, Photons, trace_photons};
 use crate::photon_map::PhotonMap;
 use crate::radiance::{Indirect, sample_radiance};
 use crate::radiance_cache::RadianceCache;
@@ -37,72 +37,87 @@ impl TimeEstimate {
     ///
     /// # Errors
     /// `Invalid` if the grid has too many points; `Embree`.
-    #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
     pub fn new(scene: &Scene, settings: &BakeSettings, device: &Device) -> Result<Option<Self>> {
         if settings.engine == Engine::Sweep {
             return Ok(None);
         }
-        let tracer = GraphTracer::new(device, scene)?;
-        let needed = |masks: &[Mask]| masks.iter().filter(|&&m| m != Mask::Empty).count() as f64;
+        let pyramids = pyramids(scene);
+        let tracer = GraphTracer::with_pyramids(device, scene, &pyramids)?;
         let count = settings.photons.min(PHOTONS);
         let pilot = PhotonSettings { count, max_bounces: settings.bounces, seed: settings.seed, fixed_isovalue: None };
         let begun = Instant::now();
         let photons = trace_photons(scene, &tracer, &pilot, &|_| true);
-        let mut stages = vec![("photons", begun.elapsed().as_secs_f64() * settings.photons as f64 / count as f64)];
-
-        let side = scene.surface.outside;
-        let at = positions(&scene.field, &Strategy::Uniform, SAMPLES, settings.seed)?;
-        let tried = at.len().max(1) as f64;
-        let map = PhotonMap::new(scene, &photons.surface, side, |p| p.bounces > 0, settings.estimate());
-        let begun = Instant::now();
-        let rays: u64 = at
-            .par_iter()
-            .enumerate()
-            .with_min_len(64)
-            .map_init(Neighbours::default, |scratch, (i, &position)| {
-                let p = position.as_dvec3();
-                let isovalue = scene.field.value(p) as f32;
-                let Some(normal) = scene.normal(p, side) else { return 0 };
-                map.irradiance(p, f64::from(isovalue), scratch);
-                let receiver = Receiver { position, normal, isovalue, departure: Departure::Surface(side) };
-                let key = (settings.seed, Stage::Cache, i as u64);
-                direct_irradiance(scene, &tracer, &receiver, settings.cache_shadow_rays, key).rays
-            })
-            .sum();
-        let per_node = begun.elapsed().as_secs_f64() / tried;
-        // Light reaches the other side of most surfaces, too.
-        let sides = if photons.surface.iter().any(|p| p.side != side) { 2.0 } else { 1.0 };
-        let nodes = if settings.gather_rays > 0 { sides * needed(&masks(&scene.field, scene.lattice())) } else { 0.0 };
-
-        let begun = Instant::now();
-        let empty = RadianceCache::from_parts([None, None], vec![None; flat::count(scene)]);
-        let indirect = match settings.gather_rays {
-            0 => Indirect::Map(&map),
-            rays => Indirect::Gather(&empty, rays),
-        };
-        let unsaved = checkpoint::Stage::UNSAVED;
-        let (shadow, seed) = (settings.shadow_rays, settings.seed);
-        let sampled = sample_radiance(scene, &tracer, &indirect, &at, side, shadow, seed, unsaved, &|_| true);
-        let seconds = begun.elapsed().as_secs_f64();
-        let lattice = settings.grid.lattice(scene.lattice())?;
-        let points = needed(&masks(&scene.field, &lattice));
-        let samples = match settings.strategy {
-            StrategyName::Nodes => points,
-            _ => settings.samples.map_or(points * settings.samples_per_point, |n| n as f64),
-        };
-
+        let all = begun.elapsed().as_secs_f64() * settings.photons as f64 / count as f64;
+        let (mut cache, mut samples, mut per_ray) = (0.0, 0.0, 0.0);
+        for number in 0..scene.fields() {
+            let seen = scene.seen_from(number);
+            let tracer = GraphTracer::with_pyramids(device, &seen, &pyramids)?;
+            let [nodes, sampled, ray] = field_seconds(&seen, &tracer, &photons, settings)?;
+            (cache, samples, per_ray) = (cache + nodes, samples + sampled, ray);
+        }
         let texels = flat::texels(scene, settings.wall_resolution, settings.wall_isovalues);
-        let per_ray = seconds / (sampled.rays + rays).max(1) as f64;
         let walls = texels as f64 * f64::from(settings.wall_shadow_rays) * per_ray;
-        stages.push(("cache", per_node * nodes + walls));
-        stages.push(("samples", seconds / tried * samples * scene.surface.stored_sides().len() as f64));
-        Ok(Some(Self { stages }))
+        Ok(Some(Self { stages: vec![("photons", all), ("cache", cache + walls), ("samples", samples)] }))
     }
 
     /// All stages together, seconds.
     pub fn total(&self) -> f64 {
         self.stages.iter().map(|s| s.1).sum()
     }
+}
+
+/// Estimated seconds of the cache's nodes and of the samples of the scene's own field, and seconds per ray.
+#[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
+fn field_seconds(
+    scene: &Scene,
+    tracer: &GraphTracer<'_>,
+    photons: &Photons,
+    settings: &BakeSettings,
+) -> Result<[f64; 3]> {
+    let needed = |masks: &[Mask]| masks.iter().filter(|&&m| m != Mask::Empty).count() as f64;
+    let side = scene.surface.outside;
+    let at = positions(&scene.field, &Strategy::Uniform, SAMPLES, settings.seed)?;
+    let tried = at.len().max(1) as f64;
+    let map = PhotonMap::new(scene, &photons.surface, side, |p| p.bounces > 0, settings.estimate());
+    let begun = Instant::now();
+    let rays: u64 = at
+        .par_iter()
+        .enumerate()
+        .with_min_len(64)
+        .map_init(Neighbours::default, |scratch, (i, &position)| {
+            let p = position.as_dvec3();
+            let isovalue = scene.field.value(p) as f32;
+            let Some(normal) = scene.normal(p, side) else { return 0 };
+            map.irradiance(p, f64::from(isovalue), scratch);
+            let receiver = Receiver { position, normal, isovalue, departure: Departure::Surface(side) };
+            let key = (settings.seed, Stage::Cache, i as u64);
+            direct_irradiance(scene, tracer, &receiver, settings.cache_shadow_rays, key).rays
+        })
+        .sum();
+    let per_node = begun.elapsed().as_secs_f64() / tried;
+    // Light reaches the other side of most surfaces, too.
+    let sides = if photons.surface.iter().any(|p| p.side != side) { 2.0 } else { 1.0 };
+    let nodes = if settings.gather_rays > 0 { sides * needed(&masks(&scene.field, scene.lattice())) } else { 0.0 };
+
+    let begun = Instant::now();
+    let empty = RadianceCache::from_parts([None, None], vec![None; flat::count(scene)]);
+    let indirect = match settings.gather_rays {
+        0 => Indirect::Map(&map),
+        rays => Indirect::Gather(&empty, rays),
+    };
+    let unsaved = checkpoint::Stage::UNSAVED;
+    let (shadow, seed) = (settings.shadow_rays, settings.seed);
+    let sampled = sample_radiance(scene, tracer, &indirect, &at, side, shadow, seed, unsaved, &|_| true);
+    let seconds = begun.elapsed().as_secs_f64();
+    let lattice = settings.grid.lattice(scene.lattice())?;
+    let points = needed(&masks(&scene.field, &lattice));
+    let samples = match settings.strategy {
+        StrategyName::Nodes => points,
+        _ => settings.samples.map_or(points * settings.samples_per_point, |n| n as f64),
+    };
+    let per_ray = seconds / (sampled.rays + rays).max(1) as f64;
+    let per_sample = seconds / tried * scene.surface.stored_sides().len() as f64;
+    Ok([per_node * nodes, per_sample * samples, per_ray])
 }
 
 impl std::fmt::Display for TimeEstimate {

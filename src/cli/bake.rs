@@ -1,15 +1,18 @@
 //! `isolume bake`: from a volume or scene to the file that holds it with its light.
 
 use super::{device, expect_extension, writable};
-use crate::bake::{BakeOptions, BakeSettings, MemoryEstimate, TimeEstimate, bake_resumable, digest, job};
+use crate::bake::{BakeOptions, BakeReport, BakeSettings, MemoryEstimate, TimeEstimate, bake_fields, digest, job};
 use crate::checkpoint::Checkpoint;
 use crate::error::{Error, Result};
 use crate::export::bake_file;
 use crate::field::Sweep;
 use crate::progress::Progress;
+use crate::scene::{Policy, Scene};
 use crate::scene_file::{SceneOptions, load, load_series};
 use crate::series::{Series, write_collection};
+use crate::volume::Volume;
 use glam::DVec3;
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
@@ -21,6 +24,7 @@ The result holds point data `value` (contour on it), `rgb` (colour by it, withou
 Examples:
   isolume bake ch2.nii.gz --isovalues 15 200 -o head.vti --report head.json
   isolume bake scene.toml -o out.vti --preset preview
+  isolume bake two-fields.toml -o two.vtm                several volumes: two.vtm, which names a .vti for each
   isolume bake scan.raw --raw-dims 305,224,14 --raw-spacing 0.24,0.24,1 -o scan.vti
   isolume bake 'rho_%04d.vti' -o lit.vti                 a series in time: lit_0000.vti … and lit.pvd for ParaView
   isolume bake 'rho_%04d.vti' --time 3.5 -o lit.vti      one moment of it
@@ -29,7 +33,7 @@ Examples:
 pub(super) struct Bake {
     /// Volume, or scene file (.toml)
     input: PathBuf,
-    /// Output: .vti
+    /// Output: .vti; of a scene of several volumes .vtm, with a .vti for each beside it
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// Write seconds, rays, counts and settings as JSON
@@ -69,7 +73,7 @@ impl Bake {
                 "cannot hold a bake with its walls and settings; bake to a .vti, and `isolume export` writes its arrays",
             ));
         }
-        expect_extension(&self.output, &["vti"])?;
+        expect_extension(&self.output, &["vti", "vtm"])?;
         writable(&self.output)?;
         if let Some(report) = &self.report {
             writable(report)?;
@@ -123,24 +127,46 @@ impl Bake {
     fn one(&self, begun: Instant, progress: Progress) -> Result<Sweep> {
         let loaded = load(&self.input, &self.scene)?;
         let load_seconds = begun.elapsed().as_secs_f64();
+        let extension = self.output.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        match (loaded.scene.fields(), extension.as_str()) {
+            (1, "vtm") => {
+                return Err(Error::invalid(&self.output, "is for several volumes; name a .vti for the bake of one"));
+            }
+            (n @ 2.., "vti") => {
+                return Err(Error::invalid(
+                    &self.output,
+                    format!(
+                        "holds one volume, the scene has {n}; name a .vtm, which ParaView opens as one, and a .vti for each \
+                         volume is written beside it"
+                    ),
+                ));
+            }
+            _ => {}
+        }
+        let volumes: Vec<&Volume> = [&loaded.volume].into_iter().chain(&loaded.companions).collect();
         let settings = BakeSettings::new(&self.bake.clone().or(&loaded.bake))?;
         let sweep = loaded.scene.field.sweep();
+        let members = loaded.scene.members();
         if progress == Progress::Shown {
-            let [nx, ny, nz] = loaded.volume.lattice.dims();
-            eprintln!(
-                "{}: {nx}×{ny}×{nz}, isovalues {} … {}, {} luminaire(s), {} threads",
-                self.input.display(),
-                sweep.lo(),
-                sweep.hi(),
-                loaded.scene.luminaires().len(),
-                rayon::current_num_threads()
-            );
-            if loaded.scene.luminaires().is_empty() && loaded.scene.surface.emission == DVec3::ZERO {
+            for member in &members {
+                let ([nx, ny, nz], sweep) = (member.field.lattice().dims(), member.field.sweep());
+                eprintln!(
+                    "{}{}: {nx}×{ny}×{nz}, isovalues {} … {}, {} luminaire(s), {} threads",
+                    self.input.display(),
+                    if members.len() > 1 { format!(" '{}'", member.name) } else { String::new() },
+                    sweep.lo(),
+                    sweep.hi(),
+                    loaded.scene.luminaires().len(),
+                    rayon::current_num_threads()
+                );
+            }
+            let dark = members.iter().all(|m| m.surface.emission == DVec3::ZERO);
+            if loaded.scene.luminaires().is_empty() && dark {
                 eprintln!("warning: nothing emits light; everything will be black");
             }
         }
         let device = device()?;
-        let memory = MemoryEstimate::new(&loaded.scene, &loaded.volume, &settings, &device)?;
+        let memory = MemoryEstimate::new(&loaded.scene, &volumes, &settings, &device)?;
         if progress == Progress::Shown || self.dry_run {
             eprintln!("{:>14}  {memory}", "memory");
         }
@@ -160,49 +186,72 @@ impl Bake {
             return Ok(sweep);
         }
         let checkpoint = self.checkpoint(job)?;
-        let work = || -> Result<(crate::bake::Bake, Instant)> {
-            let mut result = bake_resumable(&loaded.scene, &settings, &device, progress, Some(&checkpoint))?;
-            result.report.seconds.load = load_seconds;
+        let work = || -> Result<(Vec<crate::bake::Bake>, Instant)> {
+            let mut bakes = bake_fields(&loaded.scene, &settings, &device, progress, Some(&checkpoint))?;
             let export = Instant::now();
-            result.report.seconds.total = begun.elapsed().as_secs_f64();
-            bake_file::write(&self.output, &loaded.scene, &loaded.volume, &result)?;
-            Ok((result, export))
+            for bake in &mut bakes {
+                bake.report.seconds.load = load_seconds;
+                bake.report.seconds.total = begun.elapsed().as_secs_f64();
+            }
+            bake_file::write_fields(&self.output, &loaded.scene, &volumes, &bakes)?;
+            Ok((bakes, export))
         };
-        let (mut result, export) = work().inspect_err(|_| keep(&checkpoint))?;
+        let (bakes, export) = work().inspect_err(|_| keep(&checkpoint))?;
         checkpoint.remove();
-        result.report.seconds.export = export.elapsed().as_secs_f64();
-        result.report.seconds.total = begun.elapsed().as_secs_f64();
+        let mut reports: Vec<BakeReport> = bakes.into_iter().map(|b| b.report).collect();
+        for report in &mut reports {
+            report.seconds.export = export.elapsed().as_secs_f64();
+            report.seconds.total = begun.elapsed().as_secs_f64();
+        }
+        // Of several volumes, one report each by name.
+        let json = match &reports[..] {
+            [report] => serde_json::to_value(report),
+            all => serde_json::to_value(members.iter().map(|m| &m.name).zip(all).collect::<BTreeMap<_, _>>()),
+        };
+        let json = json.expect("the report is plain data");
         if let Some(path) = &self.report {
             let mut file = crate::atomic::AtomicFile::create(path)?;
-            serde_json::to_writer_pretty(&mut file, &result.report).map_err(|e| Error::io(path, e.into()))?;
+            serde_json::to_writer_pretty(&mut file, &json).map_err(|e| Error::io(path, e.into()))?;
             file.commit()?;
         }
         if self.json {
-            println!("{}", serde_json::to_string_pretty(&result.report).expect("the report is plain data"));
+            println!("{json:#}");
         }
         if progress == Progress::Shown {
-            let r = &result.report;
-            eprintln!(
-                "{:>14}  {:.2} s: {} rays ({:.1} M/s), {} photons stored, {} samples",
-                "total",
-                r.seconds.total,
-                r.rays,
-                r.rays_per_second / 1e6,
-                r.photons.stored,
-                r.samples
-            );
-            eprintln!(
-                "{:>14}  {} masked ({} filled), {} gather misses, {} without gradient, {} not finite",
-                "counts",
-                r.masked,
-                r.filled,
-                r.misses,
-                r.samples_without_gradient,
-                r.non_finite + r.non_finite_voxels
-            );
-            eprintln!("{:>14}  {}", "written", self.output.display());
+            self.summarise(&loaded.scene, &reports);
         }
         Ok(sweep)
+    }
+
+    /// What was done, for people.
+    fn summarise(&self, scene: &Scene, reports: &[BakeReport]) {
+        let r = &reports[0];
+        // Fields that light each other share rays and counts.
+        let runs = if scene.policy() == Policy::Joint { &reports[..1] } else { reports };
+        let sum = |of: fn(&BakeReport) -> u64| runs.iter().map(of).sum::<u64>();
+        eprintln!(
+            "{:>14}  {:.2} s: {} rays ({:.1} M/s), {} photons stored, {} samples",
+            "total",
+            r.seconds.total,
+            sum(|r| r.rays),
+            r.rays_per_second / 1e6,
+            sum(|r| r.photons.stored),
+            sum(|r| r.samples)
+        );
+        let each = |of: fn(&BakeReport) -> u64| reports.iter().map(of).sum::<u64>();
+        eprintln!(
+            "{:>14}  {} masked ({} filled), {} gather misses, {} without gradient, {} not finite",
+            "counts",
+            each(|r| r.masked),
+            each(|r| r.filled),
+            sum(|r| r.misses),
+            sum(|r| r.samples_without_gradient),
+            each(|r| r.non_finite + r.non_finite_voxels)
+        );
+        eprintln!("{:>14}  {}", "written", self.output.display());
+        for member in scene.members().iter().filter(|_| reports.len() > 1) {
+            eprintln!("{:>14}  {}", "", bake_file::field_file(&self.output, &member.name).display());
+        }
     }
 
     /// The checkpoint of this bake, with what an interrupted run left if that is wanted.

@@ -5,6 +5,7 @@ use crate::error::Result;
 use crate::export::Mesh;
 use crate::export::bake_file::BakedVolume;
 use crate::progress::Progress;
+use crate::scene::Scene;
 use crate::scene_file::{SceneOptions, load};
 use crate::surface_mesh::{SurfaceMesh, channel, display_colours, texture};
 use std::path::{Path, PathBuf};
@@ -20,11 +21,14 @@ Examples:
   isolume extract baked.vti --isovalue 80 -o textured.ply --refine 2
   isolume extract baked.vti --isovalue 80 -o textured.glb     for browsers, Blender, ChimeraX, PowerPoint")]
 pub(super) struct Extract {
-    /// Volume, scene file (.toml), or bake (.vti)
+    /// Volume, scene file (.toml), or bake (.vti, .vtm)
     input: PathBuf,
     /// The isosurface, in the volume's units
     #[arg(long, value_name = "C", allow_negative_numbers = true)]
     isovalue: f64,
+    /// Of several volumes, the one to take: its name (default: the first)
+    #[arg(long, value_name = "NAME")]
+    field: Option<String>,
     /// Output: .ply, .obj, .glb or .vtp
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
@@ -43,16 +47,8 @@ impl Extract {
         expect_extension(&self.output, &["ply", "obj", "glb", "vtp"])?;
         writable(&self.output)?;
         let begun = Instant::now();
-        let baked = open_bake(&self.input)?;
-        let loaded;
-        let scene = match &baked {
-            Some(baked) => &baked.scene,
-            None => {
-                loaded = load(&self.input, &self.scene)?;
-                &loaded.scene
-            }
-        };
-        let mesh = SurfaceMesh::extract(scene, scene.field.sweep().isovalue(self.isovalue), self.refine)?;
+        let (scene, baked) = open_scene(&self.input, &self.scene, self.field.as_deref())?;
+        let mesh = SurfaceMesh::extract(&scene, scene.field.sweep().isovalue(self.isovalue), self.refine)?;
         let radiance = baked.as_ref().map(|b| texture(b, &mesh.positions)).transpose()?;
         let channels: Option<[Vec<f32>; 3]> = radiance.as_ref().map(|r| [0, 1, 2].map(|c| channel(r, c)));
         let colours = radiance.as_ref().zip(baked.as_ref()).map(|(r, b)| display_colours(r, b.exposure));
@@ -84,7 +80,28 @@ impl Extract {
     }
 }
 
-/// The bake in a `.vti`, if it is one.
+/// The bake in a `.vti` or `.vtm`, if it is one.
 pub(super) fn open_bake(path: &Path) -> Result<Option<BakedVolume>> {
-    if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("vti")) { BakedVolume::try_read(path) } else { Ok(None) }
+    let is = |extension: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(extension));
+    match () {
+        () if is("vtm") => BakedVolume::read(path).map(Some),
+        () if is("vti") => BakedVolume::try_read(path),
+        () => Ok(None),
+    }
+}
+
+/// The scene of a bake, volume or scene file, seen from the volume named `field` (the first if there is no name), and the
+/// bake if it is one, seen likewise.
+pub(super) fn open_scene(
+    path: &Path,
+    options: &SceneOptions,
+    field: Option<&str>,
+) -> Result<(Scene, Option<BakedVolume>)> {
+    if let Some(baked) = open_bake(path)? {
+        let baked = if let Some(name) = field { baked.select(name).map_err(|e| e.in_file(path))? } else { baked };
+        return Ok((baked.scene.clone(), Some(baked)));
+    }
+    let scene = load(path, options)?.scene;
+    let number = field.map(|name| scene.field_named(name)).transpose().map_err(|e| e.in_file(path))?;
+    Ok((number.map_or_else(|| scene.clone(), |n| scene.seen_from(n)), None))
 }

@@ -1,6 +1,6 @@
 //! `isolume reference`: one isosurface illuminated in ordinary 3D, per vertex with variance, or as a picture.
 
-use super::extract::open_bake;
+use super::extract::open_scene;
 use super::{device, expect_extension, writable};
 use crate::embree::{Device, GraphTracer, SurfaceTracer};
 use crate::error::{Error, Result};
@@ -9,7 +9,7 @@ use crate::progress::Progress;
 use crate::reference::{Integrator, Reference, ReferenceSettings, SurfaceMapSettings, path_picture, reference};
 use crate::render::Camera;
 use crate::scene::Scene;
-use crate::scene_file::{SceneOptions, load};
+use crate::scene_file::SceneOptions;
 use crate::surface_mesh::{SurfaceMesh, unit_isovalue};
 use std::path::PathBuf;
 use std::time::Instant;
@@ -24,11 +24,15 @@ Examples:
   isolume reference scene.toml --isovalue 47 -o ref.ply --vertices 4000
   isolume compare out.vti ref.ply")]
 pub(super) struct ReferenceArgs {
-    /// Volume, scene file (.toml), or bake (.vti: its scene)
+    /// Volume, scene file (.toml), or bake (.vti, .vtm: its scene)
     input: PathBuf,
     /// The isosurface, in the volume's units
     #[arg(long, value_name = "C", allow_negative_numbers = true)]
     isovalue: f64,
+    /// Of several volumes, the one to illuminate: its name (default: the first). The others stand at the same share of their
+    /// own ranges
+    #[arg(long, value_name = "NAME")]
+    field: Option<String>,
     /// Output: .ply
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
@@ -76,11 +80,9 @@ impl ReferenceArgs {
         if self.photons == 0 || !(2..=4096).contains(&self.photons_per_estimate) || self.vertices == Some(0) {
             return Err(Error::Invalid("--photons, --vertices: at least 1; --photons-per-estimate: 2 to 4096".into()));
         }
-        let baked = open_bake(&self.input)?;
-        let scene = match baked {
-            Some(baked) => baked.scene,
-            None => load(&self.input, &self.scene)?.scene,
-        };
+        let (scene, _) = open_scene(&self.input, &self.scene, self.field.as_deref())?;
+        // Alone, if the scene's volumes give each other no light.
+        let scene = scene.lit(scene.number());
         let isovalue = unit_isovalue(&scene.field, self.isovalue)?;
         let settings = ReferenceSettings {
             integrator: self.integrator,

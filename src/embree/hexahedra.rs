@@ -2,7 +2,7 @@
 //!
 //! The whole volume is **one** primitive whose callback walks the min/max pyramid: Embree's hierarchy is blind to the
 //! isovalue, and a callback costs as much as several cells (design: speed). The isovalue rides in `ray.id`, what the
-//! ray starts and ends on in `ray.time`.
+//! ray starts and ends on in `ray.time`. Companions are a primitive each, in their own index spaces.
 
 use super::extrusions::{Extrusions, embree_ray, flattened_ray, padded};
 use super::{
@@ -13,7 +13,7 @@ use crate::error::Result;
 use crate::field::Field;
 use crate::flattened::{FlattenedHit, FlattenedRay, Side, Target};
 use crate::pyramid::Pyramid;
-use crate::scene::{Boundary, Scene};
+use crate::scene::{Boundary, Companion, Scene};
 use crate::tracer::Tracer;
 use glam::DVec3;
 use std::sync::Arc;
@@ -21,7 +21,8 @@ use std::sync::Arc;
 /// The 4D scene in Embree: nearest flattened hits of the graph, walls and luminaires.
 pub struct GraphTracer<'a> {
     bvh: Bvh<'a>,
-    volume: u32,
+    /// Geometries below this number are volumes.
+    volumes: u32,
     extrusions: Arc<Extrusions>,
 }
 
@@ -37,20 +38,30 @@ impl<'a> GraphTracer<'a> {
     /// # Errors
     /// `Embree` if the library refuses.
     pub fn new(device: &Device, scene: &'a Scene) -> Result<Self> {
-        let pyramid = Arc::new(Pyramid::new(&scene.field, scene.boundary == Boundary::Capped));
-        Self::with_pyramid(device, scene, pyramid)
+        Self::with_pyramids(device, scene, &pyramids(scene))
     }
 
-    /// As [`GraphTracer::new`] with a pyramid that was built from the same field and boundary.
+    /// As [`GraphTracer::new`] with the [`pyramids`] of the same scene, seen from any of its fields.
     ///
     /// # Errors
     /// `Embree` if the library refuses.
-    pub fn with_pyramid(device: &Device, scene: &'a Scene, pyramid: Arc<Pyramid>) -> Result<Self> {
+    pub fn with_pyramids(device: &Device, scene: &'a Scene, pyramids: &[Arc<Pyramid>]) -> Result<Self> {
         let mut builder = SceneBuilder::new(device)?;
-        let volume = builder.user_shared(Arc::new(Graph { field: &scene.field, pyramid }), u32::MAX)?;
+        let pyramid = |number: usize| pyramids[number].clone();
+        let graph = Graph { field: &scene.field, pyramid: pyramid(scene.number()) };
+        let mut last = builder.user_shared(Arc::new(graph), u32::MAX)?;
+        for companion in scene.companions() {
+            let graph = Graph { field: &companion.member.field, pyramid: pyramid(companion.number) };
+            last = builder.user_shared(Arc::new(CompanionGraph { graph, companion }), u32::MAX)?;
+        }
         let extrusions = Extrusions::attach(&mut builder, scene, u32::MAX)?;
-        Ok(Self { bvh: builder.commit()?, volume, extrusions })
+        Ok(Self { bvh: builder.commit()?, volumes: last + 1, extrusions })
     }
+}
+
+/// The min/max hierarchy of each field of `scene`, by number.
+pub fn pyramids(scene: &Scene) -> Vec<Arc<Pyramid>> {
+    scene.members().iter().map(|m| Arc::new(Pyramid::new(&m.field, m.boundary == Boundary::Capped))).collect()
 }
 
 impl Tracer for GraphTracer<'_> {
@@ -61,7 +72,7 @@ impl Tracer for GraphTracer<'_> {
         if !rayhit.is_hit() {
             return None;
         }
-        let target = if rayhit.hit.geometry == self.volume {
+        let target = if rayhit.hit.geometry < self.volumes {
             decode_target(rayhit.hit.u.to_bits())
         } else {
             Target::Polygon(self.extrusions.settle(ray, rayhit.hit.prim))
@@ -84,7 +95,7 @@ impl Tracer for GraphTracer<'_> {
                 let found = &rayhit.hit;
                 *hit = match found.geometry[lane] {
                     INVALID_ID => None,
-                    id if id == self.volume => Some(decode_target(found.u[lane].to_bits())),
+                    id if id < self.volumes => Some(decode_target(found.u[lane].to_bits())),
                     _ => Some(Target::Polygon(self.extrusions.settle(ray, found.prim[lane]))),
                 }
                 .map(|target| FlattenedHit { t: rayhit.ray.tfar[lane], target });
@@ -112,23 +123,25 @@ fn packet(rays: &[FlattenedRay]) -> (Valid16, Ray16) {
     (valid, packet)
 }
 
-/// A volume hit's target in the 32 bits of `hit.u`: side, and face + 1 of a cap.
+/// A volume hit's target in the 32 bits of `hit.u`: side, face + 1 of a cap, and from bit 16 companion + 1.
 #[inline]
 fn encode_target(target: Target) -> u32 {
     match target {
         Target::Surface(side) => side.index() as u32,
         Target::Cap(face, side) => side.index() as u32 | (u32::from(face) + 1) << 1,
+        Target::Companion(n, side) => side.index() as u32 | (u32::from(n) + 1) << 16,
         Target::Polygon(_) => 0,
     }
 }
 
 #[inline]
+#[allow(clippy::cast_possible_truncation, reason = "encoded from bytes")]
 fn decode_target(bits: u32) -> Target {
     let side = if bits & 1 == 0 { Side::Lower } else { Side::Higher };
     match bits >> 1 {
         0 => Target::Surface(side),
-        #[allow(clippy::cast_possible_truncation, reason = "a face is below 6")]
-        face => Target::Cap((face - 1) as u8, side),
+        face if face < 1 << 15 => Target::Cap((face - 1) as u8, side),
+        _ => Target::Companion((bits >> 16) as u8 - 1, side),
     }
 }
 
@@ -170,5 +183,66 @@ impl UserGeometry for Graph<'_> {
     #[inline]
     fn occluded16(&self, _: u32, active: u16, rays: &Ray16) -> u16 {
         self.pyramid.occluded16(self.field, active, |lane| flattened_ray(&rays.lane(lane)))
+    }
+}
+
+/// A companion's graph: rays are carried into its index space, where they are the rays of a scene of its own.
+struct CompanionGraph<'a> {
+    graph: Graph<'a>,
+    companion: &'a Companion,
+}
+
+impl CompanionGraph<'_> {
+    #[inline]
+    fn ray(&self, ray: &RayView) -> FlattenedRay {
+        self.companion.ray_to_index(&flattened_ray(ray))
+    }
+
+    #[inline]
+    fn target(&self, hit: &FlattenedHit) -> f32 {
+        f32::from_bits(encode_target(self.companion.target(hit.target)))
+    }
+}
+
+impl UserGeometry for CompanionGraph<'_> {
+    fn len(&self) -> u32 {
+        1
+    }
+
+    fn bounds(&self, _: u32) -> ([f32; 3], [f32; 3]) {
+        let corners = self.companion.corners();
+        let lo = corners.iter().copied().fold(DVec3::INFINITY, DVec3::min);
+        padded(lo, corners.iter().copied().fold(DVec3::NEG_INFINITY, DVec3::max))
+    }
+
+    #[inline]
+    fn intersect(&self, _: u32, ray: &RayView) -> Option<UserHit> {
+        let hit = self.graph.pyramid.intersect(self.graph.field, &self.ray(ray), f64::from(ray.tfar))?;
+        Some(UserHit { t: hit.t, u: self.target(&hit), v: 0.0, normal: [0.0; 3] })
+    }
+
+    #[inline]
+    fn occluded(&self, _: u32, ray: &RayView) -> bool {
+        self.graph.pyramid.occluded(self.graph.field, &self.ray(ray), f64::from(ray.tfar))
+    }
+
+    #[inline]
+    fn intersect16(&self, _: u32, active: u16, rays: &Ray16, hits: &mut UserHits16) -> u16 {
+        let mut found = [None; 16];
+        self.graph.pyramid.intersect16(self.graph.field, active, |lane| self.ray(&rays.lane(lane)), &mut found);
+        let mut bits = 0;
+        for (lane, hit) in found.iter().enumerate() {
+            if let Some(hit) = hit {
+                hits.t[lane] = hit.t;
+                hits.u[lane] = self.target(hit);
+                bits |= 1 << lane;
+            }
+        }
+        bits
+    }
+
+    #[inline]
+    fn occluded16(&self, _: u32, active: u16, rays: &Ray16) -> u16 {
+        self.graph.pyramid.occluded16(self.graph.field, active, |lane| self.ray(&rays.lane(lane)))
     }
 }

@@ -1,6 +1,7 @@
 //! The bake as one `.vti`: the volume, its illumination, the box's light and every setting, for viewers and for
-//! `render`, `compare` and `view`.
+//! `render`, `compare` and `view`. Of several volumes, a `.vti` each and a `.vtm` that names them.
 
+use super::multi_block;
 use super::picture::srgb_encode;
 use crate::bake::Bake;
 use crate::error::{Error, Result};
@@ -11,14 +12,14 @@ use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, local_position};
 use crate::polygon::Polygon;
 use crate::reflectance::Reflectance;
-use crate::scene::{Boundary, Scene, Surface};
+use crate::scene::{Boundary, Member, Policy, Scene, Surface};
 use crate::volume::vti::{VtiArray, VtiFile, VtiWriter};
 use crate::volume::{Lattice, Samples, Volume};
 use glam::DVec3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Name of the field string that holds scene and report as JSON.
 const DESCRIPTION: &str = "isolume";
@@ -43,6 +44,12 @@ struct Description {
     polygons: Vec<PolygonDescription>,
     textures: Vec<TextureDescription>,
     report: serde_json::Value,
+    /// The volume's name, if there are others.
+    #[serde(default)]
+    volume: String,
+    /// Whether the others gave it no light.
+    #[serde(default)]
+    independent: bool,
 }
 
 /// Where the texture of a flat is stored.
@@ -71,6 +78,32 @@ struct PolygonDescription {
 /// Suffix of the arrays of stored side number `i`: the outside has none.
 fn suffix(i: usize) -> &'static str {
     if i == 0 { "" } else { "_inside" }
+}
+
+/// Writes the bakes of a scene's fields: one as `.vti` ([`write`]); several as `.vtm` at `path` and beside it a `.vti` for
+/// each, `NAME-FIELD.vti`, which stands for itself and also holds `s`, the parameter that the fields share: a contour of it
+/// in all blocks shows all fields of one hyperplane.
+///
+/// # Errors
+/// `Io`.
+pub fn write_fields(path: &Path, scene: &Scene, volumes: &[&Volume], bakes: &[Bake]) -> Result<()> {
+    if let ([volume], [bake]) = (volumes, bakes) {
+        return write(path, scene, volume, bake);
+    }
+    let mut parts = Vec::new();
+    for (n, (volume, bake)) in volumes.iter().zip(bakes).enumerate() {
+        let lit = scene.seen_from(n);
+        let file = field_file(path, &lit.name);
+        write(&file, &lit, volume, bake)?;
+        parts.push((lit.name, file.file_name().unwrap_or_default().to_string_lossy().into_owned()));
+    }
+    multi_block::write(path, &parts)
+}
+
+/// Where the field named `name` of the bake at `path` goes.
+pub fn field_file(path: &Path, name: &str) -> PathBuf {
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+    path.with_file_name(format!("{stem}-{name}.vti"))
 }
 
 /// Writes a bake. Point data: `value` (source units, active scalars), `radiance` (linear RGB), `rgb` (exposed, clamped,
@@ -146,13 +179,23 @@ pub fn write(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
             .collect(),
         textures,
         report: report.clone(),
+        volume: scene.name.clone(),
+        independent: scene.policy() == Policy::Independent,
     };
     let json = serde_json::to_string(&description).expect("the description is plain data");
 
     let range = [sweep.lo(), sweep.hi()];
     let mut numbers = Vec::new();
     flatten("", &report, &mut numbers);
+    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+    let shared: Vec<f32> = match scene.fields() {
+        1 => Vec::new(),
+        _ => values.iter().map(|&v| sweep.isovalue(f64::from(v))).collect(),
+    };
     let mut writer = VtiWriter::new(lattice).point_data("value", 1, &values[..]).active_scalars("value");
+    if !shared.is_empty() {
+        writer = writer.point_data("s", 1, &shared[..]);
+    }
     for (i, ((_, grid), (rgb, mask))) in bake.sides.iter().zip(&sides).enumerate() {
         let s = suffix(i);
         writer = writer
@@ -210,14 +253,29 @@ pub struct BakedVolume {
     pub exposure: f64,
     /// The report, as written.
     pub report: serde_json::Value,
+    /// The bakes of the scene's companions, in their order, each as if it stood alone.
+    pub companions: Vec<BakedVolume>,
+    /// Whether the fields gave each other no light.
+    independent: bool,
 }
 
 impl BakedVolume {
-    /// Reads a bake.
+    /// A bake as if it were read.
+    pub fn new(scene: Scene, bake: Bake) -> Self {
+        let report = serde_json::to_value(&bake.report).expect("the report is plain data");
+        let (sides, flats, exposure) = (bake.sides, bake.flats, bake.exposure);
+        Self { scene, sides, flats, exposure, report, companions: Vec::new(), independent: false }
+    }
+
+    /// Reads a bake; a `.vtm` with all its fields, seen from the first.
     ///
     /// # Errors
     /// `Io`; `Invalid` if the file is no bake or is damaged.
     pub fn read(path: &Path) -> Result<Self> {
+        if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("vtm")) {
+            let fields = multi_block::read(path)?.iter().map(|file| Self::read(file)).collect::<Result<Vec<_>>>()?;
+            return Self::seen_from(fields, 0).map_err(|e| e.in_file(path));
+        }
         Self::try_read(path)?
             .ok_or_else(|| Error::invalid(path, "is no bake: it holds no illumination; make one with `isolume bake`"))
     }
@@ -292,7 +350,8 @@ impl BakedVolume {
             })
             .collect::<Result<Vec<_>>>()?;
         let boundary = if d.capped { Boundary::Capped } else { Boundary::Open };
-        let scene = Scene::new(field, surface, boundary, polygons)?;
+        let member = Member { name: d.volume, field: field.into(), surface, boundary };
+        let scene = Scene::with_members(vec![member], Policy::Joint, polygons)?;
         let mut flats = vec![None; flat::count(&scene)];
         let mut read: Option<(String, Vec<[f32; 3]>)> = None;
         for t in d.textures {
@@ -313,7 +372,37 @@ impl BakedVolume {
                 *slot = Some(FlatTexture { dims: t.dims, texels: own.to_vec() });
             }
         }
-        Ok(Self { scene, sides, flats, exposure: d.exposure, report: d.report })
+        let (exposure, report) = (d.exposure, d.report);
+        Ok(Self { scene, sides, flats, exposure, report, companions: Vec::new(), independent: d.independent })
+    }
+
+    /// Single bakes of one scene put together, seen from number `own`.
+    fn seen_from(mut fields: Vec<Self>, own: usize) -> Result<Self> {
+        let members = fields.iter().flat_map(|b| b.scene.members()).collect();
+        let independent = fields.iter().any(|b| b.independent);
+        let policy = if independent { Policy::Independent } else { Policy::Joint };
+        let polygons = fields[0].scene.polygons().to_vec();
+        let scene = Scene::with_members(members, policy, polygons)?.seen_from(own);
+        let mut this = fields.remove(own);
+        (this.scene, this.companions) = (scene, fields);
+        Ok(this)
+    }
+
+    /// The same bake seen from the field named `name`, with its grid.
+    ///
+    /// # Errors
+    /// `Invalid` with the names there are.
+    pub fn select(mut self, name: &str) -> Result<Self> {
+        let own = self.scene.field_named(name)?;
+        if own == self.scene.number() {
+            return Ok(self);
+        }
+        let mut fields = std::mem::take(&mut self.companions);
+        let number = self.scene.number();
+        let alone = self.scene.members().swap_remove(number);
+        self.scene = Scene::with_members(vec![alone], Policy::Joint, self.scene.polygons().to_vec())?;
+        fields.insert(number, self);
+        Self::seen_from(fields, own)
     }
 
     /// The grid's lattice.

@@ -187,7 +187,7 @@ impl<'a> View<'a> {
                 let u = (x - a).dot(b - a) / (b - a).length_squared();
                 Seen::Thing(Landing::Wall(id as u16, u.clamp(0.0, 1.0) as f32, p.z as f32), p.z)
             }
-            Target::Cap(..) => Seen::Nothing,
+            Target::Cap(..) | Target::Companion(..) => Seen::Nothing,
         }
     }
 

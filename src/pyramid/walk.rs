@@ -153,7 +153,8 @@ impl Pyramid {
         let n = self.cells;
         let mut o = ray.origin.as_dvec3().to_array();
         let d = ray.direction.as_dvec3().to_array();
-        if let Departure::Cap(face, side) = ray.departure {
+        // Faces from 6 on are another field's.
+        if let Departure::Cap(face @ 0..6, side) = ray.departure {
             let (axis, far) = (usize::from(face % 3), face >= 3);
             let inward = if far { d[axis] < 0.0 } else { d[axis] > 0.0 };
             if inward != (side == Side::Higher) && d[axis] != 0.0 {

@@ -147,15 +147,20 @@ pub(super) fn landing(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> O
     let position = ray.at(hit.t).as_vec3();
     let isovalue = ray.isovalue;
     let none = DVec3::ZERO;
-    let surface_albedo = || scene.surface.albedo.at(f64::from(isovalue));
     let (normal, departure, albedo, emission) = match hit.target {
         Target::Surface(side) => {
             let normal = scene.normal(position.as_dvec3(), side)?;
-            (normal, Departure::Surface(side), surface_albedo(), scene.surface.emission)
+            (normal, Departure::Surface(side), scene.surface.albedo.at(f64::from(isovalue)), scene.surface.emission)
+        }
+        Target::Companion(n, side) => {
+            let companion = &scene.companions()[usize::from(n)];
+            let (normal, surface) = (companion.normal(position.as_dvec3(), side)?, &companion.member.surface);
+            (normal, Departure::Companion(n, side), surface.albedo.at(f64::from(ray.isovalue)), surface.emission)
         }
         Target::Cap(face, side) => {
             let n = scene.face_normal(face);
-            (if side == Side::Lower { n } else { -n }, Departure::Free, surface_albedo(), none)
+            let albedo = scene.face_surface(face).albedo.at(f64::from(ray.isovalue));
+            (if side == Side::Lower { n } else { -n }, Departure::Free, albedo, none)
         }
         Target::Polygon(id) => {
             let p = &scene.polygons()[id as usize];

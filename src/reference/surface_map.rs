@@ -3,6 +3,7 @@
 use super::path::{PathTracer, landing};
 use crate::brdf::reflected;
 use crate::direct::Receiver;
+use crate::field::Field;
 use crate::flattened::{Departure, Side};
 use crate::nearest::{Neighbours, PointGrid};
 use crate::photon::Photons;
@@ -42,14 +43,20 @@ pub struct SurfaceMap {
     isovalue: f32,
     origin: DVec3,
     radius: f32,
-    /// One per side (lower, higher) of the surface.
-    sides: [Share; 2],
+    /// The scene's own surface, then its companions'.
+    surfaces: Vec<MappedSurface>,
     /// One per polygon.
     walls: Vec<Share>,
+    disk: Vec<[f64; 2]>,
+}
+
+/// Photons of one field's surface, and the surface's area.
+struct MappedSurface {
+    /// One per side (lower, higher).
+    sides: [Share; 2],
     area_grid: PointGrid,
     /// Slot order of `area_grid`: area and lower normal.
     areas: Vec<(f32, Vec3)>,
-    disk: Vec<[f64; 2]>,
 }
 
 /// Photons of one side or polygon.
@@ -67,23 +74,16 @@ impl Share {
     }
 }
 
-impl SurfaceMap {
-    /// Maps the photons of one isovalue that were reflected at least once; `mesh` is its isosurface.
-    pub fn new(
-        scene: &Scene,
-        mesh: &SurfaceMesh,
-        isovalue: f32,
-        photons: &Photons,
-        settings: SurfaceMapSettings,
-    ) -> Self {
+impl MappedSurface {
+    /// Maps the photons of the own field of `scene`; `mesh` is its isosurface.
+    fn new(scene: &Scene, mesh: &SurfaceMesh, origin: DVec3, photons: &Photons) -> Self {
         let lattice = scene.lattice();
-        let origin = scene.bounds()[0];
         let lower = |p: DVec3| scene.normal(p, Side::Lower).unwrap_or_default().as_vec3();
         let sides = [Side::Lower, Side::Higher].map(|side| {
             let items: Vec<_> = photons
                 .surface
                 .par_iter()
-                .filter(|p| p.bounces > 0 && p.side == side)
+                .filter(|p| p.bounces > 0 && p.side == side && usize::from(p.field) == scene.number())
                 .map(|p| {
                     let at = p.position.as_dvec3();
                     ((lattice.to_world(at) - origin).as_vec3(), p.power, lower(at))
@@ -91,17 +91,6 @@ impl SurfaceMap {
                 .collect();
             Share::new(&items)
         });
-        let mut landed = vec![Vec::new(); scene.polygons().len()];
-        for p in photons.flat.iter().filter(|p| p.bounces > 0) {
-            // Caps hold none.
-            if let (Some(polygon), Some(items)) =
-                (scene.polygons().get(p.flat as usize), landed.get_mut(p.flat as usize))
-            {
-                let x = polygon.at([f64::from(p.uvc[0]), f64::from(p.uvc[1])]);
-                items.push(((x - origin).as_vec3(), p.power, Vec3::ZERO));
-            }
-        }
-        let walls = landed.par_iter().map(|items| Share::new(items)).collect();
         let mut points = Vec::with_capacity(mesh.triangles.len() * CUTS * CUTS);
         for t in &mesh.triangles {
             let [a, b, c] = t.map(|v| mesh.positions[v as usize] - origin);
@@ -127,13 +116,44 @@ impl SurfaceMap {
         }
         let area_grid = PointGrid::new(&points.iter().map(|p| p.0).collect::<Vec<_>>(), 3.0);
         let areas = area_grid.numbers().iter().map(|&n| (points[n as usize].1, points[n as usize].2)).collect();
+        Self { sides, area_grid, areas }
+    }
+}
+
+impl SurfaceMap {
+    /// Maps the photons of one isovalue that were reflected at least once; `mesh` is its isosurface, `companions` are the
+    /// scenes seen from each companion with theirs.
+    pub fn new(
+        scene: &Scene,
+        mesh: &SurfaceMesh,
+        companions: &[(Scene, SurfaceMesh)],
+        isovalue: f32,
+        photons: &Photons,
+        settings: SurfaceMapSettings,
+    ) -> Self {
+        let lattice = scene.lattice();
+        let origin = scene.bounds()[0];
+        let own = MappedSurface::new(scene, mesh, origin, photons);
+        let others = companions.iter().map(|(scene, mesh)| MappedSurface::new(scene, mesh, origin, photons));
+        let surfaces = [own].into_iter().chain(others).collect();
+        let mut landed = vec![Vec::new(); scene.polygons().len()];
+        for p in photons.flat.iter().filter(|p| p.bounces > 0) {
+            // Caps hold none.
+            if let (Some(polygon), Some(items)) =
+                (scene.polygons().get(p.flat as usize), landed.get_mut(p.flat as usize))
+            {
+                let x = polygon.at([f64::from(p.uvc[0]), f64::from(p.uvc[1])]);
+                items.push(((x - origin).as_vec3(), p.power, Vec3::ZERO));
+            }
+        }
+        let walls = landed.par_iter().map(|items| Share::new(items)).collect();
         let set = Sobol::set(0, Stage::Footprint, 1 << 20);
         #[allow(clippy::cast_possible_truncation, reason = "64 points")]
         let disk = (0..DISK as u32).map(|i| warp::disk(set.point2(i, 0))).collect();
         let diagonal = (lattice.axes() * lattice.far()).length();
         #[allow(clippy::cast_possible_truncation, reason = "distances are f32")]
         let radius = (settings.max_radius * diagonal) as f32;
-        Self { settings, isovalue, origin, radius, sides, walls, area_grid, areas, disk }
+        Self { settings, isovalue, origin, radius, surfaces, walls, disk }
     }
 
     /// Radiance that leaves the surface at `receiver`: direct light, and a final gather of `samples` rays that find
@@ -177,10 +197,14 @@ impl SurfaceMap {
         let world = scene.lattice().to_world(at.position.as_dvec3());
         let q = (world - self.origin).as_vec3();
         let cone = self.settings.cone as f32;
-        let (share, normal) = match at.departure {
-            Departure::Surface(Side::Lower) => (&self.sides[0], at.normal.as_vec3()),
-            Departure::Surface(Side::Higher) => (&self.sides[1], -at.normal.as_vec3()),
-            Departure::Polygon(id) => (&self.walls[id as usize], Vec3::ZERO),
+        let own = &self.surfaces[0];
+        let (surface, share, normal) = match at.departure {
+            Departure::Surface(side) => (own, &own.sides[side.index()], lower_normal(at, side)),
+            Departure::Companion(n, side) => {
+                let surface = &self.surfaces[usize::from(n) + 1];
+                (surface, &surface.sides[side.index()], lower_normal(at, side))
+            }
+            Departure::Polygon(id) => (own, &self.walls[id as usize], Vec3::ZERO),
             Departure::Free | Departure::Cap(..) => return DVec3::ZERO,
         };
         let wall = normal == Vec3::ZERO;
@@ -209,23 +233,27 @@ impl SurfaceMap {
         let area = match at.departure {
             Departure::Polygon(id) => self.wall_area(scene, id, world, at, f64::from(radius)),
             _ => {
-                let accept = |slot: u32| self.areas[slot as usize].1.dot(normal) >= cone;
-                self.area_grid.nearest(q, usize::MAX, radius, accept, scratch);
+                let accept = |slot: u32| surface.areas[slot as usize].1.dot(normal) >= cone;
+                surface.area_grid.nearest(q, usize::MAX, radius, accept, scratch);
                 let found = scratch.found();
-                found.iter().map(|&(d2, slot)| f64::from(self.areas[slot as usize].0) * weight(d2)).sum()
+                found.iter().map(|&(d2, slot)| f64::from(surface.areas[slot as usize].0) * weight(d2)).sum()
             }
         };
         if area > 0.0 { power / area } else { DVec3::ZERO }
     }
 
-    /// ∫ K dA over the part of the disk on polygon `id` that lies on the receiver's side of the level set.
+    /// ∫ K dA over the part of the disk on polygon `id` that lies on the receiver's side of the level sets.
     fn wall_area(&self, scene: &Scene, id: u32, world: DVec3, at: &Receiver, radius: f64) -> f64 {
         let (polygon, lattice) = (&scene.polygons()[id as usize], scene.lattice());
         let frame = Frame::new(polygon.normal());
-        let far = lattice.far();
+        let higher_in = |field: &Field, p: DVec3| {
+            let inside = p.cmpge(DVec3::splat(-1e-6)).all() && p.cmple(field.lattice().far() + 1e-6).all();
+            inside && field.value(p) >= f64::from(self.isovalue)
+        };
+        // On which side of each field's level set, as bits.
         let higher = |p: DVec3| {
-            let inside = p.cmpge(DVec3::splat(-1e-6)).all() && p.cmple(far + 1e-6).all();
-            inside && scene.field.value(p) >= f64::from(self.isovalue)
+            let others = scene.companions().iter().map(|c| higher_in(&c.member.field, c.to_index(p)));
+            others.fold(u32::from(higher_in(&scene.field, p)), |bits, higher| bits << 1 | u32::from(higher))
         };
         let side = higher(at.position.as_dvec3());
         let sum: f64 = self
@@ -239,4 +267,10 @@ impl SurfaceMap {
             .sum();
         sum * std::f64::consts::PI * radius * radius / DISK as f64
     }
+}
+
+/// The normal towards the lower side at a receiver on `side`.
+fn lower_normal(at: &Receiver, side: Side) -> Vec3 {
+    let n = at.normal.as_vec3();
+    if side == Side::Lower { n } else { -n }
 }

@@ -33,8 +33,9 @@ fn nearest<'a>(found: &str, known: &[&'a str]) -> Option<&'a str> {
 
 /// ` in [table]`, by the last header above.
 fn table_of(before: &str) -> String {
-    let header = before.lines().rev().map(str::trim).find(|l| l.starts_with('[') && l.contains(']'));
-    header.and_then(|l| Some(&l[..=l.rfind(']')?])).map_or(String::new(), |h| format!(" in {h}"))
+    let header = before.lines().rev().map(str::trim).find(|l| l.starts_with('['));
+    let closing = |l: &str| if l.starts_with("[[") { "]]" } else { "]" };
+    header.and_then(|l| Some(format!(" in {}{}", l.split(']').next()?, closing(l)))).unwrap_or_default()
 }
 
 #[cfg(test)]

@@ -22,15 +22,10 @@ const DRAWN: u64 = 40_000;
 /// # Errors
 /// As rendering; `Io`.
 pub(super) fn figure6(study: &Study, subject: &Subject, name: &str, strategy: StrategyName, bake: Bake) -> Result<()> {
-    let baked = BakedVolume {
-        scene: subject.scene.clone(),
-        sides: bake.sides,
-        flats: bake.flats,
-        exposure: bake.exposure,
-        report: serde_json::Value::Null,
-    };
+    let seed = bake.report.seed;
+    let baked = BakedVolume::new(subject.scene.clone(), bake);
     let panels = [
-        samples(&baked, strategy, bake.report.seed)?,
+        samples(&baked, strategy, seed)?,
         slice(&baked, 0.4),
         render(&subject.scene, subject.main_isovalue(), &square(&baked), Shading::Baked(&baked), 8, &study.device)?
             .picture,

@@ -8,7 +8,7 @@ use isolume::flattened::{Departure, Side};
 use isolume::gather::gathered_irradiance;
 use isolume::nearest::Neighbours;
 use isolume::photon::{ENERGY_BINS, PhotonSettings, Photons};
-use isolume::photon_map::{EstimateSettings, Normalisation, PhotonMap};
+use isolume::photon_map::{EstimateSettings, Estimator, Normalisation, PhotonMap};
 use isolume::radiance_cache::{CacheSettings, RadianceCache};
 use isolume::rng::{Rng, Stage};
 use isolume::scene::{Scene, Surface};
@@ -17,14 +17,15 @@ use std::f64::consts::PI;
 
 /// h = z² under a lamp, and h = xyz with a lamp behind the corner (1, 1, 1): convex towards their lamps, so that
 /// next-event irradiance is Lambert's closed form. The first is piecewise linear on its lattice, the second exact on any.
+/// Bins are no finer than the lattice, so that it is finer than h needs.
 fn slopes() -> [(&'static str, Scene); 2] {
     let unit = |dims| lattice(dims, DVec3::ZERO, DVec3::ONE);
     let lamp = rectangle("lamp", DVec3::new(0.5, 0.5, 1.5), DVec3::Y, DVec3::X, 0.0, 1.0);
-    let square = scene(field(unit([3, 3, 33]), 0.0, 1.0, |x| x.z * x.z), grey(0.5, Side::Higher), vec![lamp]);
+    let square = scene(field(unit([17, 17, 33]), 0.0, 1.0, |x| x.z * x.z), grey(0.5, Side::Higher), vec![lamp]);
     let n = -DVec3::ONE.normalize();
     let s = DVec3::new(1.0, -1.0, 0.0).normalize();
     let lamp = rectangle("lamp", DVec3::splat(1.6), s, n.cross(s), 0.0, 1.0);
-    let product = scene(field(unit([9; 3]), 0.02, 0.9, |x| x.x * x.y * x.z), grey(0.5, Side::Higher), vec![lamp]);
+    let product = scene(field(unit([17; 3]), 0.02, 0.9, |x| x.x * x.y * x.z), grey(0.5, Side::Higher), vec![lamp]);
     [("z²", square), ("xyz", product)]
 }
 
@@ -64,21 +65,29 @@ fn against_next_event(
     filled.for_each(|(b, m)| family.ratios(format!("{name} bin {b}"), m));
 }
 
-/// Photon irradiance of first landings = next-event irradiance in every bin: inside, at Ω's faces, and with a narrow τ.
-/// Errors from the spread over points (k = 48 photons each: 14 %). Systematic 2 %: at a face the kernel looks to one
-/// side, by 0.2 r of the scale on which E |∇h| varies.
+/// Photon irradiance of first landings = next-event irradiance in every bin: inside, at Ω's faces, and with a narrow τ, by
+/// every estimator. Errors from the spread over points (k = 48 photons each: 14 %). Systematic 2 %: at a face the points'
+/// kernel looks to one side, by 0.2 r of the scale on which E |∇h| varies.
 #[test]
 fn photons_need_the_gradient_and_no_more() {
     let mut right = Family::new("with |∇h|", 0.02);
     let mut wrong = Family::new("without |∇h|", 0.02);
     for (name, scene) in slopes() {
-        let photons = photons(&scene, &PhotonSettings { max_bounces: 0, ..emission(1 << 20, 3) });
-        let k = EstimateSettings { photons: 48, ..EstimateSettings::default() };
-        let narrow = EstimateSettings { tau: 0.02, ..k };
-        against_next_event(&format!("{name} inside"), &scene, &photons, k, (0.08, 1.0), &mut right);
-        against_next_event(&format!("{name} at faces"), &scene, &photons, k, (0.0, 0.02), &mut right);
-        against_next_event(&format!("{name} narrow τ"), &scene, &photons, narrow, (0.08, 1.0), &mut right);
-        let plain = EstimateSettings { normalisation: Normalisation::WithoutGradient, ..k };
+        let photons = photons(&scene, &PhotonSettings { max_bounces: 0, ..emission(1 << 22, 3) });
+        for estimator in [Estimator::Nearest, Estimator::Radius, Estimator::Splat] {
+            let k = EstimateSettings { estimator, photons: 48, ..EstimateSettings::default() };
+            let narrow = EstimateSettings { tau: 0.02, ..k };
+            let name = format!("{name} {estimator:?}");
+            against_next_event(&format!("{name} inside"), &scene, &photons, k, (0.08, 1.0), &mut right);
+            against_next_event(&format!("{name} at faces"), &scene, &photons, k, (0.0, 0.02), &mut right);
+            against_next_event(&format!("{name} narrow τ"), &scene, &photons, narrow, (0.08, 1.0), &mut right);
+        }
+        let plain = EstimateSettings {
+            estimator: Estimator::Nearest,
+            photons: 48,
+            normalisation: Normalisation::WithoutGradient,
+            ..EstimateSettings::default()
+        };
         against_next_event(&format!("{name} inside"), &scene, &photons, plain, (0.08, 1.0), &mut wrong);
     }
     assert!(wrong.rejected() >= 10, "leaving |∇h| out must be noticed");
@@ -165,7 +174,7 @@ fn forward_is_backward() {
     );
     let backward = |receiver: &Receiver, index: u64| {
         let direct = direct_irradiance(&scene, &tracer, receiver, 8, (2, Stage::Direct, index)).mean;
-        [direct, gathered_irradiance(&scene, &tracer, &cache, receiver, 16, (2, index)).mean].map(luminance)
+        [direct, gathered_irradiance(&scene, &tracer, &cache, receiver, 16, (2, index)).estimate.mean].map(luminance)
     };
     let mut family = Family::new("forward = backward", 0.015);
     let mut judge = |what: String, photons: [(f64, f64); 2], back: [Moments; 2], first: usize| {

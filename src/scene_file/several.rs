@@ -1,0 +1,261 @@
+//! `[[volume]]`: several volumes in one scene.
+
+use super::{
+    Albedo, BoundaryName, Loaded, OutsideName, RawOptions, Rgb, SceneFile, SceneOptions, SidesName, SurfaceOptions,
+    VolumeSource, context, load_volume, suggested, surface, surroundings,
+};
+use crate::error::{Error, Result};
+use crate::field::{Field, Sweep};
+use crate::scene::{Member, Policy, Scene};
+use crate::volume::{Lattice, Volume};
+use glam::{DMat3, DVec3};
+use serde::de::value::{MapAccessDeserializer, SeqAccessDeserializer};
+use serde::de::{MapAccess, SeqAccess, Visitor};
+use serde::{Deserialize, Deserializer};
+use std::path::{Path, PathBuf};
+
+/// `[volume]`, or several `[[volume]]`.
+#[derive(Clone, Debug)]
+pub enum Volumes {
+    /// One.
+    One(VolumeSource),
+    /// Several fields in one 4D scene.
+    Several(Vec<VolumeEntry>),
+}
+
+impl Default for Volumes {
+    fn default() -> Self {
+        Volumes::One(VolumeSource::default())
+    }
+}
+
+impl<'de> Deserialize<'de> for Volumes {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> std::result::Result<Self, D::Error> {
+        // By hand, since an untagged enum would forget where an error stands.
+        struct TableOrArray;
+        impl<'de> Visitor<'de> for TableOrArray {
+            type Value = Volumes;
+
+            fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.write_str("a [volume] table or several [[volume]] tables")
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, map: A) -> std::result::Result<Volumes, A::Error> {
+                VolumeSource::deserialize(MapAccessDeserializer::new(map)).map(Volumes::One)
+            }
+
+            fn visit_seq<A: SeqAccess<'de>>(self, seq: A) -> std::result::Result<Volumes, A::Error> {
+                Vec::deserialize(SeqAccessDeserializer::new(seq)).map(Volumes::Several)
+            }
+        }
+        deserializer.deserialize_any(TableOrArray)
+    }
+}
+
+/// How several volumes share light.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum PolicyName {
+    /// They shadow and light each other.
+    Joint,
+    /// Each sees walls and luminaires only.
+    Independent,
+}
+
+/// One `[[volume]]`: where it comes from, its isovalues and its material. What is not set comes from the file's top level
+/// and `[surface]`.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+pub struct VolumeEntry {
+    /// What to call it: part of the names of files.
+    #[serde(default)]
+    pub name: String,
+    /// A volume file, relative to the scene file.
+    pub file: Option<PathBuf>,
+    /// How to read a headerless file.
+    pub raw: Option<RawOptions>,
+    /// Name of a generator instead of a file.
+    pub generator: Option<String>,
+    /// Samples along each edge of a generated volume.
+    pub size: Option<usize>,
+    /// World position of the first sample, instead of the file's.
+    pub origin: Option<[f64; 3]>,
+    /// Factor of the world distances between samples.
+    pub scale: Option<f64>,
+    /// Its range, which the shared parameter sweeps.
+    pub isovalues: Option<[f64; 2]>,
+    /// Diffuse reflectance.
+    pub albedo: Option<Albedo>,
+    /// Emitted radiance.
+    pub emission: Option<Rgb>,
+    /// The side that is outside.
+    pub outside: Option<OutsideName>,
+    /// Sides to store.
+    pub sides: Option<SidesName>,
+    /// What the volume's faces do.
+    pub boundary: Option<BoundaryName>,
+}
+
+impl VolumeEntry {
+    fn load(&self, file: &SceneFile, folder: &Path) -> Result<(Volume, Member)> {
+        let source = VolumeSource {
+            file: self.file.clone(),
+            raw: self.raw.clone(),
+            generator: self.generator.clone(),
+            size: self.size,
+            ..VolumeSource::default()
+        };
+        let mut volume = load_volume(&source, folder, &RawOptions::default())?;
+        if self.origin.is_some() || self.scale.is_some() {
+            let scale = self.scale.unwrap_or(1.0);
+            if !(scale > 0.0 && scale.is_finite()) {
+                return Err(Error::Invalid(format!("scale {scale}: must be a factor above 0")));
+            }
+            let lattice = &volume.lattice;
+            let origin = self.origin.map_or(lattice.origin(), DVec3::from_array);
+            volume.lattice = Lattice::new(lattice.dims(), origin, lattice.axes() * scale)?;
+        }
+        let [lo, hi] = match self.isovalues.or(file.isovalues) {
+            Some(range) => range,
+            None => suggested(&volume)?,
+        };
+        let sweep = Sweep::new(lo, hi)?;
+        let field = Field::new(&volume, sweep)?;
+        let own = SurfaceOptions {
+            albedo: self.albedo.clone(),
+            emission: self.emission,
+            outside: self.outside,
+            sides: self.sides,
+            boundary: self.boundary,
+        };
+        let (surface, boundary) = surface(&file.surface, &own, sweep)?;
+        Ok((volume, Member { name: self.name.clone(), field: field.into(), surface, boundary }))
+    }
+}
+
+/// Loads the volumes of a scene file and what surrounds them.
+pub(super) fn load(entries: &[VolumeEntry], file: &SceneFile, input: &Path, options: &SceneOptions) -> Result<Loaded> {
+    let folder = input.parent().unwrap_or(Path::new(""));
+    let s = &options.surface;
+    let flags = [
+        ("--time", options.time.is_some()),
+        ("--isovalues", options.isovalues.is_some()),
+        ("--albedo", s.albedo.is_some()),
+        ("--emission", s.emission.is_some()),
+        ("--outside", s.outside.is_some()),
+        ("--sides", s.sides.is_some()),
+        ("--boundary", s.boundary.is_some()),
+        ("--raw-…", options.raw.given()),
+    ];
+    if let Some((flag, _)) = flags.into_iter().find(|f| f.1) {
+        return Err(Error::invalid(
+            input,
+            format!("{flag}: the scene has several volumes; set it in their [[volume]] tables"),
+        ));
+    }
+    let named = |(n, entry): (usize, &VolumeEntry)| {
+        let name = if entry.name.is_empty() { format!("{}", n + 1) } else { format!("'{}'", entry.name) };
+        entry.load(file, folder).map_err(|e| Error::invalid(input, format!("volume {name}: {e}")))
+    };
+    let (volumes, members): (Vec<Volume>, Vec<Member>) =
+        entries.iter().enumerate().map(named).collect::<Result<Vec<_>>>()?.into_iter().unzip();
+    let mut volumes = volumes.into_iter();
+    let Some(volume) = volumes.next() else {
+        return Err(Error::invalid(input, "volume: there is none"));
+    };
+    let around = enclosing(&members).map_err(|e| e.in_file(input))?;
+    let mut polygons = surroundings(&file.surroundings, &options.surroundings, folder, &around)
+        .map_err(|e| Error::invalid(input, format!("box: {e}")))?;
+    polygons.extend(context(&file.context, folder).map_err(|e| Error::invalid(input, format!("[[context]]: {e}")))?);
+    let policy = match file.policy {
+        Some(PolicyName::Independent) => Policy::Independent,
+        Some(PolicyName::Joint) | None => Policy::Joint,
+    };
+    let scene = Scene::with_members(members, policy, polygons).map_err(|e| e.in_file(input))?;
+    Ok(Loaded { volume, companions: volumes.collect(), scene, bake: file.bake.clone() })
+}
+
+/// A lattice along the axes of the first field whose Ω holds those of all; the first's own if that does.
+fn enclosing(members: &[Member]) -> Result<Lattice> {
+    let first = members[0].field.lattice();
+    let (mut lo, mut hi) = (DVec3::ZERO, first.far());
+    for lattice in members.iter().map(|m| m.field.lattice()) {
+        for n in 0..8 {
+            let corner = DVec3::new((n & 1) as f64, (n >> 1 & 1) as f64, (n >> 2) as f64) * lattice.far();
+            let p = first.to_index(lattice.to_world(corner));
+            (lo, hi) = (lo.min(p), hi.max(p));
+        }
+    }
+    // Rounding is no reason for another box.
+    let slack = 1e-6 * first.far().max_element();
+    if lo.min_element() >= -slack && (hi - first.far()).max_element() <= slack {
+        return Ok(first.clone());
+    }
+    let (axes, size) = (first.axes(), hi - lo);
+    let axes = DMat3::from_cols(axes.x_axis * size.x, axes.y_axis * size.y, axes.z_axis * size.z);
+    Lattice::new([2; 3], first.to_world(lo), axes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::load as load_scene;
+    use super::*;
+    use crate::flattened::Side;
+
+    fn load_text(text: &str, options: &SceneOptions) -> Result<Loaded> {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scene.toml");
+        std::fs::write(&path, text).unwrap();
+        load_scene(&path, options)
+    }
+
+    fn error_of(text: &str) -> String {
+        load_text(text, &SceneOptions::default()).err().unwrap_or_else(|| panic!("accepted: {text}")).to_string()
+    }
+
+    const TWO: &str = "[surface]\nalbedo = 0.5\n[[volume]]\nname = \"a\"\ngenerator = \"bumps\"\nsize = 9\nisovalues = [10, 90]\n\
+        [[volume]]\nname = \"b\"\ngenerator = \"sphere\"\nsize = 7\norigin = [0.5, 0.5, 0.8]\nscale = 0.5\n\
+        isovalues = [0.01, 0.2]\nalbedo = [0.9, 0.1, 0.1]\noutside = \"higher\"\n";
+
+    #[test]
+    fn two_volumes_in_one_box() {
+        let loaded = load_text(TWO, &SceneOptions::default()).unwrap();
+        let scene = &loaded.scene;
+        assert_eq!((scene.fields(), scene.policy(), loaded.companions.len()), (2, Policy::Joint, 1));
+        let [a, b] = [0, 1].map(|n| scene.seen_from(n));
+        assert_eq!((a.name.as_str(), a.surface.outside, b.surface.outside), ("a", Side::Lower, Side::Higher));
+        assert_eq!((a.field.sweep().hi(), b.field.sweep().hi()), (90.0, 0.2));
+        assert_eq!(a.surface.albedo.uniform(), Some(DVec3::splat(0.5)), "[surface] holds for all");
+        // The box holds both: z to 1.3.
+        assert!((scene.bounds()[0].length() < 1e-9) && (scene.bounds()[1] - DVec3::new(1.0, 1.0, 1.3)).length() < 1e-9);
+        let x = DVec3::new(0.7, 0.6, 0.9);
+        let companion = &scene.companions()[0];
+        let p = companion.to_index(scene.lattice().to_world(scene.lattice().to_index(x)));
+        let q = companion.to_index(scene.lattice().to_index(x));
+        assert!((companion.member.field.lattice().to_world(q) - x).length() < 1e-12 && p != q);
+        let independent = load_text(&format!("policy = \"independent\"\n{TWO}"), &SceneOptions::default()).unwrap();
+        assert_eq!(independent.scene.policy(), Policy::Independent);
+    }
+
+    #[test]
+    fn errors_name_the_volume() {
+        let e = error_of("[[volume]]\nname = \"a\"\ngenerator = \"bumps\"\ncolour = 3\n");
+        assert!(
+            e.contains("scene.toml:4: unknown key `colour` in [[volume]]; known: name") && !e.contains('\n'),
+            "{e}"
+        );
+        let e = error_of(&TWO.replace("\"sphere\"", "\"spere\""));
+        assert!(e.contains("volume 'b': generator `spere`"), "{e}");
+        let e = error_of(&TWO.replace("name = \"b\"", "name = \"a\""));
+        assert!(e.contains("scene.toml") && e.contains("'a' occurs twice"), "{e}");
+        let e = error_of(&TWO.replace("name = \"b\"\n", ""));
+        assert!(e.contains("volume 2") && e.contains("needs one"), "{e}");
+        let e = error_of(&TWO.replace("scale = 0.5", "scale = 0"));
+        assert!(e.contains("volume 'b': scale 0"), "{e}");
+        let e = error_of("policy = \"joint\"\n[volume]\ngenerator = \"bumps\"\nsize = 5\n");
+        assert!(e.contains("scene.toml:1: policy"), "{e}");
+        let options = SceneOptions { isovalues: Some(vec![1.0, 2.0]), ..SceneOptions::default() };
+        let e = load_text(TWO, &options).err().unwrap().to_string();
+        assert!(e.contains("--isovalues") && e.contains("[[volume]]"), "{e}");
+    }
+}
