@@ -24,7 +24,7 @@ pub(super) struct GridPoints<'a> {
 }
 
 /// Samples around a point without a level set of its own.
-const STAND_INS: usize = 4;
+pub(super) const STAND_INS: usize = 4;
 
 impl<'a> GridPoints<'a> {
     /// Positions for the points of `lattice` whose mask `wanted` picks.
