@@ -1,6 +1,6 @@
 # isolume is a plain cargo package; this file gets its two native libraries and names the common errands.
 
-.PHONY: all deps demo test check peers bench fuzz doc clean distclean
+.PHONY: all deps demo gallery test check peers bench fuzz doc clean distclean
 
 # `make deps` writes third_party/env.sh only if libclang had to be unpacked there.
 CARGO = if [ -f third_party/env.sh ]; then . third_party/env.sh; fi; cargo
@@ -22,6 +22,11 @@ demo: deps
 	@echo "demo/bumps.vti  the volume with its illumination, for every isovalue: open it in ParaView, or render it again:"
 	@echo "                cargo run --release -- render demo/bumps.vti --isovalue 60 -o demo/other.png"
 	@echo "demo/bumps.png  the isosurface at 47"
+
+# The paper's figures and more, into docs/gallery: some minutes. DATA=folder adds ch2.nii.gz (brain) and neuron.mha.
+gallery: deps
+	$(CARGO) build --release
+	scripts/gallery $(PROGRAM) docs/gallery --work demo/gallery $(if $(DATA),--data $(DATA))
 
 test: deps
 	$(CARGO) test
