@@ -5,27 +5,17 @@ use glam::{DVec3, Vec3};
 use isolume::embree::{Device, Ray, RayHit, SceneBuilder};
 use isolume::field::{Field, Sweep};
 use isolume::isosurface::extract;
+use isolume::progress::processor_seconds;
 use isolume::rng::{Rng, Stage};
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
 use isolume::sweep::{SweepSettings, sweep};
-use isolume::volume::{Lattice, Samples, Volume};
+use isolume::volume::generate::Generator;
 use isolume::warp::{Frame, cosine_hemisphere};
 use rayon::prelude::*;
 use std::time::Instant;
 
 fn bumps(n: usize) -> Scene {
-    let lattice = Lattice::aligned([n; 3], DVec3::ZERO, DVec3::splat(1.0 / (n - 1) as f64)).expect("a lattice");
-    let g = |x: DVec3, m: [f64; 3], s: f64| (-(x - DVec3::from_array(m)).length_squared() / (2.0 * s * s)).exp();
-    let samples = (0..lattice.len())
-        .into_par_iter()
-        .map(|o| {
-            let x = lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|x| x as f64)));
-            100.0 * g(x, [0.5, 0.5, 0.38], 0.16)
-                + 80.0
-                    * (g(x, [0.32, 0.40, 0.74], 0.05) + g(x, [0.62, 0.35, 0.76], 0.05) + g(x, [0.52, 0.66, 0.72], 0.05))
-        })
-        .collect();
-    let volume = Volume::new("bumps", lattice, Samples::F64(samples)).expect("a volume");
+    let volume = Generator::from_name("bumps").and_then(|g| g.sample([n; 3])).expect("a volume");
     let field = Field::new(&volume, Sweep::new(3.6, 95.0).expect("a sweep")).expect("a field");
     let walls = cornell_box(field.lattice(), 0.0).expect("a box");
     Scene::new(field, Surface::default(), Boundary::Open, walls).expect("a scene")
@@ -47,17 +37,7 @@ fn bounces(scene: &Scene, count: usize) -> (Vec<[f32; 3]>, Vec<[u32; 3]>, Vec<Ra
     (vertices, surface.triangles.clone(), rays)
 }
 
-/// CPU seconds of all threads so far, where /proc tells; else the wall clock. Other work on the machine moves the wall
-/// clock, this one hardly.
-fn seconds(start: Instant) -> f64 {
-    let Ok(stat) = std::fs::read_to_string("/proc/self/stat") else { return start.elapsed().as_secs_f64() };
-    let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or("").split_whitespace().collect();
-    let ticks = |i: usize| fields.get(i).and_then(|x| x.parse::<f64>().ok()).unwrap_or(0.0);
-    (ticks(11) + ticks(12)) / 100.0
-}
-
 fn main() {
-    let zero = Instant::now();
     let all = std::env::args().any(|a| a == "--full");
     let device = Device::new(1).expect("Embree starts");
     println!("per CPU second (all threads), {} threads, Embree {}", rayon::current_num_threads(), device.version());
@@ -76,7 +56,7 @@ fn main() {
         };
         let (mut exact, mut gather, mut direct, mut node) = (0f64, 0f64, 0f64, 0f64);
         for _ in 0..3 {
-            let start = seconds(zero);
+            let start = processor_seconds();
             let hits: usize = rays
                 .par_chunks(1 << 12)
                 .map(|chunk| {
@@ -91,11 +71,11 @@ fn main() {
                 })
                 .sum();
             assert!(hits > 0);
-            exact = exact.max(rays.len() as f64 / (seconds(zero) - start).max(1e-2));
+            exact = exact.max(rays.len() as f64 / (processor_seconds() - start).max(1e-2));
             let time = |s: SweepSettings| {
-                let start = seconds(zero);
+                let start = processor_seconds();
                 let out = sweep(&scene, &s, &|_| true).expect("a sweep");
-                (seconds(zero) - start, out)
+                (processor_seconds() - start, out)
             };
             let (t0, _) = time(settings(0, 1));
             let (t1, _) = time(settings(0, 17));
@@ -116,7 +96,7 @@ fn main() {
             direct / exact
         );
         let start = Instant::now();
-        let cpu = seconds(zero);
+        let cpu = processor_seconds();
         let out = sweep(
             &scene,
             &SweepSettings { directions: 128, light_points: 64, replicates: 1, ..settings(64, 64) },
@@ -126,7 +106,7 @@ fn main() {
         println!(
             "      converged: {:.2} s ({:.2} CPU s), {} bounces",
             start.elapsed().as_secs_f64(),
-            seconds(zero) - cpu,
+            processor_seconds() - cpu,
             out.bounces
         );
     }

@@ -1,5 +1,6 @@
 //! The main job: from a scene to its illumination grid, by either engine, with counts and seconds.
 
+mod grid_points;
 mod memory;
 mod photon_engine;
 mod settings;

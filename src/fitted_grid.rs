@@ -49,13 +49,14 @@ impl Placed {
     }
 }
 
-/// Improves `start` (Shepard's grid on `lattice`) by the least-squares fit described above. Nodes that hold nothing stay
-/// so. The result does not depend on the number of threads.
+/// Improves `start` (Shepard's grid on `lattice`, say) by the least-squares fit described above at the nodes that `free`
+/// picks by their mask; the others stay as they are. The result does not depend on the number of threads.
 pub fn fit(
     field: &Field,
     lattice: &Lattice,
     samples: &[RadianceSample],
     start: IlluminationGrid,
+    free: impl Fn(Mask) -> bool + Sync,
     tick: &(dyn Fn(u64) -> bool + Sync),
 ) -> IlluminationGrid {
     let sorted = Sorted::new(field, lattice, samples);
@@ -68,6 +69,7 @@ pub fn fit(
         });
         out
     };
+    let free: Vec<bool> = start.mask.iter().map(|&m| free(m)).collect();
     // Diagonal of the normal equations: preconditioner, and the scale of the pull.
     let diagonal = gather(&|s, _, _| Vec3::splat(s.weight));
     let seen = diagonal.par_iter().filter(|d| d.x > 0.0).count().max(1);
@@ -87,7 +89,10 @@ pub fn fit(
     let mut r = gather(&|s, w, cell| s.weight * (s.radiance - value(&nodes, w, cell)));
     let mut d = vec![Vec3::ZERO; nodes.len()];
     let precondition = |r: &[Vec3]| -> Vec<Vec3> {
-        r.par_iter().zip(&diagonal).map(|(r, d)| *r / (d.x + pull).max(f32::MIN_POSITIVE)).collect()
+        let step = |((r, d), &free): ((&Vec3, &Vec3), &bool)| {
+            if free { *r / (d.x + pull).max(f32::MIN_POSITIVE) } else { Vec3::ZERO }
+        };
+        r.par_iter().zip(&diagonal).zip(&free).map(step).collect()
     };
     let mut z = precondition(&r);
     let mut p = z.clone();
@@ -108,8 +113,8 @@ pub fn fit(
         tick((nodes.len() / STEPS) as u64);
     }
     let mut grid = start;
-    grid.radiance.par_iter_mut().zip(&grid.mask).zip(nodes.par_iter().zip(&d)).for_each(|((out, mask), (x, d))| {
-        if *mask != Mask::Empty {
+    grid.radiance.par_iter_mut().zip(&free).zip(nodes.par_iter().zip(&d)).for_each(|((out, free), (x, d))| {
+        if *free {
             // Radiance is not negative, but a fit through noise may be.
             *out = (*x + *d).max(Vec3::ZERO).to_array();
         }
@@ -230,7 +235,7 @@ mod tests {
             (squares / 4096.0).sqrt()
         };
         let before = error(&start);
-        let after = error(&fit(&field, field.lattice(), &samples, start, &|_| true));
+        let after = error(&fit(&field, field.lattice(), &samples, start, |m| m != Mask::Empty, &|_| true));
         println!("RMS error: Shepard {before}, fitted {after}");
         assert!(before > 0.02 && after < 0.2 * before, "Shepard {before}, fitted {after}");
     }

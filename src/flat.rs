@@ -17,6 +17,21 @@ pub struct Flat {
     pub albedo: Reflectance,
     /// What rays from it start on.
     pub departure: Departure,
+    /// The outline in texture coordinates, counter-clockwise, unless the texture's parallelogram is all of it.
+    outline: Option<Vec<[f64; 2]>>,
+    /// The length that the nominal resolution spans.
+    span: f64,
+}
+
+/// A texel's share of a flat.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Texel {
+    /// Share of its area that lies in the flat, [0, 1].
+    pub covered: f64,
+    /// Centroid of that part in texture coordinates; of `source`'s if nothing is covered.
+    pub at: [f64; 2],
+    /// The texel that stands for it: itself, or the nearest covered one.
+    pub source: usize,
 }
 
 /// Number of flats of a scene, caps included.
@@ -34,6 +49,12 @@ pub fn flat(scene: &Scene, number: usize) -> Option<Flat> {
             normal: p.normal(),
             albedo: p.albedo.into(),
             departure: Departure::Polygon(id),
+            outline: (!p.is_parallelogram()).then(|| p.outline()),
+            // A wall has the nominal resolution however small it is; of context geometry, the scene has.
+            span: match p.other_face {
+                0 => longest(p.texture_edges()),
+                _ => scene.bounds().into_iter().reduce(|lo, hi| hi - lo).expect("two corners").max_element(),
+            },
         });
     }
     let (face, lattice, surface, boundary) = scene.numbered_face(number - scene.polygons().len());
@@ -47,9 +68,12 @@ pub fn flat(scene: &Scene, number: usize) -> Option<Flat> {
         corner[a] = far[a];
     }
     let edge = |b: usize| lattice.axes().col(b) * far[b];
+    let edges = [edge((a + 1) % 3), edge((a + 2) % 3)];
     Some(Flat {
         corner: lattice.to_world(corner),
-        edges: [edge((a + 1) % 3), edge((a + 2) % 3)],
+        edges,
+        outline: None,
+        span: longest(edges),
         normal: scene.face_normal(face),
         albedo: surface.albedo.clone(),
         departure: Departure::Cap(face, Side::Lower),
@@ -68,10 +92,78 @@ impl Flat {
         self.edges[0].cross(self.edges[1]).length()
     }
 
-    /// World lengths of u and v.
-    pub fn lengths(&self) -> [f64; 2] {
-        self.edges.map(DVec3::length)
+    /// Texels along u, v and the isovalue, about `across` of them along the longer edge of a wall, or along the scene's
+    /// extent for context geometry, of which there may be much.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few hundred at most")]
+    pub fn resolution(&self, across: usize, isovalues: usize) -> [usize; 3] {
+        let least = if self.span > longest(self.edges) { 1 } else { 2 };
+        let [u, v] = self.edges.map(|e| ((e.length() / self.span * across as f64).round() as usize).max(least));
+        [u, v, isovalues]
     }
+
+    /// The texels of one isovalue of a texture of `dims`, u fastest.
+    pub fn texels(&self, dims: [usize; 3]) -> Vec<Texel> {
+        let [nu, nv, _] = dims;
+        let mut texels: Vec<Texel> = (0..nu * nv)
+            .map(|source| {
+                let (i, j) = ((source % nu) as f64, (source / nu) as f64);
+                let centre = [(i + 0.5) / nu as f64, (j + 0.5) / nv as f64];
+                let Some(outline) = &self.outline else { return Texel { covered: 1.0, at: centre, source } };
+                // In units of texels, from this one's corner.
+                let part = outline.iter().map(|&[u, v]| [u * nu as f64 - i, v * nv as f64 - j]).collect();
+                let (covered, [x, y]) = area_and_centroid(&clipped(part));
+                Texel { covered, at: [(i + x) / nu as f64, (j + y) / nv as f64], source }
+            })
+            .collect();
+        // Slivers see too little to speak for themselves.
+        let counts = |t: &Texel| t.covered > 1e-3;
+        let all: Vec<usize> = (0..texels.len()).filter(|&n| counts(&texels[n])).collect();
+        for n in (0..texels.len()).filter(|n| all.binary_search(n).is_err()).collect::<Vec<_>>() {
+            let away = |&m: &usize| (n % nu).abs_diff(m % nu).pow(2) + (n / nu).abs_diff(m / nu).pow(2);
+            if let Some(source) = all.iter().copied().min_by_key(away) {
+                texels[n] = Texel { covered: 0.0, at: texels[source].at, source };
+            }
+        }
+        texels
+    }
+}
+
+/// Length of the longer edge.
+fn longest(edges: [DVec3; 2]) -> f64 {
+    edges[0].length().max(edges[1].length())
+}
+
+/// The part of a convex polygon in the unit square. \[Sutherland74\]
+fn clipped(mut points: Vec<[f64; 2]>) -> Vec<[f64; 2]> {
+    for (a, sign, edge) in [(0, 1.0, 0.0), (0, -1.0, -1.0), (1, 1.0, 0.0), (1, -1.0, -1.0)] {
+        let height = |p: [f64; 2]| sign * p[a] - edge;
+        let mut kept = Vec::with_capacity(points.len() + 1);
+        for (n, &p) in points.iter().enumerate() {
+            let q = points[(n + 1) % points.len()];
+            let (hp, hq) = (height(p), height(q));
+            if hp >= 0.0 {
+                kept.push(p);
+            }
+            if (hp >= 0.0) != (hq >= 0.0) {
+                let t = hp / (hp - hq);
+                kept.push([p[0] + t * (q[0] - p[0]), p[1] + t * (q[1] - p[1])]);
+            }
+        }
+        points = kept;
+    }
+    points
+}
+
+/// Area and centroid of a convex polygon; the middle of the unit square if it has none.
+fn area_and_centroid(points: &[[f64; 2]]) -> (f64, [f64; 2]) {
+    let (mut area, mut sum) = (0.0, [0.0; 2]);
+    for w in points.windows(2).skip(1) {
+        let [o, p, q] = [points[0], w[0], w[1]];
+        let a = 0.5 * ((p[0] - o[0]) * (q[1] - o[1]) - (p[1] - o[1]) * (q[0] - o[0])).abs();
+        area += a;
+        (0..2).for_each(|x| sum[x] += a * (o[x] + p[x] + q[x]) / 3.0);
+    }
+    if area > 0.0 { (area, sum.map(|x| x / area)) } else { (0.0, [0.5; 2]) }
 }
 
 /// The number of the flat that is a cap on this face of Ω ([`crate::flattened::face_of`]).
@@ -148,20 +240,12 @@ impl FlatTexture {
         let i: [usize; 3] = std::array::from_fn(|a| ((uvc[a] * self.dims[a] as f32) as usize).min(self.dims[a] - 1));
         (i[2] * self.dims[1] + i[1]) * self.dims[0] + i[0]
     }
-
-    /// Texels along u and v for about `across` along the longer edge of a flat of the given edge lengths.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few hundred at most")]
-    pub fn resolution(lengths: [f64; 2], across: usize, isovalues: usize) -> [usize; 3] {
-        let longest = lengths[0].max(lengths[1]);
-        let n = |l: f64| ((l / longest * across as f64).round() as usize).max(2);
-        [n(lengths[0]), n(lengths[1]), isovalues]
-    }
 }
 
-/// Texels of the textures of all flats of a scene, at most: as [`FlatTexture::resolution`] sizes them.
+/// Texels of the textures of all flats of a scene, at most: as [`Flat::resolution`] sizes them.
 pub fn texels(scene: &Scene, across: usize, isovalues: usize) -> usize {
     let flats = (0..count(scene)).filter_map(|n| flat(scene, n));
-    flats.map(|f| FlatTexture::resolution(f.lengths(), across, isovalues).iter().product::<usize>()).sum()
+    flats.map(|f| f.resolution(across, isovalues).iter().product::<usize>()).sum()
 }
 
 #[cfg(test)]

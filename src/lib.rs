@@ -48,6 +48,7 @@ pub mod sampling;
 pub mod radiance;
 pub mod illumination_grid;
 pub mod fitted_grid;
+pub mod smoothing;
 pub mod sweep;
 pub mod bake;
 pub mod scene_file;

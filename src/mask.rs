@@ -60,27 +60,22 @@ pub fn masks(field: &Field, lattice: &Lattice) -> Vec<Mask> {
 }
 
 /// Points of the graph that stand for lattice point `o`: itself if a level set of the sweep passes through it, else up to
-/// two points of the cells around it where one does (keyed by `seed`); none where none is found.
-pub fn stand_ins(field: &Field, lattice: &Lattice, o: usize, seed: u64) -> [Option<DVec3>; 2] {
+/// `N` points of the cells around it where one does (keyed by `seed`); none where none is found.
+pub fn stand_ins<const N: usize>(field: &Field, lattice: &Lattice, o: usize, seed: u64) -> [Option<DVec3>; N] {
     let centre = local_position(field, lattice, o);
-    let usable = |p: DVec3| (0.0..=1.0).contains(&field.value(p)) && field.falling_normal(p).is_some();
-    if usable(centre) {
-        return [Some(centre), None];
+    let usable = |p: &DVec3| (0.0..=1.0).contains(&field.value(*p)) && field.falling_normal(*p).is_some();
+    let mut found = [None; N];
+    if usable(&centre) {
+        found[0] = Some(centre);
+        return found;
     }
     let cell = field.lattice().far() / lattice.far();
     let mut rng = Rng::stream(seed, Stage::Cache, o as u64);
-    let mut found = [None, None];
-    for _ in 0..32 {
+    let tries = (0..16 * N).map(|_| {
         let p = centre + (DVec3::new(rng.unit(), rng.unit(), rng.unit()) * 2.0 - 1.0) * cell;
-        let p = p.clamp(DVec3::ZERO, field.lattice().far());
-        if usable(p) {
-            if found[0].is_some() {
-                found[1] = Some(p);
-                break;
-            }
-            found[0] = Some(p);
-        }
-    }
+        p.clamp(DVec3::ZERO, field.lattice().far())
+    });
+    found.iter_mut().zip(tries.filter(usable)).for_each(|(place, p)| *place = Some(p));
     found
 }
 

@@ -9,7 +9,8 @@ use glam::{DVec2, DVec3};
 /// A planar convex polygon in world coordinates, counter-clockwise seen from its front.
 ///
 /// Walls are seen, lit and light from the front only; from behind they are not there. A luminaire (`emission` ≠ 0 and
-/// `opaque_back`) blocks light from both sides and emits from its front.
+/// `opaque_back`) blocks light from both sides and emits from its front. Context geometry is two polygons back to back,
+/// [`Polygon::both_faces`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Polygon {
     /// Name of the wall, the `o`, `g` or material of an OBJ file.
@@ -25,6 +26,8 @@ pub struct Polygon {
     pub emission: DVec3,
     /// Whether the back blocks light.
     pub opaque_back: bool,
+    /// What to add to this polygon's number in a scene for that of its other face; 0 if it has none.
+    pub other_face: i32,
 }
 
 impl Polygon {
@@ -67,7 +70,36 @@ impl Polygon {
         }
         let (corner, edges) = parametrise(&vertices, normal);
         let opaque_back = emission != DVec3::ZERO;
-        Ok(Self { name: name.to_owned(), vertices, normal, area, corner, edges, albedo, emission, opaque_back })
+        Ok(Self {
+            name: name.to_owned(),
+            vertices,
+            normal,
+            area,
+            corner,
+            edges,
+            albedo,
+            emission,
+            opaque_back,
+            other_face: 0,
+        })
+    }
+
+    /// The polygon as its two faces, one after the other: seen, lit and, if it emits, light from both sides. They must stay
+    /// neighbours in that order.
+    #[must_use]
+    pub fn both_faces(self) -> [Self; 2] {
+        let front = Self { opaque_back: false, other_face: 1, ..self };
+        let vertices: Vec<DVec3> = front.vertices.iter().rev().copied().collect();
+        let normal = -front.normal;
+        let (corner, edges) = parametrise(&vertices, normal);
+        let name = format!("{}_back", front.name);
+        let back = Self { name, vertices, normal, corner, edges, other_face: -1, ..front.clone() };
+        [front, back]
+    }
+
+    /// Texture coordinates of the vertices, counter-clockwise.
+    pub fn outline(&self) -> Vec<[f64; 2]> {
+        self.vertices.iter().map(|&x| self.texture(x)).collect()
     }
 
     /// Vertices, counter-clockwise from the front.
@@ -176,6 +208,7 @@ pub struct LocalPolygon {
     lo: DVec3,
     hi: DVec3,
     opaque_back: bool,
+    other_face: i32,
 }
 
 impl LocalPolygon {
@@ -206,7 +239,8 @@ impl LocalPolygon {
             .collect();
         let reach = lo.abs().max(hi.abs()).max_element().max(1.0);
         let slack = 8.0 * f64::from(f32::EPSILON) * reach;
-        Self { normal, offset: normal.dot(v[0]), stretch, slack, edges, lo, hi, opaque_back: polygon.opaque_back }
+        let Polygon { opaque_back, other_face, .. } = *polygon;
+        Self { normal, offset: normal.dot(v[0]), stretch, slack, edges, lo, hi, opaque_back, other_face }
     }
 
     /// Bounds in the local frame.
@@ -215,12 +249,16 @@ impl LocalPolygon {
     }
 
     /// t at which `ray` meets polygon number `id` (this one) with 0 ≤ t ≤ `reach`. Fronts only, unless the back is
-    /// opaque. A ray that departs from it or ends on it does not meet it; one that starts on the plane (within the
+    /// opaque. A ray that departs from it or its other face, or ends on it, does not meet it; one that starts on the plane (within the
     /// rounding of f32 coordinates) and goes into it meets it at 0.
     #[inline]
     pub fn intersect(&self, id: u32, ends: (Departure, Option<u32>), o: DVec3, d: DVec3, reach: f64) -> Option<f64> {
         let slope = self.normal.dot(d);
-        if slope == 0.0 || (slope > 0.0 && !self.opaque_back) || ends.0 == Departure::Polygon(id) || ends.1 == Some(id)
+        if slope == 0.0 || (slope > 0.0 && !self.opaque_back) || ends.1 == Some(id) {
+            return None;
+        }
+        if let Departure::Polygon(from) = ends.0
+            && (from == id || from == id.wrapping_add_signed(self.other_face))
         {
             return None;
         }
@@ -300,6 +338,23 @@ mod tests {
             (vec![(0., 0., 0.), (2., 0., 0.), (0.5, 0.5, 0.), (0., 2., 0.)], "convex"),
         ] {
             assert!(p(&vertices).unwrap_err().to_string().contains(word), "{word}");
+        }
+    }
+
+    #[test]
+    fn two_faces_see_both_sides_and_not_each_other() {
+        let lattice = Lattice::aligned([4, 4, 4], DVec3::ZERO, DVec3::ONE).unwrap();
+        let faces = square().both_faces();
+        assert_eq!(faces[1].normal(), -DVec3::Z);
+        let local = faces.each_ref().map(|p| LocalPolygon::new(p, &lattice));
+        let met = |ray: &FlattenedRay| [local[0].meet(6, ray), local[1].meet(7, ray)];
+        let above = FlattenedRay::free(glam::Vec3::new(1.5, 0.5, 5.0), -glam::Vec3::Z, 0.0);
+        let below = FlattenedRay::free(glam::Vec3::new(1.5, 0.5, 1.0), glam::Vec3::Z, 0.0);
+        assert_eq!((met(&above), met(&below)), ([Some(2.0), None], [None, Some(2.0)]));
+        for (face, direction) in [(6, glam::Vec3::Z), (7, -glam::Vec3::Z)] {
+            let on = FlattenedRay::free(glam::Vec3::new(1.5, 0.5, 3.0), direction, 0.0);
+            assert_eq!(met(&FlattenedRay { departure: Departure::Polygon(face), ..on }), [None, None]);
+            assert!(met(&on).iter().any(Option::is_some));
         }
     }
 

@@ -5,7 +5,7 @@ use crate::brdf::reflected;
 use crate::checkpoint;
 use crate::direct::{Receiver, direct_irradiance};
 use crate::field::Field;
-use crate::flat::{self, FlatTexture};
+use crate::flat::{self, FlatTexture, Texel};
 use crate::flattened::{Departure, Side, Target};
 use crate::mask::{Mask, masks, stand_ins};
 use crate::nearest::Neighbours;
@@ -65,8 +65,11 @@ impl RadianceCache {
         tick: &(dyn Fn(u64) -> bool + Sync),
     ) -> Self {
         let rays = AtomicU64::new(0);
-        let (flats, shown) =
-            (0..flat::count(scene)).map(|n| fill_flat(scene, tracer, n, &photons.flat, settings, &rays)).unzip();
+        let photons_of = ByFlat::new(&photons.flat, flat::count(scene));
+        let (flats, shown) = (0..flat::count(scene))
+            .into_par_iter()
+            .map(|n| fill_flat(scene, tracer, n, photons_of.flat(n), settings, &rays))
+            .unzip();
         let mut cache =
             Self { nodes: vec![[None, None]; scene.fields()], flats, shown: Some(shown), rays: rays.into_inner() };
         if with_nodes {
@@ -217,7 +220,7 @@ fn fill_nodes<T: Tracer>(
             }
             let (mut sum, mut count) = (DVec3::ZERO, 0.0);
             for (stand_in, p) in
-                stand_ins(&scene.field, scene.lattice(), node, settings.seed).into_iter().flatten().enumerate()
+                stand_ins::<2>(&scene.field, scene.lattice(), node, settings.seed).into_iter().flatten().enumerate()
             {
                 let position = p.as_vec3();
                 let Some(normal) = scene.normal(position.as_dvec3(), side) else { continue };
@@ -255,22 +258,27 @@ fn fill_flat<T: Tracer>(
     scene: &Scene,
     tracer: &T,
     number: usize,
-    photons: &[FlatPhoton],
+    photons: impl Iterator<Item = FlatPhoton>,
     settings: &CacheSettings,
     rays: &AtomicU64,
 ) -> (Option<FlatTexture>, Option<FlatTexture>) {
     let Some(flat) = flat::flat(scene, number).filter(|f| !f.albedo.black()) else { return (None, None) };
-    let dims = FlatTexture::resolution(flat.lengths(), settings.flat_resolution, settings.isovalue_resolution);
+    let dims = flat.resolution(settings.flat_resolution, settings.isovalue_resolution);
     let centres = FlatTexture::black(dims);
     let lattice = scene.lattice();
+    let parts = flat.texels(dims);
+    let part = |i: usize| parts[i % parts.len()];
     let direct: Vec<DVec3> = (0..centres.texels.len())
         .into_par_iter()
         .with_min_len(256)
         .map(|i| {
-            let [u, v, c] = centres.centre(i);
+            let c = centres.centre(i)[2];
+            if part(i).covered == 0.0 {
+                return DVec3::ZERO;
+            }
             #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
             let receiver = Receiver {
-                position: lattice.to_index(flat.at([u, v])).as_vec3(),
+                position: lattice.to_index(flat.at(part(i).at)).as_vec3(),
                 normal: flat.normal,
                 isovalue: c as f32,
                 departure: flat.departure,
@@ -281,29 +289,66 @@ fn fill_flat<T: Tracer>(
             direct.mean
         })
         .collect();
-    let (power, count) = flat_power(number, dims, photons);
+    let (power, count) = flat_power(dims, &parts, photons);
     let texel = flat.area() / (dims[0] * dims[1]) as f64 / dims[2] as f64;
     let density: Vec<DVec3> = power.into_iter().map(|p| p / texel).collect();
-    let per_texel = count as f64 / density.len() as f64;
+    let covered: f64 = parts.iter().map(|p| p.covered).sum();
+    let per_texel = count as f64 / (covered * dims[2] as f64);
+    let whole = parts.iter().all(|p| p.covered == 1.0);
     let texture = |kernel: Kernel, least: f64| {
-        let indirect = smooth_twice(&density, dims, kernel.passes(per_texel));
-        let light = direct
-            .iter()
-            .zip(indirect)
-            .enumerate()
-            .map(|(n, (d, i))| reflected(flat.albedo.at(centres.centre(n)[2]), (*d + i).max(DVec3::splat(least))));
+        let passes = kernel.passes(per_texel);
+        let indirect = if whole {
+            smooth_twice(&density, dims, passes)
+        } else {
+            // Texels beyond the outline take part of a neighbour's photons; their covered area tells how much.
+            let area = smooth((0..density.len()).map(|i| DVec3::splat(part(i).covered)).collect(), dims, passes);
+            let power = smooth(density.clone(), dims, passes);
+            power.iter().zip(area).map(|(p, a)| *p / a.x.max(1e-9)).collect()
+        };
+        let light = (0..density.len()).map(|n| {
+            let from = n - n % parts.len() + part(n).source;
+            reflected(flat.albedo.at(centres.centre(n)[2]), (direct[from] + indirect[from]).max(DVec3::splat(least)))
+        });
         Some(FlatTexture { dims, texels: light.map(|l| l.as_vec3().to_array()).collect() })
     };
     // A texture to be averaged is not clamped at 0: that would brighten what few photons reach.
     (texture(GATHERED, f64::NEG_INFINITY), texture(SHOWN, 0.0))
 }
 
+/// Photons sorted by flat, in their order.
+struct ByFlat<'a> {
+    photons: &'a [FlatPhoton],
+    order: Vec<u32>,
+    start: Vec<usize>,
+}
+
+impl<'a> ByFlat<'a> {
+    fn new(photons: &'a [FlatPhoton], flats: usize) -> Self {
+        let mut start = vec![0; flats + 1];
+        photons.iter().for_each(|p| start[p.flat as usize + 1] += 1);
+        (0..flats).for_each(|n| start[n + 1] += start[n]);
+        let (mut order, mut next) = (vec![0; photons.len()], start.clone());
+        for (n, p) in (0..).zip(photons) {
+            let at = &mut next[p.flat as usize];
+            order[*at] = n;
+            *at += 1;
+        }
+        Self { photons, order, start }
+    }
+
+    fn flat(&self, n: usize) -> impl Iterator<Item = FlatPhoton> {
+        self.order[self.start[n]..self.start[n + 1]].iter().map(|&i| self.photons[i as usize])
+    }
+}
+
 /// Power per texel of photons that were reflected before, and how many they are.
-fn flat_power(number: usize, dims: [usize; 3], photons: &[FlatPhoton]) -> (Vec<DVec3>, u64) {
+fn flat_power(dims: [usize; 3], parts: &[Texel], photons: impl Iterator<Item = FlatPhoton>) -> (Vec<DVec3>, u64) {
     let bins = FlatTexture::black(dims);
     let (mut power, mut count) = (vec![DVec3::ZERO; bins.texels.len()], 0);
-    for p in photons.iter().filter(|p| p.flat as usize == number && p.bounces > 0) {
-        power[bins.texel(p.uvc)] += p.power.as_dvec3();
+    for p in photons.filter(|p| p.bounces > 0) {
+        let texel = bins.texel(p.uvc);
+        let isovalue = texel / parts.len();
+        power[isovalue * parts.len() + parts[texel % parts.len()].source] += p.power.as_dvec3();
         count += 1;
     }
     (power, count)

@@ -5,7 +5,7 @@ mod companion;
 mod obj;
 
 pub use companion::{Companion, Member, Policy};
-pub use obj::read_obj;
+pub use obj::{Placement, read_context, read_obj};
 
 use crate::error::{Error, Result};
 use crate::field::Field;

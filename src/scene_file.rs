@@ -12,7 +12,7 @@ use crate::field::{Field, Sweep};
 use crate::flattened::Side;
 use crate::polygon::Polygon;
 use crate::reflectance::Reflectance;
-use crate::scene::{Boundary, Scene, Surface, cornell_box, read_obj};
+use crate::scene::{Boundary, Placement, Scene, Surface, cornell_box, read_context, read_obj};
 use crate::volume::generate::Generator;
 use crate::volume::raw::RawLayout;
 use crate::volume::statistics::VolumeStatistics;
@@ -37,9 +37,44 @@ pub struct SceneFile {
     /// Walls and luminaires.
     #[serde(default, rename = "box")]
     pub surroundings: BoxOptions,
+    /// Other things in the scene.
+    #[serde(default)]
+    pub context: Vec<ContextOptions>,
     /// How to bake.
     #[serde(default)]
     pub bake: BakeOptions,
+}
+
+/// `[[context]]`: polygons beside the box, seen from both sides.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+pub struct ContextOptions {
+    /// An OBJ file, relative to the scene file.
+    pub file: PathBuf,
+    /// Instead of the materials' albedo.
+    pub albedo: Option<Rgb>,
+    /// Instead of the materials' emission.
+    pub emission: Option<Rgb>,
+    /// Factor of the coordinates.
+    pub scale: Option<f64>,
+    /// Degrees about x, y and z.
+    pub rotate: Option<[f64; 3]>,
+    /// Shift, world units.
+    pub translate: Option<[f64; 3]>,
+}
+
+impl ContextOptions {
+    fn polygons(&self, folder: &Path) -> Result<Vec<Polygon>> {
+        let default = Placement::default();
+        let placement = Placement {
+            albedo: self.albedo.map(Rgb::vector),
+            emission: self.emission.map(Rgb::vector),
+            scale: self.scale.unwrap_or(default.scale),
+            rotate: self.rotate.map_or(default.rotate, DVec3::from_array),
+            translate: self.translate.map_or(default.translate, DVec3::from_array),
+        };
+        read_context(&folder.join(&self.file), &placement)
+    }
 }
 
 /// `[volume]`: a file or a generator.
@@ -377,13 +412,19 @@ pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
     let field = Field::new(&volume, sweep).map_err(blame("isovalues", given))?;
     let boxed = options.surroundings.kind.is_some() || options.surroundings.margin.is_some();
     let key = if file.surroundings.kind.is_some() { "kind" } else { "margin" };
-    let polygons =
+    let mut polygons =
         surroundings(&file.surroundings, &options.surroundings, &folder, field.lattice()).map_err(blame(key, boxed))?;
+    polygons.extend(context(&file.context, &folder).map_err(blame("[[context]]", false))?);
     let flag = options.surface.albedo.is_some();
     let (surface, boundary) = surface(&file.surface, &options.surface, sweep).map_err(blame("albedo", flag))?;
     let scene =
         Scene::new(field, surface, boundary, polygons).map_err(|e| if is_scene { e.in_file(input) } else { e })?;
     Ok(Loaded { volume, companions: Vec::new(), scene, bake: file.bake })
+}
+
+/// Polygons of all context geometry.
+fn context(entries: &[ContextOptions], folder: &Path) -> Result<Vec<Polygon>> {
+    Ok(entries.iter().map(|c| c.polygons(folder)).collect::<Result<Vec<_>>>()?.concat())
 }
 
 /// The sweep that the data suggest.
@@ -517,6 +558,10 @@ mod tests {
         assert!(e.contains("scene.toml:1: unknown key `isovalue`; did you mean `isovalues`?"), "{e}");
         let e = error_of("isovalues = [5, 5]\n[volume]\ngenerator = \"bumps\"\nsize = 9\n");
         assert!(e.contains("scene.toml:1: isovalues"), "{e}");
+        let e = error_of("[volume]\ngenerator = \"bumps\"\n[[context]]\nfile = \"a.obj\"\nscal = 3\n");
+        assert!(e.contains("scene.toml:5: unknown key `scal` in [[context]]; did you mean `scale`?"), "{e}");
+        let e = error_of("[volume]\ngenerator = \"bumps\"\nsize = 9\n[[context]]\nfile = \"nowhere.obj\"\n");
+        assert!(e.contains("scene.toml: [[context]]") && e.contains("nowhere.obj"), "{e}");
         let e = error_of("[volume]\nfile = \"nowhere.vti\"\n");
         assert!(e.contains("scene.toml:2: file") && e.contains("nowhere.vti"), "{e}");
         let e = error_of("[volume]\ngenerator = \"bumps\"\nsize = 9\n[box]\nmargin = -1.0\n");

@@ -16,7 +16,7 @@ use crate::bake::{Bake, BakeSettings, bake};
 use crate::embree::{Device, SurfaceTracer};
 use crate::error::{Error, Result};
 use crate::export::ply;
-use crate::progress::Progress;
+use crate::progress::{Progress, processor_seconds};
 use crate::reference::{ReferenceSettings, reference};
 use crate::scene::Scene;
 use crate::surface_mesh::SurfaceMesh;
@@ -127,19 +127,6 @@ impl Study {
         let (begun, worked) = (Instant::now(), processor_seconds());
         let result = bake(&subject.scene, settings, &self.device, self.progress)?;
         Ok((result, [begun.elapsed().as_secs_f64(), processor_seconds() - worked]))
-    }
-}
-
-/// Seconds that all threads of this process have worked, which other work on the machine hardly changes; NaN where the
-/// system does not tell.
-fn processor_seconds() -> f64 {
-    // Fields 14 and 15, counted from behind the name's parenthesis, in ticks of 10 ms.
-    let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
-    let mut fields =
-        stat.rsplit(')').next().unwrap_or_default().split_whitespace().skip(11).map_while(|f| f.parse::<f64>().ok());
-    match (fields.next(), fields.next()) {
-        (Some(user), Some(system)) => (user + system) * 0.01,
-        _ => f64::NAN,
     }
 }
 

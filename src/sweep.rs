@@ -117,6 +117,9 @@ pub struct SweepCounts {
     pub masked: u64,
 }
 
+/// Polygons that a sweep takes.
+pub const MOST_POLYGONS: usize = 256;
+
 /// Passes with few directions take this share of the full number.
 const COARSE: usize = 4;
 /// Full passes after the light has settled.
@@ -128,8 +131,15 @@ const LEAST: usize = 32;
 /// bounces converge); returning false stops early with what there is.
 ///
 /// # Errors
-/// `NotSupported` if a polygon that is not a luminaire stands inside the volume: that needs the photon engine.
+/// `NotSupported` if a polygon that is not a luminaire stands inside the volume, or if there are more than
+/// [`MOST_POLYGONS`]: that needs the photon engine.
 pub fn sweep(scene: &Scene, settings: &SweepSettings, tick: &(dyn Fn(f64) -> bool + Sync)) -> Result<SweepResult> {
+    let polygons = scene.polygons().len();
+    if polygons > MOST_POLYGONS {
+        return Err(Error::NotSupported(format!(
+            "{polygons} polygons: sweeps test each line against all, {MOST_POLYGONS} at most; use --engine photon"
+        )));
+    }
     let inside = flats::inside(scene);
     if let Some((_, p)) = inside.iter().zip(scene.polygons()).find(|(inside, p)| **inside && !p.opaque_back) {
         return Err(Error::NotSupported(format!(

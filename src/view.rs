@@ -10,7 +10,7 @@ use crate::flat::{self, FlatTexture};
 use crate::flattened::Side;
 use crate::mask::Mask;
 use crate::render::Camera;
-use crate::scene::Boundary;
+use crate::scene::{Boundary, Scene};
 use base64::Engine;
 use flate2::{Compression, write::ZlibEncoder};
 use glam::{DMat3, DVec3};
@@ -88,8 +88,10 @@ impl Payload {
             codec::append_colours(&mut bytes, &grid.radiance, factor);
             codec::append_plane(&mut bytes, grid.mask.iter().map(|&m| if m == Mask::Empty { 0 } else { 255 }));
         }
-        let flats: Vec<Value> =
-            (0..flat::count(scene)).filter_map(|n| describe_flat(baked, &frame, n, factor, &mut bytes)).collect();
+        let flats: Vec<Value> = (0..flat::count(scene))
+            .filter(|&n| !leaves_out(scene) || scene.polygons().get(n).is_none_or(|p| p.other_face == 0))
+            .filter_map(|n| describe_flat(baked, &frame, n, factor, &mut bytes))
+            .collect();
         let axes = lattice.axes();
         let sweep = scene.field.sweep();
         let camera = Camera::facing(scene, 1000);
@@ -128,6 +130,14 @@ impl Payload {
         let script = [include_str!("view/shaders.js"), include_str!("view/viewer.js")].concat();
         [head, &description, middle, &data, before, &script, tail].concat()
     }
+}
+
+/// Polygons that a page draws at most, each by itself.
+pub const MOST_POLYGONS: usize = 2048;
+
+/// Whether a page leaves context geometry out, because there is too much.
+pub fn leaves_out(scene: &Scene) -> bool {
+    scene.polygons().len() > MOST_POLYGONS
 }
 
 /// A wall, luminaire or cap for the page, its texture appended to `bytes`; `None` for caps of an open boundary.

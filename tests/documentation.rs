@@ -36,6 +36,7 @@ fn known_keys(header: &str, flatland: bool) -> BTreeSet<String> {
     let text = match header {
         "" => format!("zzz = 1\n{needed}"),
         h if needed.contains(&format!("[{h}]")) => format!("[{h}]\nzzz = 1\n"),
+        "context" => format!("{needed}[[context]]\nfile = \"a.obj\"\nzzz = 1\n"),
         h => format!("{needed}[{h}]\nzzz = 1\n"),
     };
     fs::write(&path, text).unwrap();
@@ -58,6 +59,7 @@ fn every_key_of_a_scene_is_described_and_no_other() {
         ("volume.raw", "[volume.raw]", false),
         ("surface", "[surface]", false),
         ("box", "[box]", false),
+        ("context", "[[context]]", false),
         ("bake", "[bake]", false),
         ("", "Flatland: top level", true),
         ("field", "Flatland: [field]", true),

@@ -118,7 +118,7 @@ pub fn through_grid(
         .par_iter()
         .map(|&o| {
             let (mut sum, mut count) = (DVec3::ZERO, 0.0);
-            for (i, p) in stand_ins(&scene.field, &lattice, o, 0).into_iter().flatten().enumerate() {
+            for (i, p) in stand_ins::<2>(&scene.field, &lattice, o, 0).into_iter().flatten().enumerate() {
                 if let Some(r) = receiver(scene, p, scene.field.value(p) as f32, scene.surface.outside) {
                     (sum, count) = (sum + value(&r, (o * 2 + i) as u64), count + 1.0);
                 }

@@ -1,5 +1,6 @@
 //! How much memory a bake takes, before it takes it.
 
+use super::grid_points::STAND_INS;
 use super::{BakeSettings, Engine, StrategyName};
 use crate::embree::{Device, GraphTracer};
 use crate::error::{Error, Result};
@@ -68,8 +69,8 @@ impl MemoryEstimate {
         // As gathers and as pictures see them.
         let flats = 24 * texels;
         let sample = size_of::<Option<RadianceSample>>() as u64;
-        // A sample: position, owner, result in its chunk and joined, checkpoint.
-        let per_sample = 12 + 8 + 2 * sample + 16;
+        // A sample: position, owner, result, checkpoint.
+        let per_sample = 12 + 8 + sample + RadianceSample::SAVED as u64;
         let export = grids + flats + points * (4 + 13 * stored) + WRITER.min(points * (5 + 29 * stored) * 2);
         let stages = match settings.engine {
             Engine::Photon => {
@@ -79,17 +80,19 @@ impl MemoryEstimate {
                 let gather = settings.gather_rays > 0;
                 // Nodes of both sides, and the same in the checkpoint.
                 let nodes = if gather { 4 * 12 * voxels } else { 0 };
+                // Both halves, normal, isovalue, errors and result at each point.
+                let smoothing = if gather && settings.smoothing { points * (24 + 16 + 12 + 16) } else { 0 };
                 let map = if gather { 0 } else { (mapped * MAP) as u64 };
                 vec![
                     ("photons", base + photons * 9 / 8),
                     ("cache", base + photons + (mapped * MAPPING) as u64 + nodes + flats * 3),
-                    ("samples", base + photons + map + nodes + flats + samples * per_sample + grids),
+                    ("samples", base + photons + map + nodes + flats + samples * per_sample + smoothing + grids),
                     ("export", base + export),
                 ]
             }
             Engine::Sweep => vec![
                 ("sweep", base + points * SWEPT * stored.max(1) + flats * 4),
-                ("samples", base + flats + points * (12 * 4 + 16) + filled * per_sample + grids),
+                ("samples", base + flats + points * (12 * 4 + 16) + STAND_INS as u64 * filled * per_sample + grids),
                 ("export", base + export),
             ],
         };

@@ -1,20 +1,20 @@
 //! BB09's engine: photons, a radiance cache, samples by exact rays, interpolation.
 
+use super::grid_points::GridPoints;
 use super::{BakeSettings, Interpolation, Lit, PhotonCounts, stages};
 use crate::checkpoint::{self, Checkpoint};
 use crate::embree::{Device, GraphTracer, pyramids};
 use crate::error::{Error, Result};
-use crate::field::Field;
 use crate::fitted_grid::fit;
 use crate::flattened::Side;
 use crate::illumination_grid::{IlluminationGrid, shepard};
-use crate::mask::{Mask, stand_ins};
+use crate::mask::Mask;
 use crate::photon::{PhotonSettings, trace_photons};
 use crate::photon_map::PhotonMap;
 use crate::progress::Progress;
 use crate::radiance::{Indirect, RadianceSample, sample_radiance};
 use crate::radiance_cache::{CacheSettings, RadianceCache};
-use crate::sampling::positions;
+use crate::sampling::{Strategy, positions};
 use crate::scene::Scene;
 use crate::volume::Lattice;
 use glam::Vec3;
@@ -115,10 +115,14 @@ fn light_side(
 ) -> Result<IlluminationGrid> {
     let Job { scene, lattice, masks, .. } = job;
     let begun = Instant::now();
-    let (at, owners) = place(scene, settings, lattice, masks)?;
+    let strategy = settings.strategy.placed();
+    let points =
+        strategy.is_none().then(|| GridPoints::new(&scene.field, lattice, masks, settings.seed, |m| m != Mask::Empty));
+    let scattered = strategy.map(|s| scatter(scene, settings, masks, &s)).transpose()?;
+    let at = points.as_ref().map_or(scattered.as_deref().unwrap_or_default(), GridPoints::positions);
     let stage = progress.stage("samples", at.len() as u64);
     let (shadow_rays, seed) = (settings.shadow_rays, settings.seed);
-    let sampled = sample_radiance(scene, tracer, indirect, &at, side, shadow_rays, seed, saved, &|n| stage.tick(n));
+    let sampled = sample_radiance(scene, tracer, indirect, at, side, shadow_rays, seed, saved, &|n| stage.tick(n));
     stage.end()?;
     lit.seconds.samples += begun.elapsed().as_secs_f64();
     lit.rays += sampled.rays;
@@ -128,14 +132,22 @@ fn light_side(
 
     let passes = 1 + u64::from(settings.interpolation == Interpolation::Fit);
     let stage = progress.stage("interpolate", passes * lattice.len() as u64);
-    let grid = match owners {
-        Some(owners) => collect(masks, &owners, &sampled.samples),
+    let grid = match points {
+        Some(points) => {
+            let mut grid = points.collect(&sampled.samples);
+            if settings.smoothing && settings.gather_rays > 1 {
+                points.smooth(scene, side, settings.tau, &mut grid, &sampled.samples);
+            }
+            points.fit_beside(grid, &sampled.samples)
+        }
         None => {
             let samples: Vec<RadianceSample> = sampled.samples.into_iter().flatten().collect();
             let grid = shepard(&scene.field, lattice, masks, &samples, settings.neighbours, &|n| stage.tick(n));
             match settings.interpolation {
                 Interpolation::Shepard => grid,
-                Interpolation::Fit => fit(&scene.field, lattice, &samples, grid, &|n| stage.tick(n)),
+                Interpolation::Fit => {
+                    fit(&scene.field, lattice, &samples, grid, |m| m != Mask::Empty, &|n| stage.tick(n))
+                }
             }
         }
     };
@@ -143,63 +155,14 @@ fn light_side(
     Ok(grid)
 }
 
-/// Sample positions and, for samples at the grid's own points, the point that each belongs to.
-#[allow(clippy::type_complexity, reason = "a pair")]
+/// Positions of scattered samples.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "counts")]
-fn place(
-    scene: &Scene,
-    settings: &BakeSettings,
-    lattice: &Lattice,
-    masks: &[Mask],
-) -> Result<(Vec<Vec3>, Option<Vec<usize>>)> {
+fn scatter(scene: &Scene, settings: &BakeSettings, masks: &[Mask], strategy: &Strategy) -> Result<Vec<Vec3>> {
     let needed = masks.iter().filter(|&&m| m != Mask::Empty).count();
     let count = settings.samples.unwrap_or(((needed as f64 * settings.samples_per_point) as u64).max(1000));
-    let Some(strategy) = settings.strategy.placed() else {
-        let (at, owners) = at_points(&scene.field, lattice, settings.seed, |o| masks[o] != Mask::Empty);
-        return Ok((at, Some(owners)));
-    };
-    let at = positions(&scene.field, &strategy, count, settings.seed)?;
+    let at = positions(&scene.field, strategy, count, settings.seed)?;
     if at.is_empty() {
         return Err(Error::Invalid("no sample landed on an isosurface of the sweep; choose other isovalues".into()));
     }
-    Ok((at, None))
-}
-
-/// Sample positions that stand for the points of `lattice` that `wanted` picks, and the point that each belongs to.
-pub(super) fn at_points(
-    field: &Field,
-    lattice: &Lattice,
-    seed: u64,
-    wanted: impl Fn(usize) -> bool,
-) -> (Vec<Vec3>, Vec<usize>) {
-    let points = (0..lattice.len()).filter(|&o| wanted(o));
-    points.flat_map(|o| stand_ins(field, lattice, o, seed).into_iter().flatten().map(move |p| (p.as_vec3(), o))).unzip()
-}
-
-/// The mean of the samples that each grid point owns; points of which no sample was found stay empty, which viewers
-/// and [`IlluminationGrid::interpolate`] leave out.
-#[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-pub(super) fn collect(masks: &[Mask], owners: &[usize], samples: &[Option<RadianceSample>]) -> IlluminationGrid {
-    let mut grid = IlluminationGrid {
-        radiance: vec![[0.0; 3]; masks.len()],
-        std_error: vec![0.0; masks.len()],
-        mask: vec![Mask::Empty; masks.len()],
-    };
-    let mut i = 0;
-    while i < owners.len() {
-        let owner = owners[i];
-        let (mut sum, mut variance, mut n) = (Vec3::ZERO, 0.0, 0.0);
-        while i < owners.len() && owners[i] == owner {
-            if let Some(s) = &samples[i] {
-                (sum, variance, n) = (sum + s.radiance, variance + s.variance, n + 1.0);
-            }
-            i += 1;
-        }
-        if n > 0.0 {
-            grid.radiance[owner] = (sum / n).to_array();
-            grid.std_error[owner] = variance.sqrt() / n;
-            grid.mask[owner] = masks[owner];
-        }
-    }
-    grid
+    Ok(at)
 }

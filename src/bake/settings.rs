@@ -116,6 +116,9 @@ pub struct BakeOptions {
     #[arg(long = "gather", value_name = "M")]
     #[serde(rename = "gather")]
     pub gather_rays: Option<u32>,
+    /// Whether light gathered at the grid's points is smoothed over neighbouring ones where that lowers its error
+    #[arg(long, value_name = "BOOL")]
+    pub smoothing: Option<bool>,
     /// Nearest samples that Shepard interpolation blends
     #[arg(long, value_name = "K")]
     pub neighbours: Option<usize>,
@@ -169,6 +172,7 @@ impl BakeOptions {
             strategy: self.strategy.or(other.strategy),
             shadow_rays: self.shadow_rays.or(other.shadow_rays),
             gather_rays: self.gather_rays.or(other.gather_rays),
+            smoothing: self.smoothing.or(other.smoothing),
             neighbours: self.neighbours.or(other.neighbours),
             interpolation: self.interpolation.or(other.interpolation),
             grid: self.grid.or(other.grid),
@@ -211,6 +215,8 @@ pub struct BakeSettings {
     pub gather_rays: u32,
     /// Shadow rays per cached node and luminaire.
     pub cache_shadow_rays: u32,
+    /// Whether gathered light is smoothed over the grid's points.
+    pub smoothing: bool,
     /// Samples blended per grid point.
     pub neighbours: usize,
     /// How samples become grid values.
@@ -274,6 +280,7 @@ impl BakeSettings {
             shadow_rays: o.shadow_rays.unwrap_or(shadow),
             gather_rays: o.gather_rays.unwrap_or(gather),
             cache_shadow_rays: cache,
+            smoothing: o.smoothing.unwrap_or(true),
             neighbours: o.neighbours.unwrap_or(8),
             interpolation: o.interpolation.unwrap_or_default(),
             grid: o.grid.unwrap_or(GridSize::Factor(1)),

@@ -1,6 +1,7 @@
 //! The fast engine: line sweeps light every node; exact rays fill the points beside the sweep's ends.
 
-use super::photon_engine::{Job, at_points, collect};
+use super::grid_points::GridPoints;
+use super::photon_engine::Job;
 use super::{BakeSettings, Lit, stages};
 use crate::brdf::reflected;
 use crate::checkpoint::Checkpoint;
@@ -61,7 +62,8 @@ pub(super) fn light(
     let tracer = GraphTracer::new(device, scene)?;
     lit.seconds.build = begun.elapsed().as_secs_f64();
     let begun = Instant::now();
-    let (at, owners) = at_points(&scene.field, lattice, settings.seed, |o| masks[o] == Mask::Filled);
+    let points = GridPoints::new(&scene.field, lattice, masks, settings.seed, |m| m == Mask::Filled);
+    let at = points.positions();
     let mut sides = Vec::new();
     for (s, white) in swept.sides.iter().zip(white) {
         let stage = progress.stage("samples", at.len() as u64);
@@ -69,15 +71,15 @@ pub(super) fn light(
         let (shadow_rays, seed) = (settings.shadow_rays, settings.seed);
         let saved = stages(checkpoint, 4 * number + 2)[s.side.index()];
         let sampled =
-            sample_radiance(scene, &tracer, &indirect, &at, s.side, shadow_rays, seed, saved, &|n| stage.tick(n));
+            sample_radiance(scene, &tracer, &indirect, at, s.side, shadow_rays, seed, saved, &|n| stage.tick(n));
         stage.end()?;
         lit.rays += sampled.rays;
         lit.misses += sampled.misses;
         lit.samples += at.len() as u64 - sampled.without_gradient;
         lit.without_gradient += sampled.without_gradient;
-        let mut grid = collect(masks, &owners, &sampled.samples);
+        let mut grid = points.collect(&sampled.samples);
         merge(&mut grid, masks, &outgoing(scene, white), &s.std_error);
-        sides.push((s.side, grid));
+        sides.push((s.side, points.fit_beside(grid, &sampled.samples)));
     }
     lit.fields.push(sides);
     lit.seconds.samples = begun.elapsed().as_secs_f64();

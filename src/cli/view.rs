@@ -32,6 +32,13 @@ impl View {
         expect_extension(&self.output, &["html", "htm"])?;
         writable(&self.output)?;
         let baked = BakedVolume::read(&self.file)?;
+        if view::leaves_out(&baked.scene) && progress == Progress::Shown {
+            eprintln!(
+                "warning: context geometry is left out: {} polygons, and a page draws {}",
+                baked.scene.polygons().len(),
+                view::MOST_POLYGONS
+            );
+        }
         let name = || self.file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let title = self.title.clone().unwrap_or_else(name);
         let bytes = view::write(&self.output, &baked, &title).map_err(|e| e.in_file(&self.file))?;

@@ -18,10 +18,14 @@ use crate::volume::{Lattice, Samples, Volume};
 use glam::DVec3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 /// Name of the field string that holds scene and report as JSON.
 const DESCRIPTION: &str = "isolume";
+
+/// Name of the array that holds the radiance of all context geometry.
+const CONTEXT: &str = "context";
 
 /// Name of the field string that holds the volume's [`crate::volume::Space`].
 pub const SPACE: &str = "space";
@@ -38,8 +42,7 @@ struct Description {
     both_sides: bool,
     capped: bool,
     polygons: Vec<PolygonDescription>,
-    /// Texels (u, v, isovalue) of each flat's texture, by array name.
-    textures: Vec<(usize, String, [usize; 3])>,
+    textures: Vec<TextureDescription>,
     report: serde_json::Value,
     /// The volume's name, if there are others.
     #[serde(default)]
@@ -49,12 +52,27 @@ struct Description {
     independent: bool,
 }
 
+/// Where the texture of a flat is stored.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct TextureDescription {
+    flat: usize,
+    array: String,
+    /// Texels along u, v and the isovalue.
+    dims: [usize; 3],
+    /// Texels of the array before it.
+    #[serde(default)]
+    start: usize,
+}
+
 #[derive(Clone, Debug, Serialize, Deserialize)]
 struct PolygonDescription {
     name: String,
     vertices: Vec<DVec3>,
     albedo: DVec3,
     emission: DVec3,
+    /// As [`Polygon::other_face`].
+    #[serde(default)]
+    other_face: i32,
 }
 
 /// Suffix of the arrays of stored side number `i`: the outside has none.
@@ -90,7 +108,7 @@ pub fn field_file(path: &Path, name: &str) -> PathBuf {
 
 /// Writes a bake. Point data: `value` (source units, active scalars), `radiance` (linear RGB), `rgb` (exposed, clamped,
 /// sRGB-encoded), `std_error` (of luminance), `mask` ([`Mask`]); with both sides also `radiance_inside` and so on. Field
-/// data: `wall_<name>` radiance over (u, v, isovalue), exposure, every number of the report, and all of it as JSON.
+/// data: `wall_<name>` radiance over (u, v, isovalue), `context` the same of all context geometry, exposure, every number of the report, and all of it as JSON.
 ///
 /// # Errors
 /// `Io` if the file cannot be written.
@@ -118,17 +136,28 @@ pub fn write(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
         })
         .collect();
     let mut textures = Vec::new();
-    let texels: Vec<(String, &[f32])> = bake
-        .flats
-        .iter()
-        .enumerate()
-        .filter_map(|(n, t)| {
-            let t = t.as_ref()?;
-            let name = format!("wall_{}", flat_name(scene, n));
-            textures.push((n, name.clone(), t.dims));
-            Some((name, t.texels.as_flattened()))
-        })
-        .collect();
+    let mut texels: Vec<(String, Cow<'_, [f32]>)> = Vec::new();
+    // Much context geometry would be as many arrays.
+    let mut context = Vec::new();
+    for (n, t) in bake.flats.iter().enumerate() {
+        let Some(t) = t else { continue };
+        let (array, start) = match scene.polygons().get(n) {
+            Some(p) if p.other_face != 0 => (CONTEXT.to_owned(), context.len() / 3),
+            _ => (format!("wall_{}", flat_name(scene, n)), 0),
+        };
+        // Names in OBJ files may repeat.
+        let array =
+            if array != CONTEXT && texels.iter().any(|t| t.0 == array) { format!("{array}_{n}") } else { array };
+        if array == CONTEXT {
+            context.extend_from_slice(t.texels.as_flattened());
+        } else {
+            texels.push((array.clone(), Cow::Borrowed(t.texels.as_flattened())));
+        }
+        textures.push(TextureDescription { flat: n, array, dims: t.dims, start });
+    }
+    if !context.is_empty() {
+        texels.push((CONTEXT.to_owned(), Cow::Owned(context)));
+    }
     let description = Description {
         isovalues: [sweep.lo(), sweep.hi()],
         exposure: bake.exposure,
@@ -145,6 +174,7 @@ pub fn write(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
                 vertices: p.vertices().to_vec(),
                 albedo: p.albedo,
                 emission: p.emission,
+                other_face: p.other_face,
             })
             .collect(),
         textures,
@@ -175,7 +205,7 @@ pub fn write(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
             .point_data(&format!("mask{s}"), 1, mask);
     }
     for (name, data) in &texels {
-        writer = writer.field_data(name, 3, *data);
+        writer = writer.field_data(name, 3, &data[..]);
     }
     let constants: Vec<(String, Samples)> = numbers
         .into_iter()
@@ -269,13 +299,18 @@ impl BakedVolume {
             let found = arrays.iter().find(|a| a.name == name);
             found.map(|a| a.samples.clone()).ok_or_else(|| Error::Invalid(format!("the array '{name}' is missing")))
         };
-        let floats = |arrays: &[VtiArray], name: &str, count: usize| -> Result<Vec<f32>> {
+        let all = |arrays: &[VtiArray], name: &str| -> Result<Vec<f32>> {
             match array(arrays, name)? {
-                Samples::F32(v) if v.len() == count => Ok(v),
-                other => {
-                    Err(Error::Invalid(format!("the array '{name}' holds {} values, not {count} floats", other.len())))
-                }
+                Samples::F32(v) => Ok(v),
+                _ => Err(Error::Invalid(format!("the array '{name}' holds no 32-bit floats"))),
             }
+        };
+        let floats = |arrays: &[VtiArray], name: &str, count: usize| -> Result<Vec<f32>> {
+            let v = all(arrays, name)?;
+            if v.len() == count {
+                return Ok(v);
+            }
+            Err(Error::Invalid(format!("the array '{name}' holds {} values, not {count} floats", v.len())))
         };
         let triples = |v: Vec<f32>| -> Vec<[f32; 3]> { v.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect() };
         let outside = if d.outside == "higher" { Side::Higher } else { Side::Lower };
@@ -307,16 +342,34 @@ impl BakedVolume {
         let polygons = d
             .polygons
             .into_iter()
-            .map(|p| Polygon::new(&p.name, p.vertices, p.albedo, p.emission))
+            .map(|p| {
+                let mut polygon = Polygon::new(&p.name, p.vertices, p.albedo, p.emission)?;
+                polygon.opaque_back &= p.other_face == 0;
+                polygon.other_face = p.other_face;
+                Ok(polygon)
+            })
             .collect::<Result<Vec<_>>>()?;
         let boundary = if d.capped { Boundary::Capped } else { Boundary::Open };
         let member = Member { name: d.volume, field: field.into(), surface, boundary };
         let scene = Scene::with_members(vec![member], Policy::Joint, polygons)?;
         let mut flats = vec![None; flat::count(&scene)];
-        for (n, name, dims) in d.textures {
-            let texels = triples(floats(&file.field_data, &name, 3 * dims.iter().product::<usize>())?);
-            if let Some(slot) = flats.get_mut(n) {
-                *slot = Some(FlatTexture { dims, texels });
+        let mut read: Option<(String, Vec<[f32; 3]>)> = None;
+        for t in d.textures {
+            let count = t.dims.iter().product::<usize>();
+            let texels = match &read {
+                Some((name, texels)) if *name == t.array => texels,
+                _ => &read.insert((t.array.clone(), triples(all(&file.field_data, &t.array)?))).1,
+            };
+            let own = texels.get(t.start..).and_then(|rest| rest.get(..count)).ok_or_else(|| {
+                Error::Invalid(format!(
+                    "the array '{}' holds {} colours, not {count} from {} on",
+                    t.array,
+                    texels.len(),
+                    t.start
+                ))
+            })?;
+            if let Some(slot) = flats.get_mut(t.flat) {
+                *slot = Some(FlatTexture { dims: t.dims, texels: own.to_vec() });
             }
         }
         let (exposure, report) = (d.exposure, d.report);

@@ -136,21 +136,17 @@ impl SurfaceMap {
         let own = MappedSurface::new(scene, mesh, origin, photons);
         let others = companions.iter().map(|(scene, mesh)| MappedSurface::new(scene, mesh, origin, photons));
         let surfaces = [own].into_iter().chain(others).collect();
-        let walls = (0..scene.polygons().len())
-            .map(|n| {
-                let polygon = &scene.polygons()[n];
-                let items: Vec<_> = photons
-                    .flat
-                    .par_iter()
-                    .filter(|p| p.bounces > 0 && p.flat as usize == n)
-                    .map(|p| {
-                        let x = polygon.at([f64::from(p.uvc[0]), f64::from(p.uvc[1])]);
-                        ((x - origin).as_vec3(), p.power, Vec3::ZERO)
-                    })
-                    .collect();
-                Share::new(&items)
-            })
-            .collect();
+        let mut landed = vec![Vec::new(); scene.polygons().len()];
+        for p in photons.flat.iter().filter(|p| p.bounces > 0) {
+            // Caps hold none.
+            if let (Some(polygon), Some(items)) =
+                (scene.polygons().get(p.flat as usize), landed.get_mut(p.flat as usize))
+            {
+                let x = polygon.at([f64::from(p.uvc[0]), f64::from(p.uvc[1])]);
+                items.push(((x - origin).as_vec3(), p.power, Vec3::ZERO));
+            }
+        }
+        let walls = landed.par_iter().map(|items| Share::new(items)).collect();
         let set = Sobol::set(0, Stage::Footprint, 1 << 20);
         #[allow(clippy::cast_possible_truncation, reason = "64 points")]
         let disk = (0..DISK as u32).map(|i| warp::disk(set.point2(i, 0))).collect();
@@ -220,7 +216,15 @@ impl SurfaceMap {
             return DVec3::ZERO;
         }
         let farthest = found.iter().map(|e| e.0).fold(0.0, f32::max);
-        let radius = if found.len() < k { self.radius } else { farthest.sqrt() };
+        let most = match at.departure {
+            // Beyond a small polygon there is nothing to find.
+            Departure::Polygon(id) => {
+                let [e, f] = scene.polygons()[id as usize].texture_edges();
+                self.radius.min((e.length() + f.length()) as f32)
+            }
+            _ => self.radius,
+        };
+        let radius = if found.len() < k { most } else { farthest.sqrt() };
         if radius == 0.0 {
             return DVec3::ZERO;
         }

@@ -1,8 +1,8 @@
-//! Walls and luminaires from a Wavefront OBJ with MTL, through tobj: Kd is the albedo, Ke the emission.
+//! Walls, luminaires and context geometry from a Wavefront OBJ with MTL, through tobj: Kd is the albedo, Ke the emission.
 
 use crate::error::{Error, Result};
 use crate::polygon::Polygon;
-use glam::DVec3;
+use glam::{DQuat, DVec3, EulerRot};
 use std::path::Path;
 
 /// Reads all faces as polygons, in file order; vertices counter-clockwise from the visible side. A face without a
@@ -12,13 +12,96 @@ use std::path::Path;
 /// `Io` if the OBJ or its MTL cannot be read, `Invalid` for faces that are no planar convex polygons; messages name
 /// the file and the face.
 pub fn read_obj(path: &Path) -> Result<Vec<Polygon>> {
+    let mut polygons = Vec::new();
+    for face in faces(path)? {
+        let polygon = Polygon::new(&face.name, face.vertices, face.albedo, face.emission)
+            .map_err(|e| Error::invalid(path, format!("{}: {e}", face.place)))?;
+        polygons.push(polygon);
+    }
+    Ok(polygons)
+}
+
+/// How context geometry differs from its file.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Placement {
+    /// Instead of the materials' albedo.
+    pub albedo: Option<DVec3>,
+    /// Instead of the materials' emission.
+    pub emission: Option<DVec3>,
+    /// Factor of all coordinates, first.
+    pub scale: f64,
+    /// Then turns about world x, y and z, in that order, degrees.
+    pub rotate: DVec3,
+    /// Then a shift.
+    pub translate: DVec3,
+}
+
+impl Default for Placement {
+    fn default() -> Self {
+        Self { albedo: None, emission: None, scale: 1.0, rotate: DVec3::ZERO, translate: DVec3::ZERO }
+    }
+}
+
+/// Reads all faces as polygons with two faces each ([`Polygon::both_faces`]). Faces that are not planar and convex are split into
+/// triangles; those without an area are left out.
+///
+/// # Errors
+/// `Io` if the OBJ or its MTL cannot be read; `Invalid` if no face has an area, for coordinates that are not finite, and for
+/// an albedo or emission out of range.
+pub fn read_context(path: &Path, placement: &Placement) -> Result<Vec<Polygon>> {
+    let Placement { scale, rotate, translate, .. } = *placement;
+    let [x, y, z] = rotate.to_array().map(f64::to_radians);
+    let turn = DQuat::from_euler(EulerRot::ZYX, z, y, x);
+    let mut polygons = Vec::new();
+    for face in faces(path)? {
+        let vertices: Vec<DVec3> = face.vertices.iter().map(|&v| turn * (scale * v) + translate).collect();
+        if !vertices.iter().all(|v| v.is_finite()) {
+            return Err(Error::invalid(path, format!("{}: a vertex is not finite", face.place)));
+        }
+        let (albedo, emission) = (placement.albedo.unwrap_or(face.albedo), placement.emission.unwrap_or(face.emission));
+        let polygon = |v: Vec<DVec3>| Polygon::new(&face.name, v, albedo, emission);
+        let has_area = |t: &[DVec3]| {
+            let (a, b) = (t[1] - t[0], t[2] - t[0]);
+            a.cross(b).length() > 1e-9 * a.length_squared().max(b.length_squared())
+        };
+        match polygon(vertices.clone()) {
+            Ok(whole) => polygons.extend(whole.both_faces()),
+            Err(_) => {
+                for n in 1..vertices.len().saturating_sub(1) {
+                    let triangle = vec![vertices[0], vertices[n], vertices[n + 1]];
+                    if has_area(&triangle) {
+                        let triangle =
+                            polygon(triangle).map_err(|e| Error::invalid(path, format!("{}: {e}", face.place)))?;
+                        polygons.extend(triangle.both_faces());
+                    }
+                }
+            }
+        }
+    }
+    if polygons.is_empty() {
+        return Err(Error::invalid(path, "none of its faces has an area"));
+    }
+    Ok(polygons)
+}
+
+/// An 'f' line.
+struct Face {
+    name: String,
+    /// For messages.
+    place: String,
+    vertices: Vec<DVec3>,
+    albedo: DVec3,
+    emission: DVec3,
+}
+
+fn faces(path: &Path) -> Result<Vec<Face>> {
     let options = tobj::LoadOptions { single_index: false, triangulate: false, ..Default::default() };
     if let Err(e) = std::fs::metadata(path) {
         return Err(Error::io(path, e));
     }
     let (models, materials) = tobj::load_obj(path, &options).map_err(|e| Error::invalid(path, e))?;
     let materials = materials.map_err(|e| Error::invalid(path, format!("its material library: {e}")))?;
-    let mut polygons = Vec::new();
+    let mut faces = Vec::new();
     for model in &models {
         let mesh = &model.mesh;
         let material = mesh.material_id.map(|i| &materials[i]);
@@ -37,15 +120,14 @@ pub fn read_obj(path: &Path) -> Result<Vec<Polygon>> {
             let vertices = mesh.indices[at..at + arity as usize].iter().map(|&i| vertex(i)).collect();
             at += arity as usize;
             let name = if arities.len() == 1 { model.name.clone() } else { format!("{}_{face}", model.name) };
-            let polygon = Polygon::new(&name, vertices, albedo, emission)
-                .map_err(|e| Error::invalid(path, format!("face {} of '{}': {e}", face + 1, model.name)))?;
-            polygons.push(polygon);
+            let place = format!("face {} of '{}'", face + 1, model.name);
+            faces.push(Face { name, place, vertices, albedo, emission });
         }
     }
-    if polygons.is_empty() {
-        return Err(Error::invalid(path, "holds no faces; walls and luminaires are 'f' lines"));
+    if faces.is_empty() {
+        return Err(Error::invalid(path, "holds no faces; polygons are 'f' lines"));
     }
-    Ok(polygons)
+    Ok(faces)
 }
 
 #[cfg(test)]
@@ -71,6 +153,32 @@ mod tests {
         std::fs::write(&obj, "v 0 0 0\nv 0 1 0\nv 0 2 0\nf 1 2 3\n").unwrap();
         let message = read_obj(&obj).unwrap_err().to_string();
         assert!(message.contains("box.obj") && message.contains("face 1"), "{message}");
+    }
+
+    #[test]
+    fn context_is_placed_has_two_faces_and_is_split_where_it_must() {
+        let dir = tempfile::tempdir().unwrap();
+        let obj = dir.path().join("thing.obj");
+        // A square, a twisted quad, and a triangle without an area.
+        let text = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 1 1 1\nv 2 0 0\nf 1 2 3 4\nf 1 2 5 4\nf 1 2 6\n";
+        std::fs::write(&obj, text).unwrap();
+        let placement = Placement {
+            albedo: Some(DVec3::splat(0.3)),
+            scale: 2.0,
+            rotate: DVec3::new(90.0, 0.0, 90.0),
+            translate: DVec3::new(0.0, 0.0, 5.0),
+            ..Placement::default()
+        };
+        let p = read_context(&obj, &placement).unwrap();
+        assert_eq!(p.len(), 2 * (1 + 2));
+        // (1, 0, 0) → 2x → x → y; (0, 1, 0) → 2y → z → z.
+        for (got, expected) in p[0].vertices().iter().zip([(0., 0., 5.), (0., 2., 5.), (0., 2., 7.), (0., 0., 7.)]) {
+            assert!((*got - DVec3::from(expected)).length() < 1e-12, "{got}");
+        }
+        assert!(p.chunks(2).all(|f| (f[0].normal() + f[1].normal()).length() < 1e-12 && f[0].albedo.x == 0.3));
+        assert!(p.iter().zip([1, -1].into_iter().cycle()).all(|(p, n)| p.other_face == n && !p.opaque_back));
+        std::fs::write(&obj, "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n").unwrap();
+        assert!(read_context(&obj, &Placement::default()).unwrap_err().to_string().contains("thing.obj"));
     }
 
     #[test]

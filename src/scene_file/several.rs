@@ -2,7 +2,7 @@
 
 use super::{
     Albedo, BoundaryName, Loaded, OutsideName, RawOptions, Rgb, SceneFile, SceneOptions, SidesName, SurfaceOptions,
-    VolumeSource, load_volume, suggested, surface, surroundings,
+    VolumeSource, context, load_volume, suggested, surface, surroundings,
 };
 use crate::error::{Error, Result};
 use crate::field::{Field, Sweep};
@@ -162,8 +162,9 @@ pub(super) fn load(entries: &[VolumeEntry], file: &SceneFile, input: &Path, opti
         return Err(Error::invalid(input, "volume: there is none"));
     };
     let around = enclosing(&members).map_err(|e| e.in_file(input))?;
-    let polygons = surroundings(&file.surroundings, &options.surroundings, folder, &around)
+    let mut polygons = surroundings(&file.surroundings, &options.surroundings, folder, &around)
         .map_err(|e| Error::invalid(input, format!("box: {e}")))?;
+    polygons.extend(context(&file.context, folder).map_err(|e| Error::invalid(input, format!("[[context]]: {e}")))?);
     let policy = match file.policy {
         Some(PolicyName::Independent) => Policy::Independent,
         Some(PolicyName::Joint) | None => Policy::Joint,

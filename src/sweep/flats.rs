@@ -123,7 +123,7 @@ impl Flats {
                 if flat.albedo.black() {
                     return None;
                 }
-                let dims = FlatTexture::resolution(flat.lengths(), across, isovalues);
+                let dims = flat.resolution(across, isovalues);
                 let texels = dims[0] * dims[1];
                 let n = 3 * texels * isovalues;
                 next += texels * isovalues;
@@ -371,6 +371,7 @@ struct Met {
     /// Whether its front faces lines that run towards +τ.
     front_plus: bool,
     opaque_back: bool,
+    other_face: i32,
     /// Whether it stands inside Ω: a luminaire that cuts lines.
     inside: bool,
     reflects: bool,
@@ -421,6 +422,7 @@ impl Ends {
                     slack: 1e-9 * size,
                     front_plus: along < 0.0,
                     opaque_back: p.opaque_back,
+                    other_face: p.other_face,
                     inside: inside[i],
                     reflects: flats.textures[i].is_some(),
                 })
@@ -434,13 +436,15 @@ impl Ends {
         self.met.iter().any(|m| m.inside)
     }
 
-    /// What line (p, q) meets first beyond `from`, towards +τ (`forward`) or −τ; polygon `except` does not count.
+    /// What line (p, q) meets first beyond `from`, towards +τ (`forward`) or −τ; polygon `except` does not
+    /// count, nor its other face.
     #[inline(always)]
     #[allow(clippy::cast_possible_truncation, reason = "texture coordinates")]
     pub(super) fn stop(&self, p: f64, q: f64, from: f64, forward: bool, except: Option<u32>) -> Option<Stop> {
         let mut best: Option<(f64, &Met)> = None;
         for m in &self.met {
-            if (m.front_plus != forward && !m.opaque_back) || except == Some(m.number) {
+            let excepted = |e| e == m.number || e == m.number.wrapping_add_signed(m.other_face);
+            if (m.front_plus != forward && !m.opaque_back) || except.is_some_and(excepted) {
                 continue;
             }
             let tau = at(&m.tau, p, q);

@@ -174,7 +174,7 @@ fn forward_is_backward() {
     );
     let backward = |receiver: &Receiver, index: u64| {
         let direct = direct_irradiance(&scene, &tracer, receiver, 8, (2, Stage::Direct, index)).mean;
-        [direct, gathered_irradiance(&scene, &tracer, &cache, receiver, 16, (2, index)).mean].map(luminance)
+        [direct, gathered_irradiance(&scene, &tracer, &cache, receiver, 16, (2, index)).estimate.mean].map(luminance)
     };
     let mut family = Family::new("forward = backward", 0.015);
     let mut judge = |what: String, photons: [(f64, f64); 2], back: [Moments; 2], first: usize| {

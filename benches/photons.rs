@@ -1,0 +1,131 @@
+//! Photons traced per second, and irradiance estimated from them: rate and error of every estimator over the photons per
+//! estimate, against a gather of many rays. Then the reference's paths. Rates are per CPU second of all threads.
+
+use glam::DVec3;
+use isolume::checkpoint;
+use isolume::direct::{Receiver, luminance};
+use isolume::embree::{Device, GraphTracer, SurfaceTracer};
+use isolume::field::{Field, Sweep};
+use isolume::flattened::{Departure, Side};
+use isolume::gather::gathered_irradiance;
+use isolume::nearest::Neighbours;
+use isolume::photon::{PhotonSettings, trace_photons};
+use isolume::photon_map::{EstimateSettings, Estimator, PhotonMap};
+use isolume::progress::processor_seconds;
+use isolume::radiance_cache::{CacheSettings, RadianceCache};
+use isolume::reference::{Integrator, ReferenceSettings, reference};
+use isolume::scene::{Boundary, Scene, Surface, cornell_box};
+use isolume::surface_mesh::{SurfaceMesh, unit_isovalue};
+use isolume::volume::generate::Generator;
+use rayon::prelude::*;
+
+const ISOVALUE: f64 = 47.0;
+
+fn bumps() -> Scene {
+    let volume = Generator::from_name("bumps").and_then(|g| g.sample([101; 3])).expect("a volume");
+    let field = Field::new(&volume, Sweep::new(3.6, 95.0).expect("a sweep")).expect("a field");
+    let walls = cornell_box(field.lattice(), 0.0).expect("a box");
+    Scene::new(field, Surface::default(), Boundary::Open, walls).expect("a scene")
+}
+
+/// The work's result and its CPU seconds.
+fn timed<T>(work: impl FnOnce() -> T) -> (T, f64) {
+    let start = processor_seconds();
+    let result = work();
+    (result, (processor_seconds() - start).max(1e-9))
+}
+
+fn main() {
+    let scene = bumps();
+    let device = Device::new(1).expect("Embree starts");
+    let tracer = GraphTracer::new(&device, &scene).expect("a tracer");
+    let emission = |count, seed| PhotonSettings { count, max_bounces: u16::MAX, seed, fixed_isovalue: None };
+    println!("per CPU second, {} threads, Embree {}; bumps 101³", rayon::current_num_threads(), device.version());
+    let (photons, seconds) = timed(|| trace_photons(&scene, &tracer, &emission(1 << 21, 1), &|_| true));
+    let millions = |n: u64, seconds: f64| n as f64 / seconds / 1e6;
+    println!(
+        "photons: {:.2} M emitted/s, {:.2} M stored/s, {:.2} M rays/s",
+        millions(photons.emitted, seconds),
+        millions(photons.stored(), seconds),
+        millions(photons.rays, seconds)
+    );
+
+    // Every seventh node, in the lattice's order.
+    let receivers: Vec<Receiver> = (0..scene.lattice().len())
+        .step_by(7)
+        .filter_map(|o| {
+            let p = DVec3::from_array(scene.lattice().ijk(o).map(|i| i as f64));
+            let isovalue = scene.field.value(p);
+            let normal = scene.normal(p, Side::Lower).filter(|_| (0.0..=1.0).contains(&isovalue))?;
+            let departure = Departure::Surface(Side::Lower);
+            Some(Receiver { position: p.as_vec3(), normal, isovalue: isovalue as f32, departure })
+        })
+        .collect();
+    let cache_settings = CacheSettings {
+        node_shadow_rays: 16,
+        flat_shadow_rays: 64,
+        flat_resolution: 64,
+        isovalue_resolution: 32,
+        seed: 3,
+    };
+    let other = trace_photons(&scene, &tracer, &emission(1 << 22, 2), &|_| true);
+    let truth: Vec<DVec3> = {
+        let fine = EstimateSettings::default();
+        let saved = [checkpoint::Stage::UNSAVED; 2];
+        let cache = RadianceCache::new(&scene, &tracer, &other, fine, &cache_settings, true, saved, &|_| true);
+        let gather = |(i, r): (usize, &Receiver)| {
+            gathered_irradiance(&scene, &tracer, &cache, r, 512, (3, i as u64)).estimate.mean
+        };
+        receivers.par_iter().step_by(16).enumerate().map(gather).collect()
+    };
+    let scale = (truth.iter().map(|t| luminance(*t).powi(2)).sum::<f64>() / truth.len() as f64).sqrt();
+    println!("estimates of indirect irradiance from {} photons; error in % of its RMS", photons.surface.len());
+    println!("  {:10} {:>4} {:>9} {:>12} {:>8}", "estimator", "k", "map, s", "estimates/s", "error");
+    let mut rows: Vec<(Estimator, f64, f64)> = Vec::new();
+    for estimator in [Estimator::Nearest, Estimator::Radius, Estimator::Splat] {
+        for k in [16, 64, 256, 1024] {
+            let settings = EstimateSettings { estimator, photons: k, ..EstimateSettings::default() };
+            let (map, building) =
+                timed(|| PhotonMap::new(&scene, &photons.surface, Side::Lower, |p| p.bounces > 0, settings));
+            let (estimates, seconds) = timed(|| {
+                let estimate = |scratch: &mut Neighbours, r: &Receiver| {
+                    map.irradiance(r.position.as_dvec3(), f64::from(r.isovalue), scratch).mean
+                };
+                receivers.par_iter().with_min_len(256).map_init(Neighbours::default, estimate).collect::<Vec<_>>()
+            });
+            let squares: f64 = estimates.iter().step_by(16).zip(&truth).map(|(e, t)| luminance(*e - *t).powi(2)).sum();
+            let error = 100.0 * (squares / truth.len() as f64).sqrt() / scale;
+            let rate = receivers.len() as f64 / seconds;
+            println!("  {:10} {k:4} {building:9.2} {rate:12.0} {error:8.2}", format!("{estimator:?}").to_lowercase());
+            rows.push((estimator, error, rate));
+        }
+    }
+    // The fastest of each estimator that is as good as the k = 64 nearest.
+    let asked = rows[1].1;
+    let fastest =
+        |e: Estimator| rows.iter().filter(|r| r.0 == e && r.1 <= asked * 1.001).map(|r| r.2).fold(0.0, f64::max);
+    let nearest = fastest(Estimator::Nearest);
+    println!(
+        "  at the error of the 64 nearest or less: radius {:.1}, splat {:.1} times the nearest's rate",
+        fastest(Estimator::Radius) / nearest,
+        fastest(Estimator::Splat) / nearest
+    );
+
+    let isovalue = unit_isovalue(&scene.field, ISOVALUE).expect("in the sweep");
+    let mesh = SurfaceMesh::extract(&scene, isovalue, 1).expect("a mesh");
+    let tracer = SurfaceTracer::new(&device, &scene, isovalue, 1).expect("a tracer");
+    let settings = ReferenceSettings {
+        integrator: Integrator::Path,
+        samples: 256,
+        vertices: Some(1000),
+        ..ReferenceSettings::default()
+    };
+    let (found, seconds) = timed(|| reference(&scene, &tracer, &mesh, isovalue, &settings, &|_| true));
+    println!(
+        "reference on {} triangles: {:.0} vertices/s of {} paths, {:.2} M rays/s",
+        mesh.triangles.len(),
+        1000.0 / seconds,
+        settings.samples,
+        millions(found.rays, seconds)
+    );
+}
