@@ -55,7 +55,7 @@ impl Companion {
     /// A companion of a scene whose own field stands on `lattice`.
     fn new(member: Member, number: usize, index: u8, lattice: &Lattice) -> Self {
         let forth = between(lattice, member.field.lattice());
-        let same = forth == (DMat3::IDENTITY, DVec3::ZERO);
+        let same = forth == (DMat3::IDENTITY, DVec3::ZERO) && lattice.dims() == member.field.lattice().dims();
         Self { member, number, index, forth, back: forth.0.inverse(), same }
     }
 
@@ -117,6 +117,11 @@ impl Companion {
     /// The same for a scene whose own field stands on `lattice`.
     pub(super) fn seen_on(&self, lattice: &Lattice) -> Self {
         Self::new(self.member.clone(), self.number, self.index, lattice)
+    }
+
+    /// Whether it stands on the very lattice of the scene's own field.
+    pub fn shares_lattice(&self) -> bool {
+        self.same
     }
 
     /// The corners of its Ω in the scene's local frame.
