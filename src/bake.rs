@@ -168,6 +168,7 @@ pub fn bake_fields(
     progress: Progress,
     checkpoint: Option<&Checkpoint>,
 ) -> Result<Vec<Bake>> {
+    supported(scene, settings)?;
     let digest = digest(&job(scene, settings));
     let job = |number: u32| -> Result<Job> {
         let scene = scene.lit(number as usize);
@@ -192,20 +193,26 @@ pub fn bake_fields(
     for group in groups {
         let lit = match settings.engine {
             Engine::Photon => photon_engine::light(group, settings, device, progress, checkpoint)?,
-            Engine::Sweep if group.len() == 1 => {
-                sweep_engine::light(&group[0], settings, device, progress, checkpoint)?
-            }
-            Engine::Sweep => {
-                return Err(Error::NotSupported(
-                    "engine = \"sweep\" lights one volume at a time; several that light each other need engine = \
-                     \"photon\" (or policy = \"independent\")"
-                        .into(),
-                ));
-            }
+            Engine::Sweep => sweep_engine::light(&group[0], settings, device, progress, checkpoint)?,
         };
         bakes.extend(finish(group, lit, scene.exposure(), &digest, settings, device)?);
     }
     Ok(bakes)
+}
+
+/// Whether the engine can light the scene.
+///
+/// # Errors
+/// `NotSupported` for several fields that light each other by the sweep engine.
+pub fn supported(scene: &Scene, settings: &BakeSettings) -> Result<()> {
+    if settings.engine == Engine::Sweep && scene.policy() == Policy::Joint && scene.fields() > 1 {
+        return Err(Error::NotSupported(
+            "engine = \"sweep\" lights one volume at a time; several that light each other need engine = \"photon\" (or \
+             policy = \"independent\")"
+                .into(),
+        ));
+    }
+    Ok(())
 }
 
 /// Bakes with their reports from what an engine gave.

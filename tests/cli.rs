@@ -197,6 +197,59 @@ fn bad_input_is_one_clear_line_and_leaves_nothing() {
     refused(dir, &["bake", "s.toml", "-o", "out.vti"], &["s.toml:5", "albdo", "albedo"]);
 }
 
+/// Two volumes: a file each and one that names them; every verb that should takes them.
+#[test]
+fn several_volumes_in_one_scene() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let scene = "[[volume]]\nname = \"a\"\ngenerator = \"bumps\"\nsize = 13\nisovalues = [10, 90]\n\
+        [[volume]]\nname = \"b\"\ngenerator = \"sphere\"\nsize = 9\norigin = [0.05, 0.1, 0.02]\nscale = 0.3\n\
+        isovalues = [0.02, 0.2]\nalbedo = [0.8, 0.1, 0.1]\noutside = \"higher\"\n";
+    fs::write(dir.join("two.toml"), scene).unwrap();
+    refused(dir, &["bake", "two.toml", "-o", "two.vti"], &["two.vti", ".vtm", "2"]);
+    refused(dir, &["bake", "two.toml", "-o", "two.vtm", "--engine", "sweep"], &["sweep", "photon"]);
+    refused(dir, &["bake", "two.toml", "-o", "two.vtm", "--albedo", "1"], &["--albedo", "[[volume]]"]);
+    let bake = |seed: &str| {
+        let mut args = vec!["bake", "two.toml", "-o", "two.vtm", "-q", "--seed", seed, "--report", "two.json"];
+        args.extend(QUICK);
+        ok(dir, &args);
+    };
+    bake("1");
+    let report: serde_json::Value = serde_json::from_slice(&fs::read(dir.join("two.json")).unwrap()).unwrap();
+    assert_eq!((report["a"]["grid"][0].as_u64(), report["b"]["grid"][0].as_u64()), (Some(13), Some(9)));
+    let file = VtiFile::read(&dir.join("two-b.vti")).unwrap();
+    let array = |name: &str| file.point_data.iter().find(|a| a.name == name).unwrap().samples.clone();
+    let (Samples::F32(s), Samples::F32(value)) = (array("s"), array("value")) else { panic!("floats") };
+    assert!(s.iter().zip(&value).all(|(s, v)| (s - (v - 0.02) / 0.18).abs() < 1e-5), "s is the shared parameter");
+    let index = text(&fs::read(dir.join("two.vtm")).unwrap());
+    assert!(index.contains("vtkMultiBlockDataSet") && index.contains("file=\"two-a.vti\""), "{index}");
+
+    // The same s, whichever volume the isovalue speaks of: 50 of [10, 90] is 0.11 of [0.02, 0.2].
+    let render =
+        |args: &[&str]| ok(dir, &[&["render", "two.vtm", "--height", "40", "--samples", "2", "-q"], args].concat());
+    render(&["--isovalue", "50", "-o", "a.png"]);
+    render(&["--isovalue", "0.11", "--field", "b", "-o", "b.png"]);
+    assert_eq!(fs::read(dir.join("a.png")).unwrap(), fs::read(dir.join("b.png")).unwrap());
+    // One alone is another picture.
+    ok(dir, &["render", "two-a.vti", "--height", "40", "--samples", "2", "-q", "--isovalue", "50", "-o", "alone.png"]);
+    assert_ne!(fs::read(dir.join("a.png")).unwrap(), fs::read(dir.join("alone.png")).unwrap());
+    ok(dir, &["extract", "two.vtm", "--field", "b", "--isovalue", "0.11", "-o", "b.ply", "-q"]);
+    ok(dir, &["extract", "two-b.vti", "--isovalue", "0.11", "-o", "own.ply", "-q"]);
+    assert_eq!(fs::read(dir.join("b.ply")).unwrap(), fs::read(dir.join("own.ply")).unwrap());
+    let reference = ["reference", "--field", "b", "--isovalue", "0.11", "--samples", "16", "--vertices", "20", "-q"];
+    ok(dir, &[&reference[..], &["two.toml", "-o", "r.ply"]].concat());
+    ok(dir, &["compare", "two-b.vti", "r.ply", "--json"]);
+    refused(dir, &[&reference[..2], &["c", "two.toml", "--isovalue", "0.11", "-o", "r.ply"]].concat(), &["a, b"]);
+    refused(dir, &["view", "two.vtm", "-o", "two.html"], &["two.vtm", "several"]);
+    refused(dir, &["render", "two.vtm", "--isovalue", "5", "--field", "b", "-o", "c.png"], &["'b'", "0.02"]);
+
+    let first = fs::read(dir.join("two-a.vti")).unwrap();
+    bake("2");
+    assert_ne!(fs::read(dir.join("two-a.vti")).unwrap(), first);
+    fs::remove_file(dir.join("two-b.vti")).unwrap();
+    refused(dir, &["render", "two.vtm", "--isovalue", "50", "-o", "c.png"], &["two-b.vti"]);
+}
+
 #[test]
 fn a_second_bake_never_harms_the_first_unless_it_finishes() {
     let dir = tempfile::tempdir().unwrap();

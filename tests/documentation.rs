@@ -35,6 +35,7 @@ fn known_keys(header: &str, flatland: bool) -> BTreeSet<String> {
     let needed = if flatland { "[field]\n" } else { "[volume]\n" };
     let text = match header {
         "" => format!("zzz = 1\n{needed}"),
+        "[volume]" => "[[volume]]\nname = \"a\"\nzzz = 1\n".to_owned(),
         h if needed.contains(&format!("[{h}]")) => format!("[{h}]\nzzz = 1\n"),
         "context" => format!("{needed}[[context]]\nfile = \"a.obj\"\nzzz = 1\n"),
         h => format!("{needed}[{h}]\nzzz = 1\n"),
@@ -56,6 +57,7 @@ fn every_key_of_a_scene_is_described_and_no_other() {
     for (header, heading, flatland) in [
         ("", "Top level", false),
         ("volume", "[volume]", false),
+        ("[volume]", "[[volume]]", false),
         ("volume.raw", "[volume.raw]", false),
         ("surface", "[surface]", false),
         ("box", "[box]", false),

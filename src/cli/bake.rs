@@ -1,7 +1,9 @@
 //! `isolume bake`: from a volume or scene to the file that holds it with its light.
 
 use super::{device, expect_extension, writable};
-use crate::bake::{BakeOptions, BakeReport, BakeSettings, MemoryEstimate, TimeEstimate, bake_fields, digest, job};
+use crate::bake::{
+    BakeOptions, BakeReport, BakeSettings, MemoryEstimate, TimeEstimate, bake_fields, digest, job, supported,
+};
 use crate::checkpoint::Checkpoint;
 use crate::error::{Error, Result};
 use crate::export::bake_file;
@@ -146,6 +148,7 @@ impl Bake {
         let volumes: Vec<&Volume> = [&loaded.volume].into_iter().chain(&loaded.companions).collect();
         let settings = BakeSettings::new(&self.bake.clone().or(&loaded.bake))?;
         let sweep = loaded.scene.field.sweep();
+        supported(&loaded.scene, &settings).map_err(|e| e.in_file(&self.input))?;
         let members = loaded.scene.members();
         if progress == Progress::Shown {
             for member in &members {

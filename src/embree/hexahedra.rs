@@ -2,7 +2,8 @@
 //!
 //! The whole volume is **one** primitive whose callback walks the min/max pyramid: Embree's hierarchy is blind to the
 //! isovalue, and a callback costs as much as several cells (design: speed). The isovalue rides in `ray.id`, what the
-//! ray starts and ends on in `ray.time`. Companions are a primitive each, in their own index spaces.
+//! ray starts and ends on in `ray.time`. Companions are a primitive each, in their own index spaces, but those that share
+//! the lattice: one callback serves them all, the own field first, so that its hit ends the others' walks.
 
 use super::extrusions::{Extrusions, embree_ray, flattened_ray, padded};
 use super::{
@@ -49,10 +50,18 @@ impl<'a> GraphTracer<'a> {
         let mut builder = SceneBuilder::new(device)?;
         let pyramid = |number: usize| pyramids[number].clone();
         let graph = Graph { field: &scene.field, pyramid: pyramid(scene.number()) };
-        let mut last = builder.user_shared(Arc::new(graph), u32::MAX)?;
-        for companion in scene.companions() {
+        let companions = scene.companions().iter().map(|companion| {
             let graph = Graph { field: &companion.member.field, pyramid: pyramid(companion.number) };
-            last = builder.user_shared(Arc::new(CompanionGraph { graph, companion }), u32::MAX)?;
+            CompanionGraph { graph, companion }
+        });
+        let (same, others): (Vec<_>, Vec<_>) = companions.partition(|c| c.companion.shares_lattice());
+        let mut last = if same.is_empty() {
+            builder.user_shared(Arc::new(graph), u32::MAX)?
+        } else {
+            builder.user_shared(Arc::new(StackedGraphs { graph, same }), u32::MAX)?
+        };
+        for other in others {
+            last = builder.user_shared(Arc::new(other), u32::MAX)?;
         }
         let extrusions = Extrusions::attach(&mut builder, scene, u32::MAX)?;
         Ok(Self { bvh: builder.commit()?, volumes: last + 1, extrusions })
@@ -244,5 +253,92 @@ impl UserGeometry for CompanionGraph<'_> {
     #[inline]
     fn occluded16(&self, _: u32, active: u16, rays: &Ray16) -> u16 {
         self.graph.pyramid.occluded16(self.graph.field, active, |lane| self.ray(&rays.lane(lane)))
+    }
+}
+
+/// A graph and those of companions on the same lattice.
+struct StackedGraphs<'a> {
+    graph: Graph<'a>,
+    same: Vec<CompanionGraph<'a>>,
+}
+
+impl StackedGraphs<'_> {
+    /// The ray for the walk through companion `c` within `reach`.
+    #[inline(always)]
+    fn ray(c: &CompanionGraph<'_>, ray: &FlattenedRay, reach: f32) -> FlattenedRay {
+        FlattenedRay { reach, ..c.companion.ray_to_index(ray) }
+    }
+}
+
+impl UserGeometry for StackedGraphs<'_> {
+    fn len(&self) -> u32 {
+        1
+    }
+
+    fn bounds(&self, prim: u32) -> ([f32; 3], [f32; 3]) {
+        self.graph.bounds(prim)
+    }
+
+    #[inline]
+    fn intersect(&self, _: u32, ray: &RayView) -> Option<UserHit> {
+        let flattened = flattened_ray(ray);
+        let mut nearest = self.graph.pyramid.intersect(self.graph.field, &flattened, f64::from(ray.tfar));
+        for c in &self.same {
+            let reach = nearest.map_or(ray.tfar, |h| h.t);
+            let ray = Self::ray(c, &flattened, reach);
+            let found = c.graph.pyramid.intersect(c.graph.field, &ray, f64::from(reach));
+            if let Some(hit) = found.filter(|h| nearest.is_none_or(|n| h.t < n.t)) {
+                nearest = Some(FlattenedHit { target: c.companion.target(hit.target), ..hit });
+            }
+        }
+        let hit = nearest?;
+        Some(UserHit { t: hit.t, u: f32::from_bits(encode_target(hit.target)), v: 0.0, normal: [0.0; 3] })
+    }
+
+    #[inline]
+    fn occluded(&self, _: u32, ray: &RayView) -> bool {
+        let (flattened, reach) = (flattened_ray(ray), f64::from(ray.tfar));
+        let hidden = |c: &CompanionGraph<'_>| {
+            c.graph.pyramid.occluded(c.graph.field, &c.companion.ray_to_index(&flattened), reach)
+        };
+        self.graph.pyramid.occluded(self.graph.field, &flattened, reach) || self.same.iter().any(hidden)
+    }
+
+    #[inline]
+    fn intersect16(&self, _: u32, active: u16, rays: &Ray16, hits: &mut UserHits16) -> u16 {
+        let mut nearest = [None; 16];
+        let ray = |lane: usize| flattened_ray(&rays.lane(lane));
+        self.graph.pyramid.intersect16(self.graph.field, active, ray, &mut nearest);
+        for c in &self.same {
+            let mut found = [None; 16];
+            let reach: [f32; 16] = std::array::from_fn(|i| nearest[i].map_or(rays.tfar[i], |h: FlattenedHit| h.t));
+            let within = |lane: usize| Self::ray(c, &ray(lane), reach[lane]);
+            c.graph.pyramid.intersect16(c.graph.field, active, within, &mut found);
+            for (best, hit) in nearest.iter_mut().zip(found) {
+                if let Some(hit) = hit.filter(|h| best.is_none_or(|b| h.t < b.t)) {
+                    *best = Some(FlattenedHit { target: c.companion.target(hit.target), ..hit });
+                }
+            }
+        }
+        let mut bits = 0;
+        for (lane, hit) in nearest.iter().enumerate() {
+            if let Some(hit) = hit {
+                hits.t[lane] = hit.t;
+                hits.u[lane] = f32::from_bits(encode_target(hit.target));
+                bits |= 1 << lane;
+            }
+        }
+        bits
+    }
+
+    #[inline]
+    fn occluded16(&self, _: u32, active: u16, rays: &Ray16) -> u16 {
+        let ray = |lane: usize| flattened_ray(&rays.lane(lane));
+        let mut found = self.graph.pyramid.occluded16(self.graph.field, active, ray);
+        for c in &self.same {
+            let open = active & !found;
+            found |= c.graph.pyramid.occluded16(c.graph.field, open, |lane| c.companion.ray_to_index(&ray(lane)));
+        }
+        found
     }
 }

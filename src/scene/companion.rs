@@ -47,9 +47,18 @@ pub struct Companion {
     index: u8,
     forth: (DMat3, DVec3),
     back: DMat3,
+    /// Whether both index spaces are one.
+    same: bool,
 }
 
 impl Companion {
+    /// A companion of a scene whose own field stands on `lattice`.
+    fn new(member: Member, number: usize, index: u8, lattice: &Lattice) -> Self {
+        let forth = between(lattice, member.field.lattice());
+        let same = forth == (DMat3::IDENTITY, DVec3::ZERO) && lattice.dims() == member.field.lattice().dims();
+        Self { member, number, index, forth, back: forth.0.inverse(), same }
+    }
+
     /// Index coordinates in its lattice of local `p` of the scene.
     #[inline]
     pub fn to_index(&self, p: DVec3) -> DVec3 {
@@ -75,7 +84,7 @@ impl Companion {
     }
 
     /// The ray in its index space, as its own scene would trace it.
-    #[inline]
+    #[inline(always)]
     pub fn ray_to_index(&self, ray: &FlattenedRay) -> FlattenedRay {
         let departure = match ray.departure {
             Departure::Companion(n, side) if n == self.index => Departure::Surface(side),
@@ -84,6 +93,9 @@ impl Companion {
             }
             _ => Departure::Free,
         };
+        if self.same {
+            return FlattenedRay { departure, ..*ray };
+        }
         FlattenedRay {
             origin: self.to_index(ray.origin.as_dvec3()).as_vec3(),
             direction: (self.forth.0 * ray.direction.as_dvec3()).as_vec3(),
@@ -104,8 +116,12 @@ impl Companion {
 
     /// The same for a scene whose own field stands on `lattice`.
     pub(super) fn seen_on(&self, lattice: &Lattice) -> Self {
-        let forth = between(lattice, self.member.field.lattice());
-        Self { forth, back: forth.0.inverse(), ..self.clone() }
+        Self::new(self.member.clone(), self.number, self.index, lattice)
+    }
+
+    /// Whether it stands on the very lattice of the scene's own field.
+    pub fn shares_lattice(&self) -> bool {
+        self.same
     }
 
     /// The corners of its Ω in the scene's local frame.
@@ -163,8 +179,7 @@ impl Scene {
         let numbers = (0..all).filter(|&n| n != own);
         for (index, (member, number)) in (0u8..).zip(members.into_iter().zip(numbers)) {
             super::check(&member.surface, member.boundary, member.field.lattice(), &scene.polygons)?;
-            let forth = between(scene.field.lattice(), member.field.lattice());
-            let companion = Companion { member, number, index, forth, back: forth.0.inverse() };
+            let companion = Companion::new(member, number, index, scene.field.lattice());
             for p in companion.corners() {
                 let x = scene.lattice().to_world(p);
                 let [lo, hi] = &mut scene.interior;

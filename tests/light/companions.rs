@@ -100,8 +100,9 @@ fn means(bake: &Bake, scene: &Scene, inside: impl Fn(DVec3) -> bool) -> Vec<f64>
 #[test]
 fn the_nearest_hit_of_all_fields_wins() {
     let device = Device::new(1).unwrap();
-    let scene = two(oblique());
-    for number in 0..2 {
+    // The second pair shares a lattice, and with it one callback.
+    let scenes = [two(oblique()), two(unit(25))];
+    for (scene, number) in [(&scenes[0], 0), (&scenes[0], 1), (&scenes[1], 0), (&scenes[1], 1)] {
         let seen = scene.seen_from(number);
         let tracer = GraphTracer::new(&device, &seen).unwrap();
         let companion = &seen.companions()[0];
