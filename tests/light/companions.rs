@@ -334,7 +334,8 @@ fn an_integrating_sphere_of_one_field_around_a_source_of_another() {
         ],
         Vec::new(),
     );
-    let mut families = Family::new("sphere in sphere", 0.01);
+    // A step of the cavity's lattice is a quarter of the sweep, over which its light changes by a third.
+    let mut families = Family::new("sphere in sphere", 0.02);
     let mut moments = vec![Moments::default(); 8];
     for seed in 1..=3 {
         let bakes = run_fields(&scene, &BakeSettings { gather_rays: 64, ..quick(seed) });
@@ -407,7 +408,7 @@ fn cross_light_agrees_with_paths_between_two_meshes() {
         let both = (0..a.mask.len()).filter(|&o| a.mask[o] == Mask::Valid);
         let off: f64 = both.map(|o| f64::from((a.radiance[o][0] - b.radiance[o][0]).abs())).sum();
         let sum: f64 = a.radiance.iter().map(|r| f64::from(r[0])).sum();
-        assert!(off > 0.03 * sum, "field {k}: {}", off / sum);
+        assert!(off > 0.02 * sum, "field {k}: {}", off / sum);
     }
 }
 
