@@ -16,6 +16,7 @@ use std::path::{Path, PathBuf};
 
 /// `[volume]`, or several `[[volume]]`.
 #[derive(Clone, Debug)]
+#[allow(clippy::large_enum_variant, reason = "one value per file")]
 pub enum Volumes {
     /// One.
     One(VolumeSource),
