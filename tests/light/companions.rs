@@ -3,13 +3,18 @@
 use crate::support::*;
 use glam::{DMat3, DVec3};
 use isolume::bake::{Bake, BakeSettings, bake_fields};
+use isolume::checkpoint;
 use isolume::embree::{Device, GraphTracer, SurfaceTracer};
 use isolume::field::{Field, Sweep};
 use isolume::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target};
 use isolume::mask::Mask;
+use isolume::photon::trace_photons;
+use isolume::photon_map::EstimateSettings;
 use isolume::polygon::Polygon;
 use isolume::progress::Progress;
-use isolume::reference::{Integrator, ReferenceSettings, reference};
+use isolume::radiance::{Indirect, sample_radiance};
+use isolume::radiance_cache::{CacheSettings, RadianceCache};
+use isolume::reference::{Integrator, Reference, ReferenceSettings, reference};
 use isolume::rng::{Rng, Stage};
 use isolume::scene::{Boundary, Member, Policy, Scene, Surface, cornell_box};
 use isolume::stats::Moments;
@@ -408,6 +413,65 @@ fn cross_light_agrees_with_paths_between_two_meshes() {
         let off: f64 = both.map(|o| f64::from((a.radiance[o][0] - b.radiance[o][0]).abs())).sum();
         let sum: f64 = a.radiance.iter().map(|r| f64::from(r[0])).sum();
         assert!(off > 0.03 * sum, "field {k}: {}", off / sum);
+    }
+}
+
+/// What final gather finds at the vertices themselves, without a grid in between, against path tracing of two meshes: cross
+/// light on nuclear pasta, whose surfaces run through each other. A folder with `pasta-proton.vti` and `pasta-neutron.vti`
+/// (`isolume generate pasta --species both -o pasta.vti`) in ISOLUME_PASTA; by hand.
+#[test]
+#[ignore = "needs simulated volumes and minutes"]
+fn pasta_at_its_vertices() {
+    let Ok(folder) = std::env::var("ISOLUME_PASTA") else { panic!("ISOLUME_PASTA must name a folder") };
+    let text = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/scenes/pasta-both.toml")).unwrap();
+    let path = std::path::Path::new(&folder).join("pasta-both.toml");
+    std::fs::write(&path, text).unwrap();
+    let scene = isolume::scene_file::load(&path, &Default::default()).unwrap().scene;
+    let (device, c) = (Device::new(2).unwrap(), 0.475);
+    let views = [0, 1].map(|n| scene.seen_from(n));
+    let tracers = [0, 1].map(|n| GraphTracer::new(&device, &views[n]).unwrap());
+    let photons = trace_photons(&views[0], &tracers[0], &emission(1 << 22, 1), &|_| true);
+    let settings = CacheSettings {
+        node_shadow_rays: 4,
+        flat_shadow_rays: 32,
+        flat_resolution: 64,
+        isovalue_resolution: 32,
+        seed: 1,
+    };
+    let (estimate, unsaved) = (EstimateSettings::default(), [checkpoint::Stage::UNSAVED; 2]);
+    let mut cache = RadianceCache::new(&views[0], &tracers[0], &photons, estimate, &settings, true, unsaved, &|_| true);
+    cache.fill(&views[1], &tracers[1], &photons, estimate, &settings, unsaved, &|_| true);
+    for k in 0..2 {
+        let seen = &views[k];
+        let mesh = SurfaceMesh::extract(seen, c, 1).unwrap();
+        let triangles = SurfaceTracer::new(&device, seen, c, 1).unwrap();
+        let settings =
+            |seed| ReferenceSettings { samples: 512, vertices: Some(2000), seed, ..ReferenceSettings::default() };
+        // On the trilinear surfaces, too: where they cross, triangles cross elsewhere.
+        let paths = [1, 2].map(|seed| reference(seen, &triangles, &mesh, c, &settings(seed), &|_| true));
+        let exact = [1, 2].map(|seed| reference(seen, &tracers[k], &mesh, c, &settings(seed), &|_| true));
+        let chosen: Vec<usize> = (0..mesh.local.len()).filter(|&v| paths[0].sampled[v]).collect();
+        let at: Vec<_> = chosen.iter().map(|&v| mesh.local[v].as_vec3()).collect();
+        let gather = Indirect::Gather(&cache, 256);
+        let side = seen.surface.outside;
+        let got = sample_radiance(seen, &tracers[k], &gather, &at, side, 128, 1, checkpoint::Stage::UNSAVED, &|_| true);
+        let rms = |paths: &[Reference; 2]| {
+            let (mut square, mut n) = (0.0, 0.0);
+            for (&v, sample) in chosen.iter().zip(&got.samples) {
+                let Some(sample) = sample else { continue };
+                let shown = |x: DVec3| (x * scene.exposure()).clamp(DVec3::ZERO, DVec3::ONE);
+                let t = shown(sample.radiance.as_dvec3());
+                square += (t - shown(paths[0].radiance[v])).dot(t - shown(paths[1].radiance[v]));
+                n += 1.0;
+            }
+            100.0 * f64::max(square / n, 0.0).sqrt()
+        };
+        println!(
+            "field {k}: {:.2} % RMS against triangles, {:.2} % against the trilinear surfaces",
+            rms(&paths),
+            rms(&exact)
+        );
+        assert!(rms(&exact) <= 2.0);
     }
 }
 
