@@ -127,13 +127,18 @@ const FULL_PASSES: usize = 2;
 /// Fewest directions of a coarse pass.
 const LEAST: usize = 32;
 
-/// Lights every node of the lattice for every isovalue of the sweep. `tick` receives the fraction done (an estimate while
-/// bounces converge); returning false stops early with what there is.
+/// Whether sweeps can light a scene.
 ///
 /// # Errors
-/// `NotSupported` if a polygon that is not a luminaire stands inside the volume, or if there are more than
-/// [`MOST_POLYGONS`]: that needs the photon engine.
-pub fn sweep(scene: &Scene, settings: &SweepSettings, tick: &(dyn Fn(f64) -> bool + Sync)) -> Result<SweepResult> {
+/// `NotSupported` as [`sweep`].
+pub fn supported(scene: &Scene) -> Result<()> {
+    if scene.fields() > 1 {
+        return Err(Error::NotSupported(
+            "engine = \"sweep\" lights one volume at a time; several that light each other need engine = \"photon\" (or \
+             policy = \"independent\")"
+                .into(),
+        ));
+    }
     let polygons = scene.polygons().len();
     if polygons > MOST_POLYGONS {
         return Err(Error::NotSupported(format!(
@@ -147,6 +152,18 @@ pub fn sweep(scene: &Scene, settings: &SweepSettings, tick: &(dyn Fn(f64) -> boo
             p.name
         )));
     }
+    Ok(())
+}
+
+/// Lights every node of the lattice for every isovalue of the sweep. `tick` receives the fraction done (an estimate while
+/// bounces converge); returning false stops early with what there is.
+///
+/// # Errors
+/// `NotSupported` for several fields that light each other, if a polygon that is not a luminaire stands inside the volume,
+/// or if there are more than [`MOST_POLYGONS`]: that needs the photon engine.
+pub fn sweep(scene: &Scene, settings: &SweepSettings, tick: &(dyn Fn(f64) -> bool + Sync)) -> Result<SweepResult> {
+    supported(scene)?;
+    let inside = flats::inside(scene);
     let geometry = Geometry::new(&scene.field);
     let stored = scene.surface.stored_sides();
     // Light passes from one side to the other only around the open rims of level sets, outside Ω.

@@ -340,7 +340,7 @@ fn an_integrating_sphere_of_one_field_around_a_source_of_another() {
         Vec::new(),
     );
     let mut families = Family::new("sphere in sphere", 0.01);
-    let mut moments = vec![Moments::default(); 8];
+    let mut moments = [Moments::default(); 8];
     for seed in 1..=3 {
         let bakes = run_fields(&scene, &BakeSettings { gather_rays: 64, ..quick(seed) });
         for (k, bake) in bakes.iter().enumerate() {
