@@ -1,6 +1,6 @@
 # isolume is a plain cargo package; this file gets its two native libraries and names the common errands.
 
-.PHONY: all deps demo test check peers bench fuzz doc clean distclean
+.PHONY: all deps demo gallery test check peers bench fuzz doc clean distclean
 
 # `make deps` writes third_party/env.sh only if libclang had to be unpacked there.
 CARGO = if [ -f third_party/env.sh ]; then . third_party/env.sh; fi; cargo
@@ -22,6 +22,11 @@ demo: deps
 	@echo "demo/bumps.vti  the volume with its illumination, for every isovalue: open it in ParaView, or render it again:"
 	@echo "                cargo run --release -- render demo/bumps.vti --isovalue 60 -o demo/other.png"
 	@echo "demo/bumps.png  the isosurface at 47"
+
+# The paper's figures and more, into docs/gallery: some minutes. DATA=folder adds ch2.nii.gz (brain) and neuron.mha.
+gallery: deps
+	$(CARGO) build --release
+	scripts/gallery $(PROGRAM) docs/gallery --work demo/gallery $(if $(DATA),--data $(DATA))
 
 test: deps
 	$(CARGO) test
@@ -51,14 +56,14 @@ bench: deps
 
 # Every reader for FUZZ_SECONDS; needs the nightly toolchain and `cargo install cargo-fuzz`. Seeds: tests/corpus.
 FUZZ_SECONDS = 60
-FUZZ = nifti:nii nrrd:nrrd vti:vti raw:raw
+FUZZ = cube:cube legacy_vtk:vtk metaimage:mha mrc:mrc nifti:nii npy:npy nrrd:nrrd raw:raw tiff:tif vti:vti
 
 fuzz: deps
 	@cargo fuzz --version >/dev/null 2>&1 || { echo "make fuzz: needs cargo install cargo-fuzz, and rustup toolchain install nightly"; exit 1; }
 	@if [ -f third_party/env.sh ]; then . third_party/env.sh; fi; for target in $(FUZZ); do \
 	  name=$${target%:*}; seeds=fuzz/corpus/$$name; mkdir -p $$seeds; \
-	  cp tests/corpus/*.$${target#*:} tests/corpus/*.$${target#*:}.gz $$seeds/ 2>/dev/null; \
-	  cargo +nightly fuzz run $$name -- -max_total_time=$(FUZZ_SECONDS) -max_len=65536 -rss_limit_mb=1024 -timeout=10 || exit 1; \
+	  find tests/corpus -size -16k \( -name "*.$${target#*:}" -o -name "*.$${target#*:}.*" \) -exec cp {} $$seeds/ \; ; \
+	  cargo +nightly fuzz run $$name -- -max_total_time=$(FUZZ_SECONDS) -max_len=65536 -rss_limit_mb=1024 -timeout=60 || exit 1; \
 	done
 
 doc: deps

@@ -90,6 +90,8 @@ pub struct BakeReport {
     pub commit: &'static str,
     /// Points of the illumination grid.
     pub grid: [usize; 3],
+    /// Digest of what determines the bits.
+    pub job: String,
     /// Settings.
     pub settings: BakeSettings,
 }
@@ -168,6 +170,7 @@ pub fn bake_fields(
     checkpoint: Option<&Checkpoint>,
 ) -> Result<Vec<Bake>> {
     supported(scene, settings)?;
+    let digest = digest(&job(scene, settings));
     let job = |number: u32| -> Result<Job> {
         let scene = scene.lit(number as usize);
         let named = |e: Error| if scene.name.is_empty() { e } else { e.in_file(format!("volume '{}'", scene.name)) };
@@ -193,7 +196,7 @@ pub fn bake_fields(
             Engine::Photon => photon_engine::light(group, settings, device, progress, checkpoint)?,
             Engine::Sweep => sweep_engine::light(&group[0], settings, device, progress, checkpoint)?,
         };
-        bakes.extend(finish(group, lit, scene.exposure(), settings, device)?);
+        bakes.extend(finish(group, lit, scene.exposure(), &digest, settings, device)?);
     }
     Ok(bakes)
 }
@@ -211,7 +214,14 @@ pub fn supported(scene: &Scene, settings: &BakeSettings) -> Result<()> {
 }
 
 /// Bakes with their reports from what an engine gave.
-fn finish(jobs: &[Job], mut lit: Lit, exposure: f64, settings: &BakeSettings, device: &Device) -> Result<Vec<Bake>> {
+fn finish(
+    jobs: &[Job],
+    mut lit: Lit,
+    exposure: f64,
+    digest: &str,
+    settings: &BakeSettings,
+    device: &Device,
+) -> Result<Vec<Bake>> {
     let s = lit.seconds;
     let fields = std::mem::take(&mut lit.fields);
     let bake = |(job, mut sides): (&Job, Vec<(Side, IlluminationGrid)>)| {
@@ -251,6 +261,7 @@ fn finish(jobs: &[Job], mut lit: Lit, exposure: f64, settings: &BakeSettings, de
             embree: device.version(),
             commit: env!("ISOLUME_COMMIT"),
             grid: job.lattice.dims(),
+            job: digest.to_owned(),
             settings: settings.clone(),
         };
         // Each bake stands for itself: walls, and the caps of its own field.
@@ -260,6 +271,13 @@ fn finish(jobs: &[Job], mut lit: Lit, exposure: f64, settings: &BakeSettings, de
         Ok(Bake { lattice: job.lattice.clone(), sides, flats, exposure, report })
     };
     jobs.iter().zip(fields).map(bake).collect()
+}
+
+/// A [`job`] in eight letters.
+pub fn digest(job: &str) -> String {
+    let mut crc = flate2::Crc::new();
+    crc.update(job.as_bytes());
+    format!("{:08x}", crc.sum())
 }
 
 /// What determines a bake's bits, as lines of `key: value`: for [`Checkpoint::new`].

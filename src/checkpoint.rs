@@ -57,10 +57,26 @@ impl Stage<'_> {
         state.blocks.get(&(self.number, block as u64)).filter(|b| b.len() == length).cloned()
     }
 
-    /// Keeps a finished block; `bytes` is asked for only if there is a checkpoint.
+    /// What `parse` makes of a saved block, if there is one.
+    pub fn read<T>(&self, block: usize, parse: impl FnOnce(&[u8]) -> T) -> Option<T> {
+        let state = self.checkpoint?.state.lock().ok()?;
+        state.blocks.get(&(self.number, block as u64)).map(|bytes| parse(bytes))
+    }
+
+    /// Whether the file is to be written as soon as something is saved: the time to save what is large.
+    pub fn due(&self) -> bool {
+        self.checkpoint.is_some_and(|c| c.state.lock().is_ok_and(|s| Instant::now() >= s.due))
+    }
+
+    /// Keeps a finished block, in place of an earlier one; `bytes` is asked for only if there is a checkpoint.
     pub fn save(&self, block: usize, bytes: impl FnOnce() -> Vec<u8>) {
         if let Some(checkpoint) = self.checkpoint {
-            checkpoint.put((self.number, block as u64), bytes());
+            let key = (self.number, block as u64);
+            // Never both: a block may be as large as the work itself. The file holds the earlier one.
+            if let Ok(mut state) = checkpoint.state.lock() {
+                state.blocks.remove(&key);
+            }
+            checkpoint.put(key, bytes());
         }
     }
 }
@@ -134,7 +150,8 @@ impl Checkpoint {
 
     fn put(&self, key: (u32, u64), bytes: Vec<u8>) {
         let Ok(mut state) = self.state.lock() else { return };
-        state.dirty |= state.blocks.insert(key, bytes).is_none();
+        state.blocks.insert(key, bytes);
+        state.dirty = true;
         if Instant::now() < state.due {
             return;
         }

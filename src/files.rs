@@ -80,6 +80,38 @@ pub(crate) fn gzip_or_plain(path: &Path, start: u64) -> Result<Packing> {
     Ok(if head == [0x1f, 0x8b] { Packing::Gzip } else { Packing::Plain })
 }
 
+/// Bytes of a file's length that may be held before it is known that there is as much to hold: twice as many + 64 MB.
+pub(crate) fn trusted(length: u64) -> u64 {
+    length.saturating_mul(2).saturating_add(TRUSTED)
+}
+
+/// Bytes that a section of so many stored ones may hold at most, unpacked.
+pub(crate) fn most(packing: Packing, stored: u64) -> u64 {
+    match packing {
+        Packing::Plain => stored,
+        Packing::Gzip | Packing::Zlib => stored.saturating_mul(DEFLATE_LIMIT),
+    }
+}
+
+/// A section of a file, unpacked, as a stream.
+///
+/// # Errors
+/// `Io` with the path. What reading returns is for [`damaged`].
+pub(crate) fn stream(path: &Path, section: Section) -> Result<BufReader<Box<dyn Read>>> {
+    Ok(BufReader::with_capacity(1 << 16, open_section(path, section)?))
+}
+
+/// What it means that reading from a [`stream`] failed: `Invalid` if its packing is damaged, else `Io`.
+pub(crate) fn damaged(path: &Path, section: Section, source: std::io::Error) -> Error {
+    use std::io::ErrorKind as K;
+    match source.kind() {
+        K::UnexpectedEof | K::InvalidData | K::InvalidInput if section.packing != Packing::Plain => {
+            Error::invalid(path, format!("the {} stream is cut short or damaged ({source})", section.packing.name()))
+        }
+        _ => Error::io(path, source),
+    }
+}
+
 /// Opens a section of a file, unpacked.
 fn open_section(path: &Path, section: Section) -> Result<Box<dyn Read>> {
     let mut file = open(path)?;
@@ -115,8 +147,7 @@ pub(crate) fn read_section(path: &Path, section: Section, promised: u64) -> Resu
     let length = length(path)?;
     let stored = length.saturating_sub(section.start);
     let total = promised.saturating_add(section.skip);
-    let packed = section.packing != Packing::Plain;
-    let most = if packed { stored.saturating_mul(DEFLATE_LIMIT) } else { stored };
+    let most = most(section.packing, stored);
     if total > most {
         return Err(Error::invalid(
             path,
@@ -128,7 +159,7 @@ pub(crate) fn read_section(path: &Path, section: Section, promised: u64) -> Resu
             ),
         ));
     }
-    if section.packing != Packing::Plain && total > length.saturating_mul(2).saturating_add(TRUSTED) {
+    if section.packing != Packing::Plain && total > trusted(length) {
         let mut reader = open_section(path, section)?.take(total);
         let mut counted = 0;
         let mut buffer = vec![0; 1 << 16];
@@ -161,16 +192,15 @@ pub(crate) fn read_section(path: &Path, section: Section, promised: u64) -> Resu
     Ok(bytes)
 }
 
-/// Reads a section to its end, unpacked: for text, whose length no header promises.
+/// Parses XML of so few nodes that they fit into what is trusted.
 ///
 /// # Errors
-/// `Io` with the path; `Invalid` if a packed stream breaks off or is damaged.
-pub(crate) fn read_to_end(path: &Path, section: Section) -> Result<Vec<u8>> {
-    let mut bytes = Vec::new();
-    match open_section(path, section)?.read_to_end(&mut bytes) {
-        Ok(_) => Ok(bytes.split_off(bytes.len().min(section.skip as usize))),
-        Err(e) => Err(broken(path, section, bytes.len() as u64, bytes.len() as u64, e)),
-    }
+/// As [`roxmltree::Document::parse`]; too many nodes.
+pub(crate) fn xml(text: &str) -> Result<roxmltree::Document<'_>, roxmltree::Error> {
+    /// Of about 80 bytes.
+    const NODES: u32 = 1 << 18;
+    let options = roxmltree::ParsingOptions { nodes_limit: NODES, ..Default::default() };
+    roxmltree::Document::parse_with_options(text, options)
 }
 
 /// The error of a section that ends too early.
@@ -181,16 +211,9 @@ fn short(path: &Path, section: Section, found: u64, total: u64) -> Error {
 
 /// The error of a reader that failed: the packed stream's fault, or the system's.
 fn broken(path: &Path, section: Section, found: u64, total: u64, source: std::io::Error) -> Error {
-    use std::io::ErrorKind as K;
-    match source.kind() {
-        K::UnexpectedEof | K::InvalidData | K::InvalidInput if section.packing != Packing::Plain => Error::invalid(
-            path,
-            format!(
-                "the {} stream is cut short or damaged ({source}) after {found} of {total} unpacked bytes",
-                section.packing.name()
-            ),
-        ),
-        _ => Error::io(path, source),
+    match damaged(path, section, source) {
+        Error::Invalid(message) => Error::Invalid(format!("{message} after {found} of {total} unpacked bytes")),
+        error => error,
     }
 }
 

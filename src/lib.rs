@@ -19,6 +19,7 @@ pub mod progress;
 pub mod checkpoint;
 // Samples, value, gradient, range.
 pub mod volume;
+pub mod series;
 pub mod field;
 pub mod mask;
 // Rays of R⁴; one hexahedron; the min/max hierarchy and its walk; triangle meshes of L(h, c).

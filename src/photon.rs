@@ -123,6 +123,8 @@ pub struct PhotonSettings {
 
 /// Photons per task: fixed, so that sums are made in the same order on any number of threads.
 const CHUNK: u64 = 1 << 14;
+/// Chunks whose parts are joined at once.
+const ROUND: usize = 64;
 
 /// One source of photons with its total power × isovalue per channel.
 enum Source {
@@ -153,29 +155,31 @@ pub fn trace_photons<T: Tracer>(
     if total == 0.0 || settings.count == 0 {
         return Photons::default();
     }
-    let chunks: Vec<Photons> = (0..settings.count.div_ceil(CHUNK) as usize)
-        .into_par_iter()
-        .map(|chunk| {
-            let mut out = Photons::default();
-            let range = chunk as u64 * CHUNK..((chunk as u64 + 1) * CHUNK).min(settings.count);
-            let n = range.end - range.start;
-            if tick(0) {
-                range.for_each(|i| trace_photon(scene, tracer, settings, &sources, total, i, &mut out));
-                tick(n);
-            }
-            out
-        })
-        .collect();
     let mut all = Photons::default();
-    all.surface.reserve_exact(chunks.iter().map(|c| c.surface.len()).sum());
-    all.flat.reserve_exact(chunks.iter().map(|c| c.flat.len()).sum());
-    for c in chunks {
-        all.surface.extend_from_slice(&c.surface);
-        all.flat.extend_from_slice(&c.flat);
-        all.emitted += c.emitted;
-        all.rays += c.rays;
-        all.flat_gradient += c.flat_gradient;
-        all.energy.iter_mut().zip(c.energy).for_each(|(a, b)| *a += b);
+    let chunks = settings.count.div_ceil(CHUNK) as usize;
+    // Joined round by round: all of it and one round's parts are held, never everything twice.
+    for round in (0..chunks).step_by(ROUND) {
+        let parts: Vec<Photons> = (round..chunks.min(round + ROUND))
+            .into_par_iter()
+            .map(|chunk| {
+                let mut out = Photons::default();
+                let range = chunk as u64 * CHUNK..((chunk as u64 + 1) * CHUNK).min(settings.count);
+                let n = range.end - range.start;
+                if tick(0) {
+                    range.for_each(|i| trace_photon(scene, tracer, settings, &sources, total, i, &mut out));
+                    tick(n);
+                }
+                out
+            })
+            .collect();
+        for c in parts {
+            all.surface.extend_from_slice(&c.surface);
+            all.flat.extend_from_slice(&c.flat);
+            all.emitted += c.emitted;
+            all.rays += c.rays;
+            all.flat_gradient += c.flat_gradient;
+            all.energy.iter_mut().zip(c.energy).for_each(|(a, b)| *a += b);
+        }
     }
     all
 }

@@ -1,6 +1,8 @@
 //! The radiance that a gather ray finds where it lands: reflected light cached at the lattice's nodes, per side, and on
 //! flats as (u, v, c) textures. Direct light by shadow rays plus photons without their first landings. \[Christensen99\]
 
+mod pools;
+
 use crate::brdf::reflected;
 use crate::checkpoint;
 use crate::direct::{Receiver, direct_irradiance};
@@ -15,6 +17,7 @@ use crate::rng::Stage;
 use crate::scene::Scene;
 use crate::tracer::Tracer;
 use glam::DVec3;
+use pools::Pools;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -66,9 +69,13 @@ impl RadianceCache {
     ) -> Self {
         let rays = AtomicU64::new(0);
         let photons_of = ByFlat::new(&photons.flat, flat::count(scene));
+        let pools = Pools::new(scene, settings.flat_resolution);
         let (flats, shown) = (0..flat::count(scene))
             .into_par_iter()
-            .map(|n| fill_flat(scene, tracer, n, photons_of.flat(n), settings, &rays))
+            .map(|n| {
+                let photons = pools.of(n).flat_map(|m| photons_of.flat(m));
+                fill_flat(scene, tracer, n, photons, pools.area(scene, n), settings, &rays)
+            })
             .unzip();
         let mut cache =
             Self { nodes: vec![[None, None]; scene.fields()], flats, shown: Some(shown), rays: rays.into_inner() };
@@ -253,12 +260,14 @@ fn fill_nodes<T: Tracer>(
     nodes
 }
 
-/// Direct light at texel centres and photons of later landings, smoothed little for gathers and more for pictures.
+/// Direct light at texel centres and photons of later landings, on so many times the flat's area, smoothed little for
+/// gathers and more for pictures.
 fn fill_flat<T: Tracer>(
     scene: &Scene,
     tracer: &T,
     number: usize,
     photons: impl Iterator<Item = FlatPhoton>,
+    areas: f64,
     settings: &CacheSettings,
     rays: &AtomicU64,
 ) -> (Option<FlatTexture>, Option<FlatTexture>) {
@@ -290,7 +299,7 @@ fn fill_flat<T: Tracer>(
         })
         .collect();
     let (power, count) = flat_power(dims, &parts, photons);
-    let texel = flat.area() / (dims[0] * dims[1]) as f64 / dims[2] as f64;
+    let texel = areas * flat.area() / (dims[0] * dims[1]) as f64 / dims[2] as f64;
     let density: Vec<DVec3> = power.into_iter().map(|p| p / texel).collect();
     let covered: f64 = parts.iter().map(|p| p.covered).sum();
     let per_texel = count as f64 / (covered * dims[2] as f64);

@@ -1,9 +1,11 @@
 //! Scene files (TOML), and how a volume, a scene file and flags become a [`Scene`].
 
 mod fault;
+mod frames;
 mod several;
 
 pub use fault::fault;
+pub use frames::load_series;
 pub use several::{PolicyName, VolumeEntry, Volumes};
 
 use crate::bake::BakeOptions;
@@ -81,8 +83,12 @@ impl ContextOptions {
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
 pub struct VolumeSource {
-    /// A volume file, relative to the scene file.
+    /// A volume file, relative to the scene file, or the pattern of a series: `rho_%04d.vti`.
     pub file: Option<PathBuf>,
+    /// The files of a series instead.
+    pub files: Option<Vec<PathBuf>>,
+    /// When each file of a series is.
+    pub times: Option<Vec<f64>>,
     /// How to read a headerless file.
     pub raw: Option<RawOptions>,
     /// Name of a generator instead of a file.
@@ -314,6 +320,9 @@ pub struct SceneOptions {
     /// The sweep: lowest and highest isovalue, in the volume's units (default: suggested from the data)
     #[arg(long, num_args = 2, value_names = ["LO", "HI"], allow_negative_numbers = true)]
     pub isovalues: Option<Vec<f64>>,
+    /// The moment of a series of volumes; between two of its frames, their blend
+    #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
+    pub time: Option<f64>,
     #[command(flatten)]
     #[allow(missing_docs, reason = "a doc comment would become the group's help")]
     pub surface: SurfaceOptions,
@@ -377,15 +386,8 @@ impl Source {
 /// # Errors
 /// `Io`, `Invalid` or `NotSupported`; messages name the file and what is wrong in it.
 pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
-    let is_scene = input.extension().is_some_and(|e| e.eq_ignore_ascii_case("toml"));
-    let source = if is_scene { Some(Source::read(input)?) } else { None };
-    let (file, folder) = match &source {
-        Some(source) => (source.parse()?, input.parent().unwrap_or(Path::new("")).to_path_buf()),
-        None => {
-            let volume = VolumeSource { file: Some(input.to_path_buf()), ..VolumeSource::default() };
-            (SceneFile { volume: Volumes::One(volume), ..SceneFile::default() }, PathBuf::new())
-        }
-    };
+    let (source, file, folder) = parse(input)?;
+    let is_scene = source.is_some();
     let single = match &file.volume {
         Volumes::One(single) => single,
         Volumes::Several(entries) => return several::load(entries, &file, input, options),
@@ -400,11 +402,22 @@ pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
             "there is only one volume; list several as [[volume]]".into(),
         )));
     }
-    let key = if single.file.is_some() { "file" } else { "generator" };
-    let volume = load_volume(single, &folder, &options.raw).map_err(blame(key, false))?;
-    let isovalues = match (options.isovalues.as_deref(), file.isovalues) {
-        (Some(&[lo, hi]), _) => [lo, hi],
-        (_, Some(range)) => range,
+    let key = single.key();
+    let series = single.series(&folder).map_err(blame(key, false))?;
+    let read = |path: &Path| frames::read_volume(path, single, &options.raw);
+    let volume = match (&series, options.time) {
+        (Some(series), time) => frames::moment(series, time, input, read).map_err(blame(key, true))?,
+        (None, None) => load_volume(single, &folder, &options.raw).map_err(blame(key, false))?,
+        (None, Some(time)) => {
+            return Err(Error::invalid(input, format!("is a single volume: --time {time} chooses of a series")));
+        }
+    };
+    let isovalues = match (options.isovalues.as_deref(), file.isovalues, &series) {
+        (Some(&[lo, hi]), ..) => [lo, hi],
+        (_, Some(range), _) => range,
+        (.., Some(series)) => {
+            series.check(read)?.ok_or_else(|| Error::invalid(input, "no frame holds an isosurface"))?
+        }
         _ => suggested(&volume)?,
     };
     let given = options.isovalues.is_some() || file.isovalues.is_none();
@@ -435,16 +448,20 @@ fn suggested(volume: &Volume) -> Result<[f64; 2]> {
     })
 }
 
+/// The scene file that `input` is or stands for, its text if it is one, and where its paths begin.
+fn parse(input: &Path) -> Result<(Option<Source>, SceneFile, PathBuf)> {
+    if input.extension().is_some_and(|e| e.eq_ignore_ascii_case("toml")) {
+        let source = Source::read(input)?;
+        let file = source.parse()?;
+        return Ok((Some(source), file, input.parent().unwrap_or(Path::new("")).to_path_buf()));
+    }
+    let volume = VolumeSource { file: Some(input.to_path_buf()), ..VolumeSource::default() };
+    Ok((None, SceneFile { volume: Volumes::One(volume), ..SceneFile::default() }, PathBuf::new()))
+}
+
 fn load_volume(source: &VolumeSource, folder: &Path, raw: &RawOptions) -> Result<Volume> {
     match (&source.file, &source.generator) {
-        (Some(file), None) => {
-            let path = folder.join(file);
-            let layout = if raw.given() { Some(raw) } else { source.raw.as_ref() };
-            match layout {
-                Some(layout) => layout.layout(&path)?.read(&path),
-                None => Volume::open(&path),
-            }
-        }
+        (Some(file), None) => frames::read_volume(&folder.join(file), source, raw),
         (None, Some(name)) => Generator::from_name(name)?.sample([source.size.unwrap_or(101); 3]),
         _ => Err(Error::Invalid("[volume] needs either file or generator".into())),
     }

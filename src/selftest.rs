@@ -16,9 +16,10 @@ use crate::progress::Progress;
 use rayon::prelude::*;
 use serde::Serialize;
 use std::fmt::Write;
+use std::time::Instant;
 
 /// How many trials of each kind.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Trials {
     /// Rays drawn per watertight class; a little less than half of them start inside, and count.
     pub watertight: u64,
@@ -32,20 +33,30 @@ pub struct Trials {
     pub invariance: u64,
     /// Independent bakes per side of each z-test.
     pub bakes: u64,
+    /// Seconds after which a watertight, root or spawned case makes no further trials: it counts those that it made.
+    pub seconds: f64,
 }
 
 impl Trials {
     /// Seconds.
-    pub const QUICK: Self =
-        Self { watertight: 200_000, triangles: 50_000, roots: 200_000, spawned: 300_000, invariance: 50_000, bakes: 8 };
-    /// Minutes: 10⁷ rays per watertight class, 10⁷ roots, 10⁷ spawned rays.
+    pub const QUICK: Self = Self {
+        watertight: 200_000,
+        triangles: 50_000,
+        roots: 200_000,
+        spawned: 300_000,
+        invariance: 50_000,
+        bakes: 8,
+        seconds: f64::INFINITY,
+    };
+    /// Minutes: 10⁷ rays per watertight class, 10⁷ cells (and nearly twice as many cubics), 10⁷ spawned rays.
     pub const STANDARD: Self = Self {
         watertight: 23_000_000,
         triangles: 1_000_000,
-        roots: 10_000_000,
+        roots: 28_000_000,
         spawned: 35_000_000,
         invariance: 1_000_000,
         bakes: 16,
+        seconds: f64::INFINITY,
     };
     /// Hours: 10⁹ rays per watertight class, 10⁸ spawned ones.
     pub const LONG: Self = Self {
@@ -55,6 +66,7 @@ impl Trials {
         spawned: 350_000_000,
         invariance: 10_000_000,
         bakes: 64,
+        seconds: f64::INFINITY,
     };
 }
 
@@ -155,21 +167,23 @@ impl Tally {
     }
 }
 
-/// Runs `trial(index)` for all indices below `count` on all threads; `None` is no trial (a ray that starts outside, say).
+/// Runs `trial(index)` for all indices below `count` on all threads; `None` is no trial (a ray that starts outside, say). What
+/// is not begun after so many seconds is left out.
 ///
 /// # Errors
 /// `Interrupted`.
-pub fn many<F>(progress: Progress, name: &str, count: u64, trial: F) -> Result<Tally>
+pub fn many<F>(progress: Progress, name: &str, count: u64, seconds: f64, trial: F) -> Result<Tally>
 where
     F: Fn(u64) -> Option<Result<f64, String>> + Sync,
 {
     const BLOCK: u64 = 1 << 14;
     let stage = progress.stage(name, count);
+    let begun = Instant::now();
     let tally = (0..count.div_ceil(BLOCK))
         .into_par_iter()
         .map(|block| {
             let mut tally = Tally::default();
-            if stage.tick(0) {
+            if stage.tick(0) && begun.elapsed().as_secs_f64() < seconds {
                 let range = block * BLOCK..((block + 1) * BLOCK).min(count);
                 let n = range.end - range.start;
                 for index in range {
@@ -186,17 +200,38 @@ where
     Ok(tally)
 }
 
-/// All cases, in the order of the table.
+/// All cases of some groups.
 ///
 /// # Errors
 /// `Embree`, `Interrupted`; failures of cases are no errors but counts.
-pub fn run(trials: &Trials, device: &Device, progress: Progress) -> Result<Vec<Case>> {
-    let mut cases = watertight::cases(trials, device, progress)?;
-    cases.extend(roots::cases(trials.roots, progress)?);
-    cases.extend(spawned::cases(trials.spawned, device, progress)?);
-    cases.extend(invariance::cases(trials, device, progress)?);
-    cases.extend(degenerate::cases(device)?);
+pub fn run(trials: &Trials, groups: &[Group], device: &Device, progress: Progress) -> Result<Vec<Case>> {
+    let mut cases = Vec::new();
+    for group in groups {
+        cases.extend(match group {
+            Group::Watertight => watertight::cases(trials, device, progress)?,
+            Group::Roots => roots::cases(trials, progress)?,
+            Group::Spawned => spawned::cases(trials, device, progress)?,
+            Group::Invariance => invariance::cases(trials, device, progress)?,
+            Group::Degenerate => degenerate::cases(device)?,
+        });
+    }
     Ok(cases)
+}
+
+/// The kinds of cases.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+#[allow(missing_docs, reason = "the names of the modules")]
+pub enum Group {
+    Watertight,
+    Roots,
+    Spawned,
+    Invariance,
+    Degenerate,
+}
+
+impl Group {
+    /// In the order of the table.
+    pub const ALL: [Self; 5] = [Self::Watertight, Self::Roots, Self::Spawned, Self::Invariance, Self::Degenerate];
 }
 
 /// The table as text.

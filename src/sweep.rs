@@ -19,10 +19,14 @@ mod flats;
 mod gather;
 mod grid;
 mod half;
+mod monitor;
 mod pack;
 #[allow(unsafe_code, reason = "vector instructions: measured to pay, chosen at run time")]
 mod simd;
+mod state;
+mod totals;
 
+use crate::checkpoint::Stage;
 use crate::error::{Error, Result};
 use crate::flat::FlatTexture;
 use crate::flattened::Side;
@@ -32,9 +36,10 @@ use gather::Pass;
 use glam::DVec3;
 use grid::{Geometry, Planes};
 use half::Half4;
+use monitor::Monitor;
 use rayon::prelude::*;
 use simd::Isa;
-use std::f32::consts::PI;
+use state::{Passes, State};
 use std::sync::Mutex;
 
 /// How to sweep.
@@ -162,63 +167,71 @@ pub fn supported(scene: &Scene) -> Result<()> {
 /// `NotSupported` for several fields that light each other, if a polygon that is not a luminaire stands inside the volume,
 /// or if there are more than [`MOST_POLYGONS`]: that needs the photon engine.
 pub fn sweep(scene: &Scene, settings: &SweepSettings, tick: &(dyn Fn(f64) -> bool + Sync)) -> Result<SweepResult> {
+    sweep_resumable(scene, settings, Stage::UNSAVED, tick)
+}
+
+/// As [`sweep`], keeping what is finished in `saved` (whole passes, whenever the checkpoint is due or `tick` ends the work)
+/// and going on from there: with the same bits.
+///
+/// # Errors
+/// As [`sweep`].
+pub fn sweep_resumable(
+    scene: &Scene,
+    settings: &SweepSettings,
+    saved: Stage,
+    tick: &(dyn Fn(f64) -> bool + Sync),
+) -> Result<SweepResult> {
     supported(scene)?;
     let inside = flats::inside(scene);
     let geometry = Geometry::new(&scene.field);
     let stored = scene.surface.stored_sides();
-    // Light passes from one side to the other only around the open rims of level sets, outside Ω.
+    let sides = swept_sides(scene);
+    let replicates = settings.replicates.max(1);
+    let mut flats = Flats::new(scene, settings.flat_resolution.0.max(2), settings.flat_resolution.1.max(2));
+    let mut state = State::new(&stored, geometry.h.len(), replicates);
+    let mut passes = saved.read(0, |bytes| state.restore(bytes, sides.len(), &mut flats)).flatten();
+    if state.counts.valid == 0 {
+        state.counts.valid = geometry.valid.iter().filter(|v| **v).count() as u64;
+        state.counts.masked = geometry.valid.len() as u64 - state.counts.valid;
+    }
+    let run = Run { scene, settings, geometry: &geometry, inside: &inside, sides: &sides, isa: Isa::detect(), saved };
+    let mut stopped = false;
+    while state.done < replicates && !stopped {
+        let r = state.done;
+        let progress = |x: f64| tick((r as f64 + x) / replicates as f64);
+        let (replicate, complete) = run.replicate(&mut state, passes.take(), &mut flats, &progress);
+        stopped = !complete;
+        if complete || r == 0 {
+            state.add(&replicate, &flats, scene);
+        }
+    }
+    if !stopped {
+        saved.save(0, || state.bytes(None));
+    }
+    let State { done, total, flats: sums, bounces, residual, counts } = state;
+    let flats = flats.textures.iter().zip(sums).map(|(texture, sum)| {
+        texture.as_ref().zip(sum).map(|(t, mut sum)| {
+            sum.iter_mut().for_each(|x| *x /= done as f32);
+            t.export(&sum)
+        })
+    });
+    let flats = flats.collect();
+    Ok(SweepResult { sides: total.finish(&geometry, done), flats, bounces, residual, stopped, counts })
+}
+
+/// The sides that are swept: the stored ones, and the other one if light passes to it.
+pub(crate) fn swept_sides(scene: &Scene) -> Vec<Side> {
+    // Only around the open rims of level sets, outside Ω.
     let margin = {
         let [lo, hi] = gather::local_bounds(scene);
         lo.min(scene.lattice().far() - hi).min_element() < -1e-6
     };
     let coupled = margin && scene.boundary == Boundary::Open && !scene.polygons().is_empty();
-    let mut sides = stored.clone();
+    let mut sides = scene.surface.stored_sides();
     if coupled && sides.len() == 1 {
         sides.push(sides[0].opposite());
     }
-    let replicates = settings.replicates.max(1);
-    let mut total = Totals::new(&stored, geometry.h.len(), replicates);
-    let mut flats_sum: Vec<Option<Vec<f32>>> = Vec::new();
-    let mut flats = Flats::new(scene, settings.flat_resolution.0.max(2), settings.flat_resolution.1.max(2));
-    let mut out = SweepResult {
-        sides: Vec::new(),
-        flats: Vec::new(),
-        bounces: 0,
-        residual: 0.0,
-        stopped: false,
-        counts: SweepCounts::default(),
-    };
-    out.counts.valid = geometry.valid.iter().filter(|v| **v).count() as u64;
-    out.counts.masked = geometry.valid.len() as u64 - out.counts.valid;
-    let mut done = 0;
-    for r in 0..replicates {
-        let run = Run { scene, settings, geometry: &geometry, inside: &inside, sides: &sides, isa: Isa::detect() };
-        let progress = |x: f64| tick((r as f64 + x) / replicates as f64);
-        let replicate = run.replicate(r as u64, &mut flats, &mut out, &progress);
-        if out.stopped && done > 0 {
-            break;
-        }
-        done += 1;
-        total.add(&replicate, scene);
-        for (i, t) in flats.textures.iter().enumerate() {
-            if r == 0 {
-                flats_sum.push(t.as_ref().map(|t| t.radiance.clone()));
-            } else if let (Some(sum), Some(t)) = (&mut flats_sum[i], t) {
-                sum.iter_mut().zip(&t.radiance).for_each(|(s, x)| *s += x);
-            }
-        }
-        if out.stopped {
-            break;
-        }
-    }
-    out.sides = total.finish(&geometry, done);
-    for (texture, sum) in flats.textures.iter().zip(flats_sum) {
-        out.flats.push(texture.as_ref().zip(sum).map(|(t, mut sum)| {
-            sum.iter_mut().for_each(|x| *x /= done as f32);
-            t.export(&sum)
-        }));
-    }
-    Ok(out)
+    sides
 }
 
 /// What the replicates of one sweep share.
@@ -229,6 +242,7 @@ struct Run<'a> {
     inside: &'a [bool],
     sides: &'a [Side],
     isa: Isa,
+    saved: Stage<'a>,
 }
 
 /// Direct and indirect irradiance of one replicate, per side.
@@ -238,24 +252,17 @@ struct Replicate {
 }
 
 impl Run<'_> {
-    /// Direct light, then bounces: coarse passes until the tail is predictable and small, full passes, whose mean counts.
-    fn replicate(
-        &self,
-        number: u64,
-        flats: &mut Flats,
-        out: &mut SweepResult,
-        progress: &dyn Fn(f64) -> bool,
-    ) -> Replicate {
+    /// Direct light of one replicate, on the flats too, and black indirect light; `None` if `progress` stopped it.
+    fn begin(&self, state: &mut State, flats: &mut Flats, progress: &dyn Fn(f64) -> bool) -> Result<Passes, Replicate> {
         let s = self.settings;
-        let n = self.geometry.h.len();
         let points = s.light_points.max(1);
         let lights = points * self.scene.luminaires().len();
         let mut step = 0;
-        let mut stopped = false;
         let mut ask = || {
             step += 1;
             progress(0.2 * f64::from(step) / lights as f64)
         };
+        let number = state.done as u64;
         let (direct, complete) = direct::direct(
             self.scene,
             (self.geometry, self.isa),
@@ -264,9 +271,39 @@ impl Run<'_> {
             (s.seed, number, points),
             &mut ask,
         );
-        stopped |= !complete;
-        out.counts.shadow_rays += out.counts.valid * lights as u64;
-        let mut indirect: Vec<Planes> = self.sides.iter().map(|_| grid::black(n)).collect();
+        let indirect = self.sides.iter().map(|_| grid::black(self.geometry.h.len())).collect();
+        let nothing = flats.open();
+        flats.close(nothing);
+        flats.reflect([1.0; 3], false);
+        let light = Replicate { direct, indirect };
+        if !complete {
+            return Err(light);
+        }
+        state.counts.shadow_rays += state.counts.valid * lights as u64;
+        Ok(Passes { light, monitor: Monitor::default(), averaged: 0, bounce: 0, scale: [1.0; 3] })
+    }
+
+    /// Direct light, then bounces: coarse passes until the tail is predictable and small, full passes, whose mean counts.
+    /// Goes on behind the passes of `from`, whose light the flats hold. False if `progress` stopped it.
+    fn replicate(
+        &self,
+        state: &mut State,
+        from: Option<Passes>,
+        flats: &mut Flats,
+        progress: &dyn Fn(f64) -> bool,
+    ) -> (Replicate, bool) {
+        let s = self.settings;
+        let number = state.done as u64;
+        if from.is_none() && self.saved.due() {
+            self.saved.save(0, || state.bytes(None));
+        }
+        let mut now = match from.map_or_else(|| self.begin(state, flats, progress), Ok) {
+            Ok(passes) => passes,
+            Err(light) => {
+                self.saved.save(0, || state.bytes(None));
+                return (light, false);
+            }
+        };
         let pass = Pass {
             scene: self.scene,
             geometry: self.geometry,
@@ -275,17 +312,16 @@ impl Run<'_> {
             isa: self.isa,
             workspaces: Mutex::default(),
         };
-        let nothing = flats.open();
-        flats.close(nothing);
-        flats.reflect([1.0; 3], false);
-        let (mut b, mut unit) = self.reflect(flats, &direct, None, [1.0; 3]);
         let fixed = s.max_bounces < 6;
-        let mut monitor = Monitor::default();
-        let mut averaged = 0;
-        let mut bounce = 0;
-        while bounce < s.max_bounces && !stopped {
-            bounce += 1;
-            let settled = fixed || averaged > 0 || monitor.missing(FULL_PASSES as i32).is_some_and(|m| m < s.target);
+        while now.bounce < s.max_bounces {
+            if self.saved.due() {
+                self.saved.save(0, || state.bytes(Some((&now, flats))));
+            }
+            let indirect = (now.bounce > 0).then_some(&now.light.indirect[..]);
+            let (b, unit) = self.reflect(flats, &now.light.direct, indirect, now.scale);
+            let settled =
+                fixed || now.averaged > 0 || now.monitor.missing(FULL_PASSES as i32).is_some_and(|m| m < s.target);
+            let bounce = now.bounce + 1;
             let last_coarse = settled || bounce + FULL_PASSES > s.max_bounces;
             let directions =
                 if last_coarse { s.directions } else { (s.directions / COARSE).max(LEAST).min(s.directions) };
@@ -298,6 +334,7 @@ impl Run<'_> {
                 progress(0.2 + 0.8 * (bounce as f64 - 1.0 + f64::from(family) / total as f64) / (bounce as f64 + 3.0))
             };
             let mut fresh = Vec::new();
+            let mut stopped = false;
             for (&side, b) in self.sides.iter().zip(&b) {
                 let (e, complete) = pass.gather(side, &lines, b, unit, flats, &mut incoming, &mut ask);
                 stopped |= !complete;
@@ -305,32 +342,32 @@ impl Run<'_> {
             }
             flats.close(incoming);
             if stopped {
-                break;
+                self.saved.save(0, || state.bytes(Some((&now, flats))));
+                state.see(&now);
+                return (now.light, false);
             }
-            out.counts.families += (lines.len() * self.sides.len()) as u64;
-            out.counts.gather_rays += out.counts.valid * (lines.len() * self.sides.len()) as u64;
+            now.bounce = bounce;
+            state.counts.families += total as u64;
+            state.counts.gather_rays += state.counts.valid * total as u64;
             let mean = self.mean(&fresh);
-            if averaged > 0 {
+            if now.averaged > 0 {
                 // Full passes are averaged: each saw the light that the one before left.
-                let w = 1.0 / (averaged + 1) as f32;
-                for (old, new) in indirect.iter_mut().flatten().zip(fresh.iter().flatten()) {
+                let w = 1.0 / (now.averaged + 1) as f32;
+                for (old, new) in now.light.indirect.iter_mut().flatten().zip(fresh.iter().flatten()) {
                     old.par_iter_mut().zip(new).with_min_len(1 << 12).for_each(|(o, n)| *o += w * (n - *o));
                 }
             } else {
-                indirect = fresh;
+                now.light.indirect = fresh;
             }
-            averaged += usize::from(last_coarse && !fixed);
-            let scale = if fixed { [1.0; 3] } else { monitor.push(mean) };
-            flats.reflect(scale, true);
-            if bounce == s.max_bounces || (!fixed && averaged == FULL_PASSES) {
+            now.averaged += usize::from(last_coarse && !fixed);
+            now.scale = if fixed { [1.0; 3] } else { now.monitor.push(mean) };
+            flats.reflect(now.scale, true);
+            if !fixed && now.averaged == FULL_PASSES {
                 break;
             }
-            (b, unit) = self.reflect(flats, &direct, Some(&indirect), scale);
         }
-        out.bounces = out.bounces.max(bounce);
-        out.residual = monitor.missing(0).unwrap_or(f64::NAN).max(out.residual);
-        out.stopped |= stopped;
-        Replicate { direct, indirect }
+        state.see(&now);
+        (now.light, true)
     }
 
     /// B = Le + ρ/π (direct + scale · indirect) of the sides, filled where no surface is, as lines read it; packs the flats
@@ -412,129 +449,5 @@ impl Run<'_> {
             chunks.iter().sum()
         };
         std::array::from_fn(|c| planes.iter().map(|p| sum(&p[c])).sum())
-    }
-}
-
-/// Watches the mean of indirect light, per channel, from pass to pass.
-#[derive(Default)]
-struct Monitor {
-    means: Vec<[f64; 3]>,
-    /// Ratio of successive changes, and the share of the mean that all later bounces would add, when last measured.
-    ratio: [f64; 3],
-    tail: [f64; 3],
-    /// Passes since then.
-    since: i32,
-}
-
-/// The pass whose change predicts the tail: by then light has left the neighbourhood of the luminaires.
-const PREDICTS: usize = 4;
-
-impl Monitor {
-    /// Takes the means of a pass; returns per channel the factor that adds the predicted tail of all bounces that are
-    /// left. It is applied once: passes after it start from light that is complete in the mean.
-    #[allow(clippy::cast_possible_truncation, reason = "a factor near 1")]
-    fn push(&mut self, mean: [f64; 3]) -> [f32; 3] {
-        self.means.push(mean);
-        self.since += 1;
-        if self.means.len() != PREDICTS {
-            return [1.0; 3];
-        }
-        self.since = 0;
-        let [a, b, c] = [1, 2, 3].map(|i| self.means[i]);
-        std::array::from_fn(|i| {
-            let (old, new) = (b[i] - a[i], c[i] - b[i]);
-            if !(old > 0.0 && new > 0.0) {
-                return 1.0;
-            }
-            self.ratio[i] = (new / old).min(0.98);
-            let rest = new * self.ratio[i] / (1.0 - self.ratio[i]);
-            self.tail[i] = rest / c[i];
-            1.0 + (rest / c[i]) as f32
-        })
-    }
-
-    /// Bound on the share of the mean that is still missing, `more` passes from now; `None` before the prediction. The
-    /// change of a pass itself stalls at the directions' noise.
-    fn missing(&self, more: i32) -> Option<f64> {
-        (self.means.len() >= PREDICTS)
-            .then(|| (0..3).map(|i| self.tail[i] * self.ratio[i].powi(self.since + more)).fold(0.0, f64::max))
-    }
-}
-
-/// Sums over replicates.
-struct Totals {
-    sides: Vec<Side>,
-    direct: Vec<Planes>,
-    indirect: Vec<Planes>,
-    /// Running mean and sum of squared deviations of the luminance of ρE/π. \[Welford62\]
-    spread: Vec<Vec<[f32; 2]>>,
-    count: f32,
-}
-
-impl Totals {
-    fn new(sides: &[Side], n: usize, replicates: usize) -> Self {
-        let spread = if replicates > 1 { vec![vec![[0.0; 2]; n]; sides.len()] } else { Vec::new() };
-        Self { sides: sides.to_vec(), direct: Vec::new(), indirect: Vec::new(), spread, count: 0.0 }
-    }
-
-    #[allow(clippy::cast_possible_truncation, reason = "albedo")]
-    fn add(&mut self, r: &Replicate, scene: &Scene) {
-        self.count += 1.0;
-        let luminance = |albedo: DVec3| -> [f32; 3] {
-            std::array::from_fn(|c| [0.2126, 0.7152, 0.0722][c] * albedo[c] as f32 / PI)
-        };
-        let (albedo, h) = (&scene.surface.albedo, scene.field.samples());
-        let same = (albedo.stops().len() == 1).then(|| luminance(albedo.at(0.0)));
-        for (s, spread) in self.spread.iter_mut().enumerate() {
-            let (d, e) = (&r.direct[s], &r.indirect[s]);
-            let count = self.count;
-            spread.par_iter_mut().enumerate().with_min_len(1 << 12).for_each(|(i, m)| {
-                let luminance = same.unwrap_or_else(|| luminance(albedo.at(f64::from(h[i]))));
-                let x: f32 = (0..3).map(|c| luminance[c] * (d[c][i] + e[c][i])).sum();
-                let old = x - m[0];
-                m[0] += old / count;
-                m[1] += old * (x - m[0]);
-            });
-        }
-        if self.direct.is_empty() {
-            (self.direct, self.indirect) =
-                (r.direct[..self.sides.len()].to_vec(), r.indirect[..self.sides.len()].to_vec());
-            return;
-        }
-        for (sum, new) in [(&mut self.direct, &r.direct), (&mut self.indirect, &r.indirect)] {
-            for (s, n) in sum.iter_mut().flatten().zip(new.iter().flatten()) {
-                s.par_iter_mut().zip(n).with_min_len(1 << 12).for_each(|(s, n)| *s += n);
-            }
-        }
-    }
-
-    fn finish(self, geometry: &Geometry, done: usize) -> Vec<SweptSide> {
-        let scale = 1.0 / done.max(1) as f32;
-        let collect = |planes: &Planes| -> Vec<[f32; 3]> {
-            let [r, g, b] = planes;
-            (0..r.len())
-                .into_par_iter()
-                .with_min_len(1 << 12)
-                .map(|i| if geometry.valid[i] { [scale * r[i], scale * g[i], scale * b[i]] } else { [0.0; 3] })
-                .collect()
-        };
-        let mut spread = self.spread.into_iter();
-        self.sides
-            .iter()
-            .enumerate()
-            .map(|(s, &side)| SweptSide {
-                side,
-                direct: collect(&self.direct[s]),
-                indirect: collect(&self.indirect[s]),
-                std_error: match spread.next() {
-                    Some(m) if done > 1 => m
-                        .iter()
-                        .zip(&geometry.valid)
-                        .map(|(m, v)| if *v { (m[1] * scale / (done - 1) as f32).sqrt() } else { 0.0 })
-                        .collect(),
-                    _ => Vec::new(),
-                },
-            })
-            .collect()
     }
 }

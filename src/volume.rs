@@ -4,6 +4,7 @@
 pub(crate) mod ascii;
 pub mod cube;
 pub mod generate;
+mod header;
 pub mod legacy_vtk;
 pub mod metaimage;
 pub mod mrc;

@@ -1,18 +1,21 @@
 //! The line-sweep engine against answers that are known without a reference, and against exact rays.
 
 use glam::{DMat3, DVec3};
+use isolume::checkpoint::Checkpoint;
 use isolume::embree::{Device, GraphTracer};
 use isolume::field::{Field, Sweep};
 use isolume::flattened::{Departure, Side, Target};
 use isolume::polygon::Polygon;
 use isolume::rng::{Rng, Sobol, Stage};
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
-use isolume::sweep::{SweepResult, SweepSettings, sweep};
+use isolume::sweep::{SweepResult, SweepSettings, sweep, sweep_resumable};
 use isolume::tracer::Tracer;
 use isolume::volume::{Lattice, Samples, Volume};
 use isolume::warp::{Frame, cosine_hemisphere};
 use rayon::prelude::*;
 use std::f64::consts::PI;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::time::Duration;
 
 /// A field on `lattice` from a function of the world.
 fn field(lattice: Lattice, range: (f64, f64), f: impl Fn(DVec3) -> f64 + Sync) -> Field {
@@ -227,7 +230,7 @@ fn any_number_of_threads_gives_the_same_bits() {
                 .flatten()
                 .all(|x| x.is_finite() && *x >= 0.0)
         );
-        for threads in [2, 7] {
+        for threads in [2, 7, 16] {
             let other = everything(25, margin, threads);
             for (a, b) in one.sides.iter().zip(&other.sides) {
                 assert!(
@@ -322,4 +325,80 @@ fn polygons_in_the_volume_are_refused() {
     let scene = Scene::new(f, Surface::default(), Boundary::Open, vec![shelf]).unwrap();
     let error = sweep(&scene, &ONE_BOUNCE, &|_| true).unwrap_err().to_string();
     assert!(error.contains("shelf") && error.contains("photon"), "{error}");
+}
+
+#[test]
+fn an_interrupted_sweep_goes_on_with_the_same_bits() {
+    let settings = SweepSettings {
+        directions: 32,
+        light_points: 4,
+        max_bounces: 12,
+        replicates: 3,
+        flat_resolution: (6, 6),
+        ..SweepSettings::default()
+    };
+    // One side in the box; both, coupled around the rims by a margin.
+    for margin in [0.0, 0.2] {
+        let field = bumps(13);
+        let walls = cornell_box(field.lattice(), margin).unwrap();
+        let surface = Surface { both_sides: margin > 0.0, ..Surface::default() };
+        let scene = Scene::new(field, surface, Boundary::Open, walls).unwrap();
+        let bits = |result: &SweepResult| -> Vec<u32> {
+            let nodes = result.sides.iter().flat_map(|s| {
+                let light = s.direct.iter().chain(&s.indirect).flatten();
+                light.chain(&s.std_error).map(|x| x.to_bits()).collect::<Vec<_>>()
+            });
+            let walls = result.flats.iter().flatten().flat_map(|f| f.texels.iter().flatten().map(|x| x.to_bits()));
+            nodes.chain(walls).collect()
+        };
+        let ticks = AtomicU64::new(0);
+        let whole = sweep(&scene, &settings, &|_| ticks.fetch_add(1, Relaxed) < u64::MAX).unwrap();
+        assert!(!whole.stopped && whole.bounces > 4);
+        let all = ticks.load(Relaxed);
+        let folder = tempfile::tempdir().unwrap();
+        let (path, kept) = (folder.path().join("a.checkpoint"), folder.path().join("kept"));
+        let (mut runs, mut done, mut repeated) = (0, 0, 0);
+        // Ended after a third of the work each time, as SIGINT does (what is finished is saved on the way out) and as a
+        // kill does (the file holds what was saved when it was due).
+        for killed in [false, true] {
+            loop {
+                let every = if killed { Duration::ZERO } else { Duration::from_secs(3600) };
+                let checkpoint = Checkpoint::new(&path, "job: a\n".into(), every).unwrap();
+                checkpoint.resume().unwrap();
+                ticks.store(0, Relaxed);
+                let tick = |_| {
+                    let go = ticks.fetch_add(1, Relaxed) < all / 3 + runs;
+                    if !go && killed && path.exists() && !kept.exists() {
+                        std::fs::copy(&path, &kept).unwrap();
+                    }
+                    go
+                };
+                let result = sweep_resumable(&scene, &settings, checkpoint.stage(0), &tick).unwrap();
+                (runs, done) = (runs + 1, done + ticks.load(Relaxed));
+                assert!(runs < 60, "no progress");
+                if !result.stopped {
+                    assert_eq!(bits(&result), bits(&whole), "margin {margin}, killed {killed}");
+                    assert_eq!((result.counts, result.bounces), (whole.counts, whole.bounces));
+                    assert_eq!(result.residual.to_bits(), whole.residual.to_bits());
+                    // What is finished is not done again.
+                    checkpoint.save().unwrap();
+                    let again =
+                        sweep_resumable(&scene, &settings, checkpoint.stage(0), &|_| panic!("no work")).unwrap();
+                    assert_eq!(bits(&again), bits(&whole));
+                    checkpoint.remove();
+                    break;
+                }
+                if killed {
+                    std::fs::rename(&kept, &path).unwrap();
+                } else {
+                    assert!(checkpoint.save().unwrap());
+                }
+            }
+            repeated += done;
+            (done, runs) = (0, if killed { runs } else { 0 });
+        }
+        let share = repeated as f64 / (2 * all) as f64;
+        println!("margin {margin}: {runs} runs, {share:.2} of the work");
+        assert!((1.0..2.0).contains(&share), "{share}");
+    }
 }

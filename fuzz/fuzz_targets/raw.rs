@@ -13,7 +13,7 @@ libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     layout.endian = if head[7] & 1 == 0 { Endian::Little } else { Endian::Big };
     layout.header_bytes = u64::from(u16::from_le_bytes([head[8], head[9]]));
     let path = isolume_fuzz::file(samples, "raw");
-    if let Ok(volume) = layout.read(&path) {
+    if let Some(volume) = isolume_fuzz::counted(&path, samples.len(), || layout.read(&path)) {
         assert_eq!(volume.samples().len() * volume.samples().element_type().size() + usize::from(u16::from_le_bytes([head[8], head[9]])), samples.len());
     }
     let _ = std::fs::remove_file(path);

@@ -10,6 +10,7 @@ use crate::mask::{Mask, masks};
 use crate::photon::{FlatPhoton, PhotonSettings, SurfacePhoton, trace_photons};
 use crate::radiance::RadianceSample;
 use crate::scene::Scene;
+use crate::sweep;
 use crate::volume::Volume;
 
 /// The program, its libraries and threads.
@@ -22,8 +23,15 @@ const PILOTS: u64 = 1 << 12;
 const MAPPING: f64 = 76.0;
 const MAP: f64 = 50.0;
 
-/// Bytes per grid point and side of the sweep engine, at its peak.
-const SWEPT: u64 = 110;
+/// Bytes of the sweep engine per grid point (normals, h in two orders, what direct light sees), per point and swept side
+/// (direct, indirect and incoming light, what lines read), and per point and stored side (sums over replicates and their
+/// spread). Measured at 101³ and 128³: 108 with one point per luminaire, 131 with sixteen, 63 more for a second side.
+const SWEPT: u64 = 55;
+const SWEPT_SIDE: u64 = 44;
+const SUMMED_SIDE: u64 = 32;
+
+/// Bytes per point and side that its checkpoint holds while a replicate is under way, besides the sums.
+const KEPT_SIDE: u64 = 24;
 
 /// Bytes that writing holds at most: batches of raw and packed blocks.
 const WRITER: u64 = 128 << 20;
@@ -72,6 +80,8 @@ impl MemoryEstimate {
         // A sample: position, owner, result, checkpoint.
         let per_sample = 12 + 8 + sample + RadianceSample::SAVED as u64;
         let export = grids + flats + points * (4 + 13 * stored) + WRITER.min(points * (5 + 29 * stored) * 2);
+        let sides = sweep::swept_sides(scene).len() as u64;
+        let swept = SWEPT + sides * (SWEPT_SIDE + KEPT_SIDE) + 2 * stored * SUMMED_SIDE;
         let stages = match settings.engine {
             Engine::Photon => {
                 let [landings, mapped] = landings(scene, settings, device)?;
@@ -91,7 +101,7 @@ impl MemoryEstimate {
                 ]
             }
             Engine::Sweep => vec![
-                ("sweep", base + points * SWEPT * stored.max(1) + flats * 4),
+                ("sweep", base + points * swept + flats * 4),
                 ("samples", base + flats + points * (12 * 4 + 16) + STAND_INS as u64 * filled * per_sample + grids),
                 ("export", base + export),
             ],

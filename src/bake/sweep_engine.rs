@@ -14,7 +14,7 @@ use crate::progress::Progress;
 use crate::radiance::{Indirect, sample_radiance};
 use crate::radiance_cache::RadianceCache;
 use crate::scene::{Scene, Surface};
-use crate::sweep::{SweptSide, sweep};
+use crate::sweep::{SweptSide, sweep_resumable};
 use crate::volume::Lattice;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
@@ -41,7 +41,8 @@ pub(super) fn light(
     };
     let stage = progress.stage("sweep", STEPS as u64);
     let done = std::sync::atomic::AtomicU64::new(0);
-    let swept = sweep(scene, &settings.sweep(), &|fraction| {
+    let [saved, _] = stages(checkpoint, 4 * number);
+    let swept = sweep_resumable(scene, &settings.sweep(), saved, &|fraction| {
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 … 1000")]
         let now = (fraction * STEPS) as u64;
         let before = done.fetch_max(now, std::sync::atomic::Ordering::Relaxed);

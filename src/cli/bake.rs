@@ -1,20 +1,24 @@
 //! `isolume bake`: from a volume or scene to the file that holds it with its light.
 
 use super::{device, expect_extension, writable};
-use crate::bake::{BakeOptions, BakeReport, BakeSettings, MemoryEstimate, TimeEstimate, bake_fields, job, supported};
+use crate::bake::{
+    BakeOptions, BakeReport, BakeSettings, MemoryEstimate, TimeEstimate, bake_fields, digest, job, supported,
+};
 use crate::checkpoint::Checkpoint;
 use crate::error::{Error, Result};
 use crate::export::bake_file;
+use crate::field::Sweep;
 use crate::progress::Progress;
 use crate::scene::{Policy, Scene};
-use crate::scene_file::{SceneOptions, load};
+use crate::scene_file::{SceneOptions, load, load_series};
+use crate::series::{Series, write_collection};
 use crate::volume::Volume;
 use glam::DVec3;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-#[derive(clap::Args, Debug)]
+#[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 The result holds point data `value` (contour on it), `rgb` (colour by it, without lighting and without a colour map),
 `radiance` (linear), `std_error` and `mask`, the walls' light as field data, and every setting.
@@ -24,6 +28,8 @@ Examples:
   isolume bake scene.toml -o out.vti --preset preview
   isolume bake two-fields.toml -o two.vtm                several volumes: two.vtm, which names a .vti for each
   isolume bake scan.raw --raw-dims 305,224,14 --raw-spacing 0.24,0.24,1 -o scan.vti
+  isolume bake 'rho_%04d.vti' -o lit.vti                 a series in time: lit_0000.vti … and lit.pvd for ParaView
+  isolume bake 'rho_%04d.vti' --time 3.5 -o lit.vti      one moment of it
   isolume bake big.nrrd -o big.vti --resume              go on where an interrupted bake stopped
   isolume bake big.nrrd -o big.vti --max-memory 8G --dry-run   what it would take")]
 pub(super) struct Bake {
@@ -74,9 +80,57 @@ impl Bake {
         if let Some(report) = &self.report {
             writable(report)?;
         }
+        let series = if self.scene.time.is_none() { load_series(&self.input, &self.scene)? } else { None };
+        match series {
+            Some(series) => self.frames(&series, progress),
+            None => self.one(begun, progress).map(drop),
+        }
+    }
+
+    /// Every frame of a series, with the same sweep and seed, and the collection of those that are done.
+    fn frames(&self, series: &Series, progress: Progress) -> Result<()> {
+        let mut scene = self.scene.clone();
+        let mut done = Vec::new();
+        for (n, &time) in series.times().iter().enumerate() {
+            if progress == Progress::Shown {
+                eprintln!("{:>14}  {} of {}, time {time}", "frame", n + 1, series.times().len());
+            }
+            scene.time = Some(time);
+            let numbered = |path: &PathBuf| Series::numbered(path, n);
+            let frame = Self {
+                output: numbered(&self.output),
+                report: self.report.as_ref().map(numbered),
+                checkpoint: self.checkpoint.as_ref().map(numbered),
+                scene: scene.clone(),
+                ..self.clone()
+            };
+            let sweep = frame.one(Instant::now(), progress)?;
+            scene.isovalues = Some(vec![sweep.lo(), sweep.hi()]);
+            if self.dry_run {
+                eprintln!("{:>14}  that for each of {} frames", "series", series.times().len());
+                return Ok(());
+            }
+            done.push((time, frame.output));
+            write_collection(&self.output.with_extension("pvd"), &done)?;
+        }
+        if progress == Progress::Shown {
+            eprintln!("{:>14}  {}", "written", self.output.with_extension("pvd").display());
+        }
+        Ok(())
+    }
+
+    /// Whether the output is there, whole and of this job.
+    fn complete(&self, job: &str) -> bool {
+        let found = self.output.exists().then(|| bake_file::BakedVolume::read(&self.output).ok()).flatten();
+        found.is_some_and(|b| b.report.get("job").and_then(|j| j.as_str()) == Some(&digest(job)))
+    }
+
+    /// One bake; returns its sweep.
+    fn one(&self, begun: Instant, progress: Progress) -> Result<Sweep> {
         let loaded = load(&self.input, &self.scene)?;
         let load_seconds = begun.elapsed().as_secs_f64();
-        match (loaded.scene.fields(), found.as_str()) {
+        let extension = self.output.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        match (loaded.scene.fields(), extension.as_str()) {
             (1, "vtm") => {
                 return Err(Error::invalid(&self.output, "is for several volumes; name a .vti for the bake of one"));
             }
@@ -93,6 +147,7 @@ impl Bake {
         }
         let volumes: Vec<&Volume> = [&loaded.volume].into_iter().chain(&loaded.companions).collect();
         let settings = BakeSettings::new(&self.bake.clone().or(&loaded.bake))?;
+        let sweep = loaded.scene.field.sweep();
         supported(&loaded.scene, &settings).map_err(|e| e.in_file(&self.input))?;
         let members = loaded.scene.members();
         if progress == Progress::Shown {
@@ -126,9 +181,14 @@ impl Bake {
                 Some(time) => eprintln!("{:>14}  {time}", "time"),
                 None => eprintln!("{:>14}  not estimated for the sweep engine", "time"),
             }
-            return Ok(());
+            return Ok(sweep);
         }
-        let checkpoint = self.checkpoint(job(&loaded.scene, &settings))?;
+        let job = job(&loaded.scene, &settings);
+        if self.resume && self.scene.time.is_some() && self.complete(&job) {
+            eprintln!("{:>14}  {} is complete", "resumed", self.output.display());
+            return Ok(sweep);
+        }
+        let checkpoint = self.checkpoint(job)?;
         let work = || -> Result<(Vec<crate::bake::Bake>, Instant)> {
             let mut bakes = bake_fields(&loaded.scene, &settings, &device, progress, Some(&checkpoint))?;
             let export = Instant::now();
@@ -163,7 +223,7 @@ impl Bake {
         if progress == Progress::Shown {
             self.summarise(&loaded.scene, &reports);
         }
-        Ok(())
+        Ok(sweep)
     }
 
     /// What was done, for people.

@@ -1,9 +1,9 @@
 //! `isolume selftest`: the hard cases on this machine, as one table.
 
 use super::device;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::progress::Progress;
-use crate::selftest::{Trials, run, table, verdict};
+use crate::selftest::{Group, Trials, run, table, verdict};
 
 #[derive(clap::Args, Debug)]
 #[command(after_help = "\
@@ -11,6 +11,7 @@ Exit code 1 if any case fails. Cases marked · stand beside the others for compa
 
 Examples:
   isolume selftest --quick
+  isolume selftest --long --only watertight --seconds-per-case 600
   isolume selftest --json > selftest.json")]
 pub(super) struct SelfTest {
     /// Seconds instead of minutes
@@ -19,6 +20,12 @@ pub(super) struct SelfTest {
     /// Hours: 10⁹ rays per watertight class, 10⁸ spawned rays
     #[arg(long)]
     long: bool,
+    /// Only these groups of cases
+    #[arg(long, value_enum, value_delimiter = ',', value_name = "GROUP")]
+    only: Vec<Group>,
+    /// End a watertight, root or spawned case after so many seconds: it counts the trials that it made
+    #[arg(long, value_name = "SECONDS")]
+    seconds_per_case: Option<f64>,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -26,13 +33,18 @@ pub(super) struct SelfTest {
 
 impl SelfTest {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
-        let trials = match (self.quick, self.long) {
+        let mut trials = match (self.quick, self.long) {
             (true, _) => Trials::QUICK,
             (_, true) => Trials::LONG,
             _ => Trials::STANDARD,
         };
+        trials.seconds = self.seconds_per_case.unwrap_or(trials.seconds);
+        if !(trials.seconds > 0.0) {
+            return Err(Error::Invalid(format!("--seconds-per-case {}: must be above 0", trials.seconds)));
+        }
+        let groups = if self.only.is_empty() { &Group::ALL[..] } else { &self.only };
         let device = device()?;
-        let cases = run(&trials, &device, progress)?;
+        let cases = run(&trials, groups, &device, progress)?;
         if self.json {
             let json = serde_json::json!({
                 "version": env!("CARGO_PKG_VERSION"),

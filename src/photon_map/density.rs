@@ -43,7 +43,7 @@ pub(super) struct PhotonDensity<'a> {
     edge: f64,
 }
 
-/// Radii in bins: the least, where the search begins, the largest.
+/// Radii in bins: the least, where photons are counted, the largest.
 const LEAST: f32 = 1.3;
 const FIRST: f32 = 2.0;
 const MOST: f32 = 5.0;
@@ -125,8 +125,7 @@ impl<'a> PhotonDensity<'a> {
         let from = DVec3::from_array(std::array::from_fn(|a| (bin[a] * self.factor[a]) as f64 - 0.5));
         let count: [usize; 3] = std::array::from_fn(|a| self.factor[a] * fine(a) as usize);
         let (mut measure, mut isovalue, mut normal, mut centroid) = (0.0, 0.0, DVec3::ZERO, DVec3::ZERO);
-        let mut add = |p: DVec3, h: f64, weight: f64| {
-            let g = self.field.gradient(p);
+        let mut add = |p: DVec3, h: f64, g: DVec3, weight: f64| {
             let w = g.length() * weight;
             if w > 0.0 {
                 measure += w;
@@ -135,6 +134,7 @@ impl<'a> PhotonDensity<'a> {
                 centroid += w * p;
             }
         };
+        let to_steps = lattice.axes().transpose();
         for k in 0..count[2] {
             for j in 0..count[1] {
                 for i in 0..count[0] {
@@ -142,12 +142,11 @@ impl<'a> PhotonDensity<'a> {
                     if p.cmplt(DVec3::ZERO).any() || p.cmpgt(far).any() {
                         continue;
                     }
-                    let h = self.field.value(p);
-                    let reach = self.field.gradient(p);
+                    let (h, g) = (self.field.value(p), self.field.gradient(p));
                     // How far h goes within the octant.
-                    let spread = 0.5 * (lattice.axes().transpose() * reach).abs().dot(step);
+                    let spread = 0.5 * (to_steps * g).abs().dot(step);
                     if h - spread >= 0.0 && h + spread <= 1.0 {
-                        add(p, h, cell);
+                        add(p, h, g, cell);
                     } else if h + spread >= 0.0 && h - spread <= 1.0 {
                         for corner in 0..8u32 {
                             let o =
@@ -155,7 +154,7 @@ impl<'a> PhotonDensity<'a> {
                             let q = p + o * step;
                             let h = self.field.value(q);
                             if (0.0..=1.0).contains(&h) {
-                                add(q, h, cell / 8.0);
+                                add(q, h, self.field.gradient(q), cell / 8.0);
                             }
                         }
                     }
@@ -210,15 +209,14 @@ impl<'a> PhotonDensity<'a> {
             });
             if squares > 0.0 { sum * sum / squares } else { 0.0 }
         };
+        // Their number grows as the cube of the radius; where too few tell how fast, one more look.
+        let mut n = count(FIRST);
         let mut radius = FIRST;
-        loop {
-            let n = count(radius);
-            if n >= wanted || radius >= MOST {
-                radius = (radius * (wanted / n.max(1.0)).cbrt().min(1.0)).max(LEAST);
-                break;
-            }
-            radius = (radius * (1.2 * wanted / n.max(1.0)).cbrt().clamp(1.1, 1.6)).min(MOST);
+        if n < 0.2 * wanted {
+            radius = MOST;
+            n = count(MOST);
         }
+        let radius = (radius * (wanted / n.max(1.0)).cbrt()).clamp(LEAST, MOST);
         let scale = 1.0 / radius;
         let mut fit = Fit::default();
         self.around(place, radius, |b, d2, d| {

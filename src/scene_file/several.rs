@@ -16,6 +16,7 @@ use std::path::{Path, PathBuf};
 
 /// `[volume]`, or several `[[volume]]`.
 #[derive(Clone, Debug)]
+#[allow(clippy::large_enum_variant, reason = "one value per file")]
 pub enum Volumes {
     /// One.
     One(VolumeSource),
@@ -103,6 +104,7 @@ impl VolumeEntry {
             raw: self.raw.clone(),
             generator: self.generator.clone(),
             size: self.size,
+            ..VolumeSource::default()
         };
         let mut volume = load_volume(&source, folder, &RawOptions::default())?;
         if self.origin.is_some() || self.scale.is_some() {
@@ -137,6 +139,7 @@ pub(super) fn load(entries: &[VolumeEntry], file: &SceneFile, input: &Path, opti
     let folder = input.parent().unwrap_or(Path::new(""));
     let s = &options.surface;
     let flags = [
+        ("--time", options.time.is_some()),
         ("--isovalues", options.isovalues.is_some()),
         ("--albedo", s.albedo.is_some()),
         ("--emission", s.emission.is_some()),

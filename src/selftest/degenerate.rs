@@ -119,11 +119,29 @@ fn inputs() -> Vec<Input> {
         },
         Input { sweep: [500.0, 600.0], expect: Expect::Refusal("outside the data"), ..input("sweep beyond the data") },
         Input { sweep: [-1000.0, 1000.0], ..input("sweep wider than the data") },
+        Input { sweep: [0.0, 33.0], ..with("sweep of exactly the data's range", |[i, j, k], _| (i + j + k) as f64) },
+        Input {
+            sweep: [33.0, 40.0],
+            expect: Expect::Refusal("outside the data"),
+            ..with("sweep that begins at the greatest value", |[i, j, k], _| (i + j + k) as f64)
+        },
+        Input {
+            sweep: [-7.0, 0.0],
+            expect: Expect::Refusal("outside the data"),
+            ..with("sweep that ends at the least value", |[i, j, k], _| (i + j + k) as f64)
+        },
         Input { sweep: [47.0, 47.0 + 1e-9], expect: Expect::Refusal("no grid point"), ..input("sweep of width 1e-9") },
         with("step edge and plateaus", |_, x| if x.x > 0.4 { 95.0 } else { 0.0 }),
         Input { walls: Walls::None, expect: Expect::Black, ..input("no walls, no luminaire") },
         Input { walls: Walls::Luminaire(DVec3::new(0.5, 0.5, 0.999), 0.2), ..input("a luminaire and no walls") },
         Input { walls: Walls::Luminaire(inside, 0.05), expect: Expect::Any, ..input("luminaire inside the solid") },
+        Input { walls: Walls::Luminaire(DVec3::new(0.5, 0.5, 0.6), 0.3), ..input("luminaire that level sets cut") },
+        Input {
+            sweep: [0.0, 1.0],
+            surface: Surface { outside: crate::flattened::Side::Higher, ..Surface::default() },
+            walls: Walls::Luminaire(DVec3::new(0.5, 0.5, 6.0 / 11.0), 0.25),
+            ..with("luminaire that touches a level set", |_, x| x.z)
+        },
         Input { walls: Walls::BoxAndLuminaire(DVec3::new(0.5, 0.5, 1.0), 0.2), ..input("luminaire in the ceiling") },
         Input {
             walls: Walls::BoxAndLuminaire(DVec3::new(0.5, 0.5, 0.5), 0.5),

@@ -186,7 +186,7 @@ pub fn intersections(rays: u64, device: &Device, progress: Progress) -> Result<V
         .map(|change| {
             let other = scene(N, change, false)?;
             let other_tracer = GraphTracer::new(device, &other)?;
-            let tally = many(progress, "invariance", rays, |i| {
+            let tally = many(progress, "invariance", rays, f64::INFINITY, |i| {
                 let a = ray(&base, &SAME, i);
                 let b = ray(&other, change, i);
                 Some(compare(&base, &a, change, tracer.intersect(&a), other_tracer.intersect(&b)))
@@ -213,7 +213,7 @@ pub fn walls(rays: u64, device: &Device, progress: Progress) -> Result<Case> {
     for change in &changes() {
         let other = scene(N, change, true)?;
         let other_tracer = GraphTracer::new(device, &other)?;
-        let tally = many(progress, "walls", rays, |i| {
+        let tally = many(progress, "walls", rays, f64::INFINITY, |i| {
             let mut rng = Rng::stream(7, Stage::Test, i);
             let last = (N - 1) as f64;
             let mut p = DVec3::new(rng.unit(), rng.unit(), rng.unit()) * last;

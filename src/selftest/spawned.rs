@@ -6,7 +6,7 @@
 
 use super::double::Double;
 use super::watertight::{closed, start};
-use super::{Case, many};
+use super::{Case, Trials, many};
 use crate::embree::{Device, GraphTracer};
 use crate::error::Result;
 use crate::field::Field;
@@ -203,18 +203,18 @@ fn spawn<T: Tracer>(kind: &Kind, tracer: &T, index: u64) -> Option<(FlattenedRay
     Some((scene.ray(origin, direction, here as f32, Departure::Surface(side)), side))
 }
 
-/// `count` rays, shared among the scenes.
+/// Rays, shared among the scenes.
 ///
 /// # Errors
 /// `Embree`, `Interrupted`.
-pub fn cases(count: u64, device: &Device, progress: Progress) -> Result<Vec<Case>> {
+pub fn cases(trials: &Trials, device: &Device, progress: Progress) -> Result<Vec<Case>> {
     let kinds = kinds()?;
-    let share = count.div_ceil(kinds.len() as u64);
+    let share = trials.spawned.div_ceil(kinds.len() as u64);
     kinds
         .iter()
         .map(|kind| {
             let tracer = GraphTracer::new(device, &kind.scene)?;
-            let tally = many(progress, "spawned", share, |i| {
+            let tally = many(progress, "spawned", share, trials.seconds, |i| {
                 let (ray, side) = spawn(kind, &tracer, i)?;
                 let hit = tracer.intersect(&ray);
                 if tracer.occluded(&ray) != hit.is_some() {

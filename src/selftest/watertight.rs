@@ -158,9 +158,11 @@ fn inside(scene: &Scene, origin: Vec3, c: f32) -> bool {
 ///
 /// # Errors
 /// `Embree`, `Interrupted`.
-pub fn misses(class: &Class, rays: u64, device: &Device, progress: Progress) -> Result<Tally> {
+pub fn misses(class: &Class, trials: &Trials, device: &Device, progress: Progress) -> Result<Tally> {
     let tracer = GraphTracer::new(device, &class.scene)?;
-    many(progress, class.name, rays, |i| ray(class, i, None).map(|ray| judge(&tracer, &ray)))
+    many(progress, class.name, trials.watertight, trials.seconds, |i| {
+        ray(class, i, None).map(|ray| judge(&tracer, &ray))
+    })
 }
 
 fn judge<T: Tracer>(tracer: &T, ray: &FlattenedRay) -> Result<f64, String> {
@@ -191,7 +193,7 @@ pub fn triangle_misses(class: &Class, rays: u64, device: &Device, progress: Prog
         };
         let tracer = SurfaceTracer::new(device, &class.scene, c, 1)?;
         let count = rays.div_ceil(TRIANGLE_ISOVALUES);
-        let tally = many(progress, "triangles", count, |i| {
+        let tally = many(progress, "triangles", count, f64::INFINITY, |i| {
             let ray = ray(class, k * count + i, Some(c))?;
             let o = ray.origin;
             let vertex = o == o.round() && class.scene.field.value(o.as_dvec3()) > f64::from(c);
@@ -209,7 +211,7 @@ pub fn triangle_misses(class: &Class, rays: u64, device: &Device, progress: Prog
 pub fn cases(trials: &Trials, device: &Device, progress: Progress) -> Result<Vec<Case>> {
     let mut cases = Vec::new();
     for class in classes()? {
-        let tally = misses(&class, trials.watertight, device, progress)?;
+        let tally = misses(&class, trials, device, progress)?;
         cases.push(tally.case("watertight", class.name, None, ""));
         let tally = triangle_misses(&class, trials.triangles, device, progress)?;
         let mut beside = tally.case("  triangles", class.name, None, "Embree on the extracted mesh, for comparison");

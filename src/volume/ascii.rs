@@ -12,19 +12,22 @@ pub(crate) fn parse(text: &[u8], element: ElementType, count: usize) -> Result<S
         return Err(format!("{count} numbers promised, but {} bytes of text cannot hold them", text.len()));
     }
     let text = std::str::from_utf8(text).map_err(|e| format!("the samples are not text: {e}"))?;
+    let words = || text.split(|c: char| c.is_ascii_whitespace() || c == ',').filter(|w| !w.is_empty());
+    // Counted before there is room for them.
+    let found = words().take(count).count();
+    if found < count {
+        return Err(format!("{count} numbers promised, {found} found; the file is cut short"));
+    }
     macro_rules! numbers {
         ($t:ty) => {{
             let mut values = Vec::<$t>::with_capacity(count);
-            for word in text.split(|c: char| c.is_ascii_whitespace() || c == ',').filter(|w| !w.is_empty()) {
+            for word in words() {
                 if values.len() == count {
                     return Err(format!("{count} numbers promised, more found: `{word}`"));
                 }
                 values.push(word.parse().map_err(|_| {
                     format!("sample {} is `{word}`, which is no number of type {}", values.len(), element.name())
                 })?);
-            }
-            if values.len() < count {
-                return Err(format!("{count} numbers promised, {} found; the file is cut short", values.len()));
             }
             values
         }};

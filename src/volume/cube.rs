@@ -4,103 +4,174 @@
 //! here x does, as everywhere.
 
 use crate::error::{Error, Result};
-use crate::files::{self, Packing, Section};
+use crate::files::{self, Section};
 use crate::volume::{Lattice, Samples, Volume};
 use glam::{DMat3, DVec3};
+use std::io::{BufRead, Read};
 use std::path::Path;
+
+/// A line of the header longer than this is none, nor a number.
+const LINE_LIMIT: u64 = 1 << 16;
+const WORD_LIMIT: usize = 64;
 
 /// Reads a cube of one value per point.
 ///
 /// # Errors
-/// `Io`; `Invalid` for a broken header, or too few or too many values; `NotSupported` for several orbitals or values per
-/// point.
+/// `Io`; `Invalid` for a broken header, or too few or too many values (known before they are allocated); `NotSupported` for
+/// several orbitals or values per point.
 pub fn read(path: &Path) -> Result<Volume> {
-    let text = match files::gzip_or_plain(path, 0)? {
-        Packing::Plain => files::read(path)?,
-        packing => files::read_to_end(path, Section { start: 0, packing, skip: 0 })?,
-    };
-    let text = String::from_utf8_lossy(&text);
-    parse(&text, path)
-}
-
-fn parse(text: &str, path: &Path) -> Result<Volume> {
-    // Two lines of comment stand in front.
-    let mut lines = text.split_inclusive('\n').enumerate().skip(2);
-    let mut numbers = |what: &str, least: usize| -> Result<Vec<f64>> {
-        let (number, line) = lines.next().unwrap_or((0, ""));
-        let values: Option<Vec<f64>> = line.split_ascii_whitespace().map(real).collect();
-        values.filter(|v| v.len() >= least).ok_or_else(|| {
-            let line = line.trim_end();
-            Error::invalid(path, format!("line {} is `{line}`; it must hold {least} numbers: {what}", number + 1))
-        })
-    };
-    let head = numbers("the number of atoms and the origin", 4)?;
-    let rows = [1, 2, 3].map(|a| numbers(&format!("the samples along axis {a} and their step"), 4));
-    let [x, y, z] = rows;
-    let rows = [x?, y?, z?];
-    let whole = |v: f64, what: &str| {
-        let n = v.abs();
-        if n.fract() == 0.0 && n < 1e9 {
-            Ok(n as usize)
-        } else {
-            Err(Error::invalid(path, format!("{what} is {v}; it must be a whole number")))
-        }
-    };
-    let dims = [whole(rows[0][0], "axis 1")?, whole(rows[1][0], "axis 2")?, whole(rows[2][0], "axis 3")?];
-    if rows.iter().any(|r| (r[0] < 0.0) != (rows[0][0] < 0.0)) {
-        return Err(Error::invalid(
-            path,
-            "counts samples by positive and negative numbers: bohr along one axis and ångström along another",
-        ));
-    }
-    let column = |a: usize| DVec3::from_slice(&rows[a][1..4]);
-    let axes = DMat3::from_cols(column(0), column(1), column(2));
-    let lattice = Lattice::new(dims, DVec3::from_slice(&head[1..4]), axes).map_err(|e| e.in_file(path))?;
-    let several = |n: f64| {
-        Error::not_supported(path, format!("holds {n} values per point; write one of them with `cubegen` or Multiwfn"))
-    };
-    if head.len() > 4 && head[4] != 1.0 {
-        return Err(several(head[4]));
-    }
-    let atoms = whole(head[0], "the number of atoms")?;
-    for _ in 0..atoms {
-        numbers("an atom's number, charge and position", 5)?;
-    }
-    if head[0] < 0.0 {
-        // Orbitals: how many, and their names.
-        let ids = numbers("the number of orbitals and their numbers", 2)?;
-        if ids[0] != 1.0 {
-            return Err(several(ids[0]));
-        }
-    }
-
-    let from = lines.next().map_or(text.len(), |(_, line)| line.as_ptr() as usize - text.as_ptr() as usize);
-    let text = &text[from..];
+    let text = Text { path, section: Section { start: 0, packing: files::gzip_or_plain(path, 0)?, skip: 0 } };
+    let (lattice, mut reader) = text.header()?;
+    let [_, ny, nz] = lattice.dims();
     let count = lattice.len();
+    let length = files::length(path)?;
     // One character and one separator per number: less text cannot hold the promise.
-    if count > text.len() / 2 + 1 {
-        return Err(Error::invalid(
-            path,
-            format!("{count} values promised, but {} bytes cannot hold them", text.len()),
-        ));
+    if count as u64 > files::most(text.section.packing, length) / 2 + 1 {
+        let message = format!("{count} values promised, but {length} bytes cannot hold them");
+        return Err(Error::invalid(path, message));
+    }
+    if count as u64 * 8 > files::trusted(length) {
+        let found = text.values(&mut reader, count, |_, _| Ok(()))?;
+        text.complete(count, found)?;
+        (_, reader) = text.header()?;
     }
     let mut samples = vec![0.0; count];
-    let mut found = 0;
-    let [_, ny, nz] = dims;
-    for word in text.split_ascii_whitespace() {
-        let value = real(word).ok_or_else(|| Error::invalid(path, format!("value {found} is `{word}`, no number")))?;
-        if found < count {
-            samples[lattice.offset(found / (ny * nz), found / nz % ny, found % nz)] = value;
-        }
-        found += 1;
-    }
-    if found != count {
-        return Err(Error::invalid(
-            path,
-            format!("{count} values promised, {found} found; it is cut short or damaged"),
-        ));
-    }
+    let found = text.values(&mut reader, count, |n, word| {
+        let short = Some(word).filter(|w| w.len() < WORD_LIMIT);
+        let value = short.and_then(|w| std::str::from_utf8(w).ok()).and_then(real).ok_or_else(|| {
+            Error::invalid(path, format!("value {n} is `{}`, no number", String::from_utf8_lossy(word)))
+        })?;
+        samples[lattice.offset(n / (ny * nz), n / nz % ny, n % nz)] = value;
+        Ok(())
+    })?;
+    text.complete(count, found)?;
     Volume::new(path.display().to_string(), lattice, Samples::F64(samples))
+}
+
+/// A file of text that is never held as a whole.
+#[derive(Clone, Copy)]
+struct Text<'a> {
+    path: &'a Path,
+    section: Section,
+}
+
+impl Text<'_> {
+    /// The next line, without what is no text.
+    fn line(&self, reader: &mut impl BufRead) -> Result<String> {
+        let mut line = Vec::new();
+        let read = reader.by_ref().take(LINE_LIMIT).read_until(b'\n', &mut line);
+        read.map_err(|e| files::damaged(self.path, self.section, e))?;
+        if line.len() as u64 == LINE_LIMIT {
+            return Err(Error::invalid(self.path, format!("a line of the header is longer than {LINE_LIMIT} bytes")));
+        }
+        Ok(String::from_utf8_lossy(&line).into_owned())
+    }
+
+    /// Calls `visit` with the number and the characters (the first 64 of them) of the next `count` words; returns how many
+    /// there are, but looks for one more only.
+    fn values(
+        &self,
+        reader: &mut impl BufRead,
+        count: usize,
+        mut visit: impl FnMut(usize, &[u8]) -> Result<()>,
+    ) -> Result<usize> {
+        let (mut found, mut word) = (0, Vec::with_capacity(WORD_LIMIT));
+        loop {
+            let bytes = match reader.fill_buf() {
+                Err(e) if e.kind() == std::io::ErrorKind::Interrupted => continue,
+                bytes => bytes.map_err(|e| files::damaged(self.path, self.section, e))?,
+            };
+            let (end, length) = (bytes.is_empty(), bytes.len());
+            for &b in if end { &b"\n"[..] } else { bytes } {
+                if !b.is_ascii_whitespace() {
+                    if word.len() < WORD_LIMIT {
+                        word.push(b);
+                    }
+                } else if !word.is_empty() {
+                    if found == count {
+                        return Ok(found + 1);
+                    }
+                    visit(found, &word)?;
+                    found += 1;
+                    word.clear();
+                }
+            }
+            if end {
+                return Ok(found);
+            }
+            reader.consume(length);
+        }
+    }
+
+    fn complete(&self, count: usize, found: usize) -> Result<()> {
+        if found == count {
+            return Ok(());
+        }
+        let found = if found > count { format!("more than {count}") } else { found.to_string() };
+        let message = format!("{count} values promised, {found} found; it is cut short or damaged");
+        Err(Error::invalid(self.path, message))
+    }
+
+    /// The lattice, and the stream where the values begin.
+    fn header(&self) -> Result<(Lattice, impl BufRead + use<>)> {
+        let path = self.path;
+        let mut reader = files::stream(path, self.section)?;
+        // Two lines of comment stand in front.
+        let mut number = 2;
+        for _ in 0..number {
+            self.line(&mut reader)?;
+        }
+        let mut numbers = |what: &str, least: usize| -> Result<Vec<f64>> {
+            number += 1;
+            let line = self.line(&mut reader)?;
+            let values: Option<Vec<f64>> = line.split_ascii_whitespace().map(real).collect();
+            values.filter(|v| v.len() >= least).ok_or_else(|| {
+                let shown: String = line.trim_end().chars().take(80).collect();
+                Error::invalid(path, format!("line {number} is `{shown}`; it must hold {least} numbers: {what}"))
+            })
+        };
+        let head = numbers("the number of atoms and the origin", 4)?;
+        let rows = [1, 2, 3].map(|a| numbers(&format!("the samples along axis {a} and their step"), 4));
+        let [x, y, z] = rows;
+        let rows = [x?, y?, z?];
+        let whole = |v: f64, what: &str| {
+            let n = v.abs();
+            if n.fract() == 0.0 && n < 1e9 {
+                Ok(n as usize)
+            } else {
+                Err(Error::invalid(path, format!("{what} is {v}; it must be a whole number")))
+            }
+        };
+        let dims = [whole(rows[0][0], "axis 1")?, whole(rows[1][0], "axis 2")?, whole(rows[2][0], "axis 3")?];
+        if rows.iter().any(|r| (r[0] < 0.0) != (rows[0][0] < 0.0)) {
+            return Err(Error::invalid(
+                path,
+                "counts samples by positive and negative numbers: bohr along one axis and ångström along another",
+            ));
+        }
+        let column = |a: usize| DVec3::from_slice(&rows[a][1..4]);
+        let axes = DMat3::from_cols(column(0), column(1), column(2));
+        let lattice = Lattice::new(dims, DVec3::from_slice(&head[1..4]), axes).map_err(|e| e.in_file(path))?;
+        let several = |n: f64| {
+            let message = format!("holds {n} values per point; write one of them with `cubegen` or Multiwfn");
+            Error::not_supported(path, message)
+        };
+        if head.len() > 4 && head[4] != 1.0 {
+            return Err(several(head[4]));
+        }
+        let atoms = whole(head[0], "the number of atoms")?;
+        for _ in 0..atoms {
+            numbers("an atom's number, charge and position", 5)?;
+        }
+        if head[0] < 0.0 {
+            // Orbitals: how many, and their names.
+            let ids = numbers("the number of orbitals and their numbers", 2)?;
+            if ids[0] != 1.0 {
+                return Err(several(ids[0]));
+            }
+        }
+        Ok((lattice, reader))
+    }
 }
 
 /// A number as Fortran writes it: `1.0E-3`, `1.0D-3`, and `1.0-100` where the exponent has three digits.
@@ -128,7 +199,10 @@ mod tests {
     }
 
     fn open(text: &str) -> Result<Volume> {
-        parse(text, Path::new("a.cube"))
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.cube");
+        std::fs::write(&path, text).unwrap();
+        read(&path)
     }
 
     #[test]
@@ -162,7 +236,7 @@ mod tests {
             assert!(message.contains(words) && message.contains("a.cube"), "{words}: {message}");
         };
         refused(cube("1 0 0 0", [2, 3, 4], 23), "23 found");
-        refused(cube("1 0 0 0", [2, 3, 4], 25), "25 found");
+        refused(cube("1 0 0 0", [2, 3, 4], 25), "more than 24 found");
         refused(cube("1 0 0 0", [1000, 1000, 1000], 24), "cannot hold");
         refused(cube("1 0 0 0", [1, 3, 4], 12), "flatland");
         refused(cube("1 0 0", [2, 3, 4], 24), "line 3");
@@ -173,5 +247,7 @@ mod tests {
         refused(orbitals, "2 values per point");
         refused(cube("1 0 0 0", [2, 3, 4], 24).replace("5.00000E0", "five"), "`five`");
         refused("one\ntwo\n".into(), "atoms");
+        refused("x".repeat(70_000), "longer than");
+        refused(cube("1 0 0 0", [2, 3, 4], 24).replace("5.00000E0", &"5".repeat(100_000)), "no number");
     }
 }

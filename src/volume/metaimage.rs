@@ -5,24 +5,23 @@
 
 use crate::error::{Error, Result};
 use crate::files::{self, Packing, Section};
+use crate::volume::header::{Header, Line};
 use crate::volume::{ElementType, Endian, Lattice, Samples, Volume, ascii};
 use glam::{DMat3, DVec3};
-use std::collections::HashMap;
-use std::io::{BufRead, BufReader, Read};
-use std::path::{Path, PathBuf};
-
-/// A header longer than this is not one.
-const HEADER_LIMIT: u64 = 1 << 20;
+use std::path::Path;
 
 /// The key that ends the header.
 const DATA_FILE: &str = "ElementDataFile";
 
-/// The fields of a header and where it ends.
-struct Header<'a> {
-    path: &'a Path,
-    fields: HashMap<String, String>,
-    /// Bytes up to and with the line of `ElementDataFile`.
-    length: u64,
+/// The fields of a MetaImage header.
+struct Fields<'a>(Header<'a>);
+
+impl<'a> std::ops::Deref for Fields<'a> {
+    type Target = Header<'a>;
+
+    fn deref(&self) -> &Header<'a> {
+        &self.0
+    }
 }
 
 /// Reads a 3D scalar volume. Samples keep the file's type.
@@ -35,80 +34,59 @@ struct Header<'a> {
 /// `Io`; `Invalid` for a broken header, too few bytes (known before they are allocated) or a damaged stream;
 /// `NotSupported` for several channels, other dimensions and samples split over several files.
 pub fn read(path: &Path) -> Result<Volume> {
-    let header = Header::read(path)?;
+    let header = Fields::read(path)?;
     let lattice = header.lattice()?;
     let element = header.element()?;
     let samples = header.samples(lattice.len(), element)?;
     Volume::new(path.display().to_string(), lattice, samples)
 }
 
-impl<'a> Header<'a> {
+impl<'a> Fields<'a> {
     /// Reads the lines up to `ElementDataFile`.
     fn read(path: &'a Path) -> Result<Self> {
-        let mut reader = BufReader::new(files::open(path)?.take(HEADER_LIMIT));
-        let (mut fields, mut length, mut line) = (HashMap::new(), 0, Vec::new());
-        for number in 1.. {
-            line.clear();
-            length += reader.read_until(b'\n', &mut line).map_err(|e| Error::io(path, e))? as u64;
-            if line.is_empty() {
-                return Err(Error::invalid(path, format!("the header has no field `{DATA_FILE}`, which must end it")));
-            }
-            let text = String::from_utf8_lossy(&line);
+        let header = Header::read(path, |number, text| {
             let text = text.trim();
             if text.is_empty() {
-                continue;
+                return Ok(Line::Nothing);
             }
             let Some((key, value)) = text.split_once('=').map(|(k, v)| (k.trim(), v.trim())) else {
                 let shown: String = text.chars().take(40).collect();
                 return Err(Error::invalid(path, format!("line {number}, `{shown}`, is no `key = value`")));
             };
-            fields.insert(key.to_string(), value.to_string());
-            if key == DATA_FILE {
-                break;
-            }
+            let (last, key, value) = (key == DATA_FILE, key.to_string(), value.to_string());
+            Ok(if last { Line::Last(key, value) } else { Line::Field(key, value) })
+        })?;
+        if header.get(DATA_FILE).is_none() {
+            let message = format!("the header has no field `{DATA_FILE}`, which must end it");
+            return Err(Error::invalid(path, message));
         }
-        Ok(Self { path, fields, length })
+        Ok(Self(header))
     }
 
     /// The first of several names of a field that is there.
-    fn get(&self, keys: &[&'static str]) -> Option<(&'static str, &str)> {
-        keys.iter().find_map(|&key| Some((key, self.fields.get(key)?.as_str())))
+    fn first(&self, keys: &[&'static str]) -> Option<&'static str> {
+        keys.iter().copied().find(|key| self.get(key).is_some())
     }
 
-    fn need(&self, key: &'static str) -> Result<&str> {
-        self.get(&[key])
-            .map(|(_, value)| value)
-            .ok_or_else(|| Error::invalid(self.path, format!("the header has no field `{key}`")))
-    }
-
-    fn wrong(&self, key: &str, value: &str, wanted: &str) -> Error {
-        Error::invalid(self.path, format!("field `{key}` is `{value}`; {wanted}"))
-    }
-
-    /// `count` numbers of a field, `None` if the field is missing.
-    fn numbers<T: std::str::FromStr>(&self, keys: &[&'static str], count: usize) -> Result<Option<Vec<T>>> {
-        let Some((key, value)) = self.get(keys) else { return Ok(None) };
-        let numbers: Option<Vec<T>> = value.split_whitespace().map(|w| w.parse().ok()).collect();
-        numbers
-            .filter(|n| n.len() == count)
-            .map(Some)
-            .ok_or_else(|| self.wrong(key, value, &format!("it must hold {count} numbers")))
+    /// `count` numbers of the first of several fields that is there.
+    fn any<T: std::str::FromStr>(&self, keys: &[&'static str], count: usize) -> Result<Option<Vec<T>>> {
+        self.first(keys).map_or(Ok(None), |key| self.numbers(key, count))
     }
 
     /// A yes or no, `false` if the field is missing. MetaIO looks at the first letter only.
     fn flag(&self, keys: &[&'static str]) -> Result<bool> {
-        match self.get(keys) {
+        match self.first(keys) {
             None => Ok(false),
-            Some((key, value)) => match value.chars().next().map(|c| c.to_ascii_lowercase()) {
+            Some(key) => match self.need(key)?.chars().next().map(|c| c.to_ascii_lowercase()) {
                 Some('t' | 'y' | '1') => Ok(true),
                 Some('f' | 'n' | '0') => Ok(false),
-                _ => Err(self.wrong(key, value, "it must be True or False")),
+                _ => Err(self.wrong(key, "it must be True or False")),
             },
         }
     }
 
     fn lattice(&self) -> Result<Lattice> {
-        let n: Option<Vec<usize>> = self.numbers(&["NDims"], 1)?;
+        let n: Option<Vec<usize>> = self.numbers("NDims", 1)?;
         match n.as_deref() {
             Some([3]) => {}
             Some([n]) => {
@@ -122,26 +100,26 @@ impl<'a> Header<'a> {
             _ => return Err(Error::invalid(self.path, "the header has no field `NDims`, so it is no MetaImage")),
         }
         let dims: Vec<usize> = self
-            .numbers(&["DimSize"], 3)?
+            .numbers("DimSize", 3)?
             .ok_or_else(|| Error::invalid(self.path, "the header has no field `DimSize`"))?;
         let vector = |keys: &[&'static str], missing: DVec3| -> Result<DVec3> {
-            Ok(self.numbers(keys, 3)?.map_or(missing, |v| DVec3::from_slice(&v)))
+            Ok(self.any(keys, 3)?.map_or(missing, |v| DVec3::from_slice(&v)))
         };
         let spacing = vector(&["ElementSpacing", "ElementSize"], DVec3::ONE)?;
         let origin = vector(&["Offset", "Position", "Origin"], DVec3::ZERO)?;
-        let rows: Option<Vec<f64>> = self.numbers(&["TransformMatrix", "Rotation", "Orientation"], 9)?;
+        let rows: Option<Vec<f64>> = self.any(&["TransformMatrix", "Rotation", "Orientation"], 9)?;
         let directions = rows.map_or(DMat3::IDENTITY, |r| DMat3::from_cols_slice(&r));
         Lattice::new([dims[0], dims[1], dims[2]], origin, directions * DMat3::from_diagonal(spacing))
             .map_err(|e| e.in_file(self.path))
     }
 
     fn element(&self) -> Result<ElementType> {
-        if let Some((key, value)) = self.get(&["ElementNumberOfChannels"])
+        if let Some(value) = self.get("ElementNumberOfChannels")
             && value != "1"
         {
             return Err(Error::not_supported(
                 self.path,
-                format!("{key} = {value}: colours and vectors are not read; extract one channel"),
+                format!("ElementNumberOfChannels = {value}: colours and vectors are not read; extract one channel"),
             ));
         }
         Ok(match self.need("ElementType")? {
@@ -169,13 +147,7 @@ impl<'a> Header<'a> {
         let name = self.need(DATA_FILE)?;
         let (path, start) = match name {
             "LOCAL" | "Local" | "local" => (self.path.to_path_buf(), self.length),
-            _ if name.starts_with("LIST") || name.contains('%') => {
-                return Err(Error::not_supported(
-                    self.path,
-                    format!("{DATA_FILE} = {name}: samples split over several files are not read; join them"),
-                ));
-            }
-            _ => (self.path.parent().map_or_else(|| PathBuf::from(name), |p| p.join(name)), 0),
+            _ => (self.beside(DATA_FILE, name)?, 0),
         };
         let promised = (count as u64).saturating_mul(element.size() as u64);
         let packing = if self.flag(&["CompressedData"])? {
@@ -187,7 +159,7 @@ impl<'a> Header<'a> {
         } else {
             Packing::Plain
         };
-        let skip: i64 = self.numbers(&["HeaderSize"], 1)?.map_or(0, |v| v[0]);
+        let skip: i64 = self.numbers("HeaderSize", 1)?.map_or(0, |v| v[0]);
         let start = match u64::try_from(skip) {
             // Bytes in front of the samples, of a detached file only.
             Ok(bytes) if start == 0 => bytes,
@@ -201,10 +173,10 @@ impl<'a> Header<'a> {
             }
             Err(_) => {
                 let wanted = "it must not be negative (−1 is for samples that are not compressed)";
-                return Err(self.wrong("HeaderSize", &skip.to_string(), wanted));
+                return Err(self.wrong("HeaderSize", wanted));
             }
         };
-        if self.fields.contains_key("BinaryData") && !self.flag(&["BinaryData"])? {
+        if self.get("BinaryData").is_some() && !self.flag(&["BinaryData"])? {
             let text = files::read(&path)?;
             let from = usize::try_from(start).unwrap_or(usize::MAX).min(text.len());
             return ascii::parse(&text[from..], element, count).map_err(|e| Error::invalid(&path, e));

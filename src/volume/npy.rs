@@ -78,13 +78,14 @@ pub fn read(path: &Path) -> Result<Volume> {
 
 /// The Python dictionary `{'descr': '<f4', 'fortran_order': False, 'shape': (3, 4, 5), }`.
 fn parse_header(text: &str) -> Result<Header> {
+    let shown: String = text.trim_end().chars().take(120).map(|c| if c.is_control() { ' ' } else { c }).collect();
     let value = |key: &str| {
         let at = ["'", "\""].iter().find_map(|q| {
             let quoted = format!("{q}{key}{q}");
             text.find(&quoted).map(|at| at + quoted.len())
         });
         let rest = at.and_then(|at| text[at..].trim_start().strip_prefix(':'));
-        rest.map(str::trim_start).ok_or_else(|| Error::Invalid(format!("the header has no key '{key}': {text}")))
+        rest.map(str::trim_start).ok_or_else(|| Error::Invalid(format!("the header has no key '{key}': {shown}")))
     };
     let descr = value("descr")?;
     let quoted = |q: char| descr.strip_prefix(q).and_then(|d| d.split(q).next());
@@ -116,13 +117,13 @@ fn parse_header(text: &str) -> Result<Header> {
     let fortran = match value("fortran_order")? {
         v if v.starts_with("True") => true,
         v if v.starts_with("False") => false,
-        _ => return Err(Error::Invalid(format!("fortran_order is neither True nor False: {text}"))),
+        _ => return Err(Error::Invalid(format!("fortran_order is neither True nor False: {shown}"))),
     };
     let shape = value("shape")?;
     let inside = shape.strip_prefix('(').and_then(|s| s.split(')').next());
     let shape: Option<Vec<usize>> =
         inside.and_then(|s| s.split(',').map(str::trim).filter(|w| !w.is_empty()).map(|w| w.parse().ok()).collect());
-    let shape = shape.ok_or_else(|| Error::Invalid(format!("shape is no tuple of numbers: {text}")))?;
+    let shape = shape.ok_or_else(|| Error::Invalid(format!("shape is no tuple of numbers: {shown}")))?;
     Ok(Header { element, half, endian: if order == b'>' { Endian::Big } else { Endian::Little }, fortran, shape })
 }
 

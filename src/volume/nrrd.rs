@@ -5,25 +5,14 @@
 
 use crate::error::{Error, Result};
 use crate::files::{self, Packing, Section};
+use crate::volume::header::{Header, Line};
 use crate::volume::plane::Plane;
 use crate::volume::vti::SamplesRef;
 use crate::volume::{ElementType, Endian, Lattice, Samples, Space, Volume, ascii};
 use flate2::{Compression, write::GzEncoder};
 use glam::{DMat3, DVec3};
-use std::collections::HashMap;
-use std::io::{BufRead, BufReader, Read, Write};
-use std::path::{Path, PathBuf};
-
-/// A header longer than this is not one.
-const HEADER_LIMIT: u64 = 1 << 20;
-
-/// The fields of a header and where it ends.
-struct Header<'a> {
-    path: &'a Path,
-    fields: HashMap<String, String>,
-    /// Bytes up to and with the empty line.
-    length: u64,
-}
+use std::io::{BufRead, BufReader, Write};
+use std::path::Path;
 
 /// Reads a 3D scalar volume (or a 4D one with an axis of a single sample). Samples keep the file's type.
 ///
@@ -34,7 +23,7 @@ struct Header<'a> {
 /// `Io`; `Invalid` for a broken header, too few bytes (known before they are allocated) or a damaged stream;
 /// `NotSupported` for vectors, other dimensions, other encodings and split data files.
 pub fn read(path: &Path) -> Result<Volume> {
-    let header = Header::read(path)?;
+    let header = Fields::read(path)?;
     let keep = header.kept_axes()?;
     let sizes: Vec<usize> = header.list("sizes")?;
     let dims = keep.map(|a| sizes[a]);
@@ -51,7 +40,7 @@ pub fn read(path: &Path) -> Result<Volume> {
 /// # Errors
 /// As [`read`].
 pub fn read_plane(path: &Path) -> Result<Option<Plane>> {
-    let header = Header::read(path)?;
+    let header = Fields::read(path)?;
     let sizes: Vec<usize> = header.list("sizes")?;
     let Some(axes) = Plane::long_axes(&sizes).map_err(|e| e.in_file(path))? else { return Ok(None) };
     let spacing = if header.get("spacedirections").is_some() {
@@ -66,7 +55,7 @@ pub fn read_plane(path: &Path) -> Result<Option<Plane>> {
         [1.0; 2]
     };
     let dims = axes.map(|a| sizes[a]);
-    let count = dims[0].checked_mul(dims[1]).ok_or_else(|| header.invalid("sizes", "that is too large"))?;
+    let count = dims[0].checked_mul(dims[1]).ok_or_else(|| header.wrong("sizes", "that is too large"))?;
     Ok(Some(Plane { dims, spacing, samples: header.samples(count, header.element()?)? }))
 }
 
@@ -127,71 +116,54 @@ pub fn write(
     })
 }
 
-impl<'a> Header<'a> {
-    /// Reads the lines up to the first empty one.
+/// The fields of an NRRD header: lower case, without blanks, since "data file" and "datafile" are the same field.
+struct Fields<'a>(Header<'a>);
+
+impl<'a> std::ops::Deref for Fields<'a> {
+    type Target = Header<'a>;
+
+    fn deref(&self) -> &Header<'a> {
+        &self.0
+    }
+}
+
+impl<'a> Fields<'a> {
+    /// Reads the lines up to the first empty one; a detached header may end without it.
     fn read(path: &'a Path) -> Result<Self> {
-        let mut reader = BufReader::new(files::open(path)?.take(HEADER_LIMIT));
-        let mut fields = HashMap::new();
-        let mut length = 0;
-        let mut line = Vec::new();
-        for number in 1.. {
-            line.clear();
-            length += reader.read_until(b'\n', &mut line).map_err(|e| Error::io(path, e))? as u64;
-            if number == 1 && !line.starts_with(b"NRRD000") {
-                return Err(Error::invalid(path, "does not begin with NRRD0001 … NRRD0005, so it is no NRRD file"));
-            }
-            if line.is_empty() {
-                // A detached header may end without an empty line; an attached one that long is none.
-                if length >= HEADER_LIMIT {
-                    return Err(Error::invalid(path, format!("the header does not end within {HEADER_LIMIT} bytes")));
-                }
-                break;
-            }
-            let text = String::from_utf8_lossy(&line);
-            let text = text.trim_end_matches(['\r', '\n']);
-            if text.is_empty() {
-                break;
-            }
+        let mut begun = false;
+        let no_nrrd = || Error::invalid(path, "does not begin with NRRD0001 … NRRD0005, so it is no NRRD file");
+        let header = Header::read(path, |number, text| {
             if number == 1 {
-                if !matches!(&text[7..], "1" | "2" | "3" | "4" | "5") {
-                    return Err(Error::not_supported(path, format!("{text}: only NRRD0001 … NRRD0005 are read")));
-                }
-                continue;
+                begun = true;
+                return match text.strip_prefix("NRRD000").ok_or_else(no_nrrd)? {
+                    "1" | "2" | "3" | "4" | "5" => Ok(Line::Nothing),
+                    _ => Err(Error::not_supported(path, format!("{text}: only NRRD0001 … NRRD0005 are read"))),
+                };
+            }
+            if text.is_empty() {
+                return Ok(Line::End);
             }
             // `key:=value` pairs are the user's own notes.
-            let Some((key, value)) = text.split_once(':').filter(|(_, v)| !v.starts_with('=')) else {
-                if text.starts_with('#') || text.contains(":=") {
-                    continue;
+            match text.split_once(':').filter(|(_, v)| !v.starts_with('=')) {
+                _ if text.starts_with('#') => Ok(Line::Nothing),
+                Some((key, value)) => {
+                    Ok(Line::Field(key.replace(' ', "").to_ascii_lowercase(), value.trim().to_string()))
                 }
-                return Err(Error::invalid(path, format!("line {number}, `{text}`, is no `field: value`")));
-            };
-            if !text.starts_with('#') {
-                // "data file" and "datafile" are the same field.
-                fields.insert(key.replace(' ', "").to_ascii_lowercase(), value.trim().to_string());
+                None if text.contains(":=") => Ok(Line::Nothing),
+                None => {
+                    let shown: String = text.chars().take(80).collect();
+                    Err(Error::invalid(path, format!("line {number}, `{shown}`, is no `field: value`")))
+                }
             }
-        }
-        Ok(Self { path, fields, length })
-    }
-
-    fn get(&self, key: &str) -> Option<&str> {
-        self.fields.get(key).map(String::as_str)
-    }
-
-    fn need(&self, key: &str) -> Result<&str> {
-        self.get(key).ok_or_else(|| Error::invalid(self.path, format!("the header has no field `{key}`")))
-    }
-
-    fn invalid(&self, key: &str, wanted: &str) -> Error {
-        Error::invalid(self.path, format!("field `{key}` is `{}`; {wanted}", self.get(key).unwrap_or("")))
+        })?;
+        if begun { Ok(Self(header)) } else { Err(no_nrrd()) }
     }
 
     /// A field with one number per axis.
     fn list<T: std::str::FromStr>(&self, key: &str) -> Result<Vec<T>> {
-        let n: usize = self.need("dimension")?.parse().map_err(|_| self.invalid("dimension", "it must be a number"))?;
-        let values: Option<Vec<T>> = self.need(key)?.split_whitespace().map(|w| w.parse().ok()).collect();
-        values
-            .filter(|v| v.len() == n)
-            .ok_or_else(|| self.invalid(key, &format!("it must hold {n} numbers, one per axis")))
+        let n: usize = self.need("dimension")?.parse().map_err(|_| self.wrong("dimension", "it must be a number"))?;
+        self.need(key)?;
+        Ok(self.numbers(key, n)?.unwrap_or_default())
     }
 
     /// One vector per axis (`None` for `none`), by the parentheses.
@@ -206,9 +178,9 @@ impl<'a> Header<'a> {
                 continue;
             }
             let (inside, tail) =
-                rest.strip_prefix('(').and_then(|r| r.split_once(')')).ok_or_else(|| self.invalid(key, wanted))?;
+                rest.strip_prefix('(').and_then(|r| r.split_once(')')).ok_or_else(|| self.wrong(key, wanted))?;
             let numbers: Option<Vec<f64>> = inside.split(',').map(|w| w.trim().parse().ok()).collect();
-            vectors.push(Some(numbers.ok_or_else(|| self.invalid(key, wanted))?));
+            vectors.push(Some(numbers.ok_or_else(|| self.wrong(key, wanted))?));
             rest = tail.trim_start();
         }
         Ok(vectors)
@@ -248,14 +220,13 @@ impl<'a> Header<'a> {
             let world =
                 |v: Option<&Option<Vec<f64>>>| -> Option<DVec3> { v?.clone()?.try_into().ok().map(DVec3::from_array) };
             let column = |a: usize| {
-                world(vectors.get(keep[a])).ok_or_else(|| {
-                    self.invalid("spacedirections", "every axis of the volume needs its vector `(x,y,z)`")
-                })
+                world(vectors.get(keep[a]))
+                    .ok_or_else(|| self.wrong("spacedirections", "every axis of the volume needs its vector `(x,y,z)`"))
             };
             let axes = DMat3::from_cols(column(0)?, column(1)?, column(2)?);
             let origin = match self.get("spaceorigin") {
                 Some(_) => world(self.vectors("spaceorigin")?.first())
-                    .ok_or_else(|| self.invalid("spaceorigin", "it must be one vector `(x,y,z)`"))?,
+                    .ok_or_else(|| self.wrong("spaceorigin", "it must be one vector `(x,y,z)`"))?,
                 None => DVec3::ZERO,
             };
             return Lattice::new(dims, origin, axes);
@@ -315,13 +286,7 @@ impl<'a> Header<'a> {
     fn samples(&self, count: usize, element: ElementType) -> Result<Samples> {
         let (path, start) = match self.get("datafile") {
             None => (self.path.to_path_buf(), self.length),
-            Some(name) if name.starts_with("LIST") || name.contains('%') => {
-                return Err(Error::not_supported(
-                    self.path,
-                    format!("data file `{name}`: samples split over several files are not read; join them"),
-                ));
-            }
-            Some(name) => (self.path.parent().map_or_else(|| PathBuf::from(name), |p| p.join(name)), 0),
+            Some(name) => (self.beside("data file", name)?, 0),
         };
         let encoding = self.need("encoding")?.to_ascii_lowercase();
         let packing = match encoding.as_str() {
@@ -335,7 +300,7 @@ impl<'a> Header<'a> {
             }
         };
         let number = |key: &str| -> Result<i64> {
-            self.get(key).map_or(Ok(0), |v| v.parse().map_err(|_| self.invalid(key, "it must be a whole number")))
+            self.get(key).map_or(Ok(0), |v| v.parse().map_err(|_| self.wrong(key, "it must be a whole number")))
         };
         let start = start + skip_lines(&path, start, number("lineskip")?)?;
         let promised = (count as u64).saturating_mul(element.size() as u64);
@@ -348,7 +313,7 @@ impl<'a> Header<'a> {
                     Error::invalid(&path, format!("{promised} bytes of samples promised, {stored} found"))
                 })?
             }
-            _ => return Err(self.invalid("byteskip", "it must not be negative (-1 is for the raw encoding only)")),
+            _ => return Err(self.wrong("byteskip", "it must not be negative (-1 is for the raw encoding only)")),
         };
         if matches!(encoding.as_str(), "ascii" | "text" | "txt") {
             let text = files::read(&path)?;
@@ -359,7 +324,7 @@ impl<'a> Header<'a> {
             Some("little") => Endian::Little,
             Some("big") => Endian::Big,
             None if element.size() == 1 => Endian::Little,
-            Some(_) => return Err(self.invalid("endian", "it must be `little` or `big`")),
+            Some(_) => return Err(self.wrong("endian", "it must be `little` or `big`")),
             None => return Err(Error::invalid(self.path, "samples of several bytes need the field `endian`")),
         };
         let bytes = files::read_section(&path, Section { start, packing, skip }, promised)?;

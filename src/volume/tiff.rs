@@ -2,20 +2,18 @@
 //!
 //! Sample (i, j, k) is column i, row j from the top, page k; rows run downwards, so y does too, as in ImageJ and ITK.
 
+mod directories;
+
 use crate::error::{Error, Result};
 use crate::files;
 use crate::volume::{ElementType, Endian, Lattice, Samples, Volume};
 use glam::DVec3;
-use roxmltree::Document;
-use std::io::{BufReader, Cursor, Read, Seek, SeekFrom};
+use std::io::{BufReader, Cursor, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 use tiff::decoder::ifd::Value;
-use tiff::decoder::{Decoder, DecodingResult, Limits};
+use tiff::decoder::{ChunkType, Decoder, DecodingResult, Limits};
 use tiff::tags::Tag;
 use tiff::{ColorType, TiffError, TiffResult};
-
-/// What one page may take beyond twice the file's size.
-const TRUSTED: u64 = 256 << 20;
 
 /// A text longer than this is not read for a spacing.
 const TEXT_LIMIT: usize = 16 << 20;
@@ -53,16 +51,21 @@ fn unzip(path: &Path) -> Result<Vec<u8>> {
     let [name] = &names[..] else {
         return Err(Error::not_supported(path, format!("holds {} TIFF files; it must hold one", names.len())));
     };
-    let mut entry = archive.by_name(name).map_err(broken)?;
-    let promised = entry.size();
-    let mut bytes = Vec::new();
-    // Memory grows with what is there, not with what is promised. At its end the checksum is compared.
-    let found = entry.by_ref().take(promised.saturating_add(1)).read_to_end(&mut bytes);
-    match found {
-        Ok(n) if n as u64 == promised => Ok(bytes),
-        Ok(n) => Err(Error::invalid(path, format!("`{name}`: {promised} bytes promised, {n} found"))),
-        Err(e) => Err(Error::invalid(path, format!("`{name}` is cut short or damaged: {e}"))),
-    }
+    let mut unpack = |out: &mut dyn Write| {
+        let mut entry = archive.by_name(name).map_err(broken)?;
+        let promised = entry.size();
+        // At its end the checksum is compared.
+        match std::io::copy(&mut entry.by_ref().take(promised.saturating_add(1)), out) {
+            Ok(n) if n == promised => Ok(promised),
+            Ok(n) => Err(Error::invalid(path, format!("`{name}`: {promised} bytes promised, {n} found"))),
+            Err(e) => Err(Error::invalid(path, format!("`{name}` is cut short or damaged: {e}"))),
+        }
+    };
+    // Nothing is kept before it is known that all of it is there.
+    let promised = unpack(&mut std::io::sink())?;
+    let mut bytes = Vec::with_capacity(usize::try_from(promised).unwrap_or(usize::MAX));
+    unpack(&mut bytes)?;
+    Ok(bytes)
 }
 
 /// Samples of the pages read so far, as native bytes.
@@ -76,26 +79,56 @@ struct Pages {
 fn decode<R: Read + Seek>(mut reader: R, path: &Path) -> Result<Volume> {
     let io = |e| Error::io(path, e);
     let length = reader.seek(SeekFrom::End(0)).map_err(io)?;
+    if let Some((tag, count)) = directories::excessive(&mut reader, files::trusted(length)) {
+        let message = format!("tag {tag} promises {count} values, but the file has {length} bytes; it is damaged");
+        return Err(Error::invalid(path, message));
+    }
     reader.rewind().map_err(io)?;
+    let trusted = usize::try_from(files::trusted(length)).unwrap_or(usize::MAX);
     let mut limits = Limits::default();
-    // No page is believed to be much larger than the file.
-    limits.decoding_buffer_size = usize::try_from(length.saturating_mul(2).max(TRUSTED)).unwrap_or(usize::MAX);
-    limits.intermediate_buffer_size = limits.decoding_buffer_size;
+    limits.decoding_buffer_size = trusted;
+    limits.intermediate_buffer_size = trusted;
     limits.ifd_value_size = TEXT_LIMIT;
 
     let mut page = 0;
     let decoded = (|| -> TiffResult<_> {
-        let mut decoder = Decoder::new(&mut reader)?.with_limits(limits);
+        let mut decoder = Decoder::new(&mut reader)?.with_limits(limits.clone());
         let place = Place::of(&mut decoder);
         let start = decoder.find_tag_unsigned_vec::<u64>(Tag::StripOffsets)?.and_then(|o| o.first().copied());
         let order = decoder.byte_order();
         let mut pages: Option<Pages> = None;
+        let mut stored = 0;
         loop {
             let (color, size) = (decoder.colortype()?, decoder.dimensions()?);
             if !matches!(color, ColorType::Gray(bits) if bits >= 8) {
-                return Ok(Err(format!("page {page} holds {color:?} samples; convert it to grey of 8 bits or more")));
+                let message = format!("page {page} holds {color:?} samples; convert it to grey of 8 bits or more");
+                return Ok(Err(Error::not_supported(path, message)));
+            }
+            // Pages that share their bytes would grow without end.
+            let of_page = stored_bytes(&mut decoder)?;
+            stored = of_page.saturating_add(stored);
+            let held = pages.as_ref().map_or(0, |p| p.bytes.len());
+            let wanted = decoder.image_buffer_layout()?.len;
+            let plain = decoder.find_tag_unsigned::<u16>(Tag::Compression)?.unwrap_or(1) == 1;
+            if stored > length || (plain && of_page < wanted as u64) {
+                return Ok(Err(Error::invalid(
+                    path,
+                    format!(
+                        "page {page} has {wanted} bytes of samples and promises {of_page} stored ones, with the pages before                          it {stored}, but the file has {length}; it is cut short or damaged"
+                    ),
+                )));
+            }
+            if wanted > trusted - held.min(trusted) {
+                // Unpacked once without keeping it.
+                for chunk in 0..chunks(&mut decoder)? {
+                    decoder.read_chunk(chunk)?;
+                }
+                limits.decoding_buffer_size = wanted.max(trusted);
+                decoder = decoder.with_limits(limits.clone());
             }
             let (element, bytes) = page_bytes(decoder.read_image()?);
+            limits.decoding_buffer_size = trusted;
+            decoder = decoder.with_limits(limits.clone());
             match &mut pages {
                 None => pages = Some(Pages { element, size, bytes, count: 1 }),
                 Some(p) if (p.element, p.size) == (element, size) => {
@@ -104,11 +137,12 @@ fn decode<R: Read + Seek>(mut reader: R, path: &Path) -> Result<Volume> {
                 }
                 Some(p) => {
                     let ((w, h), (nw, nh), kind) = (p.size, size, (p.element.name(), element.name()));
-                    return Ok(Err(format!(
+                    let message = format!(
                         "page {page} is {nw}×{nh} of {}, page 0 {w}×{h} of {}; the pages of a volume are alike (leave \
                          thumbnails out)",
                         kind.1, kind.0
-                    )));
+                    );
+                    return Ok(Err(Error::not_supported(path, message)));
                 }
             }
             if !decoder.more_images() {
@@ -121,7 +155,7 @@ fn decode<R: Read + Seek>(mut reader: R, path: &Path) -> Result<Volume> {
     })();
     let (mut pages, place, start, order) = match decoded {
         Ok(Ok(all)) => all,
-        Ok(Err(message)) => return Err(Error::not_supported(path, message)),
+        Ok(Err(error)) => return Err(error),
         // What the system refused is named as such; a file that ends early is not.
         Err(TiffError::IoError(e)) if e.kind() != std::io::ErrorKind::UnexpectedEof => return Err(io(e)),
         Err(TiffError::IoError(_)) => return Err(Error::invalid(path, format!("page {page}: the file is cut short"))),
@@ -158,6 +192,24 @@ fn decode<R: Read + Seek>(mut reader: R, path: &Path) -> Result<Volume> {
     let dims = [width as usize, height as usize, pages.count];
     let lattice = Lattice::aligned(dims, DVec3::ZERO, place.spacing).map_err(|e| e.in_file(path))?;
     Volume::new(path.display().to_string(), lattice, Samples::from_vec(pages.bytes, element, endian))
+}
+
+/// Bytes that the strips or tiles of a page take in the file.
+fn stored_bytes<R: Read + Seek>(decoder: &mut Decoder<R>) -> TiffResult<u64> {
+    let tag = match decoder.get_chunk_type() {
+        ChunkType::Strip => Tag::StripByteCounts,
+        ChunkType::Tile => Tag::TileByteCounts,
+    };
+    let counts = decoder.find_tag_unsigned_vec::<u64>(tag)?.unwrap_or_default();
+    Ok(counts.into_iter().fold(0, u64::saturating_add))
+}
+
+/// Strips or tiles of a page.
+fn chunks<R: Read + Seek>(decoder: &mut Decoder<R>) -> TiffResult<u32> {
+    match decoder.get_chunk_type() {
+        ChunkType::Strip => decoder.strip_count(),
+        ChunkType::Tile => decoder.tile_count(),
+    }
 }
 
 /// A decoded page as native bytes.
@@ -220,7 +272,7 @@ impl Place {
     }
 
     fn ome(&mut self, text: &str) {
-        let Ok(document) = Document::parse(text.trim_end_matches('\0')) else { return };
+        let Ok(document) = files::xml(text.trim_end_matches('\0')) else { return };
         let Some(pixels) = document.descendants().find(|n| n.tag_name().name() == "Pixels") else { return };
         let step = |key: &str| {
             let step = pixels.attribute(key).and_then(|v| v.parse::<f64>().ok());

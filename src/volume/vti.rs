@@ -16,7 +16,7 @@ use crate::volume::plane::Plane;
 use crate::volume::{ElementType, Lattice, Samples, ascii};
 use codec::Encoding;
 use glam::{DMat3, DVec3};
-use roxmltree::{Document, Node};
+use roxmltree::Node;
 use std::path::Path;
 
 /// A named array of a file. Sample t of component c is element `t · components + c`.
@@ -141,7 +141,7 @@ impl Arrays {
     /// arrays are left unread.
     fn parse<T>(bytes: &[u8], place: impl FnOnce(Placement) -> Result<(T, usize)>) -> Result<(T, Self)> {
         let (text, appended) = split_appended(bytes)?;
-        let document = Document::parse(&text).map_err(|e| Error::Invalid(format!("is no well-formed XML: {e}")))?;
+        let document = files::xml(&text).map_err(|e| Error::Invalid(format!("is no well-formed XML: {e}")))?;
         let root = document.root_element();
         if root.tag_name().name() != "VTKFile" || root.attribute("type") != Some("ImageData") {
             return Err(Error::NotSupported(format!(

@@ -1,0 +1,70 @@
+//! `[volume]` in time: `file` as a pattern, or `files`.
+
+use super::{RawOptions, SceneOptions, VolumeSource, Volumes, parse};
+use crate::error::{Error, Result};
+use crate::series::Series;
+use crate::volume::Volume;
+use std::path::Path;
+
+/// The series of volumes that `input` is, if it is one.
+///
+/// # Errors
+/// As [`super::load`]; `Invalid` also if its frames do not share a lattice.
+pub fn load_series(input: &Path, options: &SceneOptions) -> Result<Option<Series>> {
+    let (source, file, folder) = parse(input)?;
+    let Volumes::One(single) = &file.volume else { return Ok(None) };
+    let blame = |e: Error| source.as_ref().map_or_else(|| e.to_string(), |s| s.blame("file", &e).to_string());
+    let series = single.series(&folder).map_err(|e| Error::Invalid(blame(e)))?;
+    if let Some(series) = &series {
+        series.check(|path| read_volume(path, single, &options.raw))?;
+    }
+    Ok(series)
+}
+
+impl VolumeSource {
+    /// The key that says where the volume comes from.
+    pub(super) fn key(&self) -> &'static str {
+        match self {
+            VolumeSource { files: Some(_), .. } => "files",
+            VolumeSource { file: Some(_), .. } => "file",
+            _ => "generator",
+        }
+    }
+
+    pub(super) fn series(&self, folder: &Path) -> Result<Option<Series>> {
+        let times = self.times.clone();
+        let series = match (&self.files, &self.file) {
+            (Some(_), Some(_)) => return Err(Error::Invalid("[volume] needs either file or files".into())),
+            (Some(files), None) => Some(Series::new(files.iter().map(|f| folder.join(f)).collect(), times)?),
+            (None, Some(file)) => Series::find(&folder.join(file), times)?,
+            (None, None) => None,
+        };
+        match &self.times {
+            Some(_) if series.is_none() => Err(Error::Invalid("times are for a series of files".into())),
+            _ => Ok(series),
+        }
+    }
+}
+
+/// The volume of `series` that `time` chooses.
+pub(super) fn moment(
+    series: &Series,
+    time: Option<f64>,
+    input: &Path,
+    read: impl Fn(&Path) -> Result<Volume>,
+) -> Result<Volume> {
+    let Some(time) = time else {
+        let n = series.times().len();
+        return Err(Error::invalid(input, format!("is a series of {n} volumes; choose a moment with --time")));
+    };
+    series.at(time, read)
+}
+
+/// Reads a volume file as the source and flags say.
+pub(super) fn read_volume(path: &Path, source: &VolumeSource, raw: &RawOptions) -> Result<Volume> {
+    let layout = if raw.given() { Some(raw) } else { source.raw.as_ref() };
+    match layout {
+        Some(layout) => layout.layout(path)?.read(path),
+        None => Volume::open(path),
+    }
+}

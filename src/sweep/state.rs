@@ -1,0 +1,235 @@
+//! Where a sweep stands between two passes, and the same as bytes for a checkpoint.
+
+use super::flats::Flats;
+use super::grid::Planes;
+use super::monitor::Monitor;
+use super::totals::Totals;
+use super::{Replicate, SweepCounts};
+use crate::flattened::Side;
+use crate::scene::Scene;
+
+/// What the finished replicates of a sweep gave.
+pub(super) struct State {
+    /// Replicates that are finished.
+    pub done: usize,
+    /// Light of the nodes.
+    pub total: Totals,
+    /// Sums of the flats' reflected radiance.
+    pub flats: Vec<Option<Vec<f32>>>,
+    /// As in [`super::SweepResult`].
+    pub bounces: usize,
+    pub residual: f64,
+    pub counts: SweepCounts,
+}
+
+/// The passes of a replicate that is not finished. The flats hold the rest of it: their direct light and their radiance.
+pub(super) struct Passes {
+    pub light: Replicate,
+    pub monitor: Monitor,
+    /// Full passes that `light.indirect` is the mean of.
+    pub averaged: usize,
+    /// Passes behind us.
+    pub bounce: usize,
+    /// What stands for the bounces that are left, per channel.
+    pub scale: [f32; 3],
+}
+
+impl State {
+    pub(super) fn new(stored: &[Side], nodes: usize, replicates: usize) -> Self {
+        Self {
+            done: 0,
+            total: Totals::new(stored, nodes, replicates),
+            flats: Vec::new(),
+            bounces: 0,
+            residual: 0.0,
+            counts: SweepCounts::default(),
+        }
+    }
+
+    /// Adds a replicate and what it left on the flats.
+    pub(super) fn add(&mut self, replicate: &Replicate, flats: &Flats, scene: &Scene) {
+        self.total.add(replicate, scene);
+        let radiance = || flats.textures.iter().map(|t| t.as_ref().map(|t| &t.radiance));
+        if self.done == 0 {
+            self.flats = radiance().map(Option::<&Vec<f32>>::cloned).collect();
+        } else {
+            for (sum, new) in self.flats.iter_mut().zip(radiance()) {
+                if let (Some(sum), Some(new)) = (sum, new) {
+                    sum.iter_mut().zip(new).for_each(|(s, x)| *s += x);
+                }
+            }
+        }
+        self.done += 1;
+    }
+
+    /// Takes note of how far a replicate came.
+    pub(super) fn see(&mut self, passes: &Passes) {
+        self.bounces = self.bounces.max(passes.bounce);
+        self.residual = passes.monitor.missing(0).unwrap_or(f64::NAN).max(self.residual);
+    }
+
+    /// Everything as bytes, with the passes of a replicate that is under way.
+    pub(super) fn bytes(&self, passes: Option<(&Passes, &Flats)>) -> Vec<u8> {
+        let numbers = |planes: &[Planes]| planes.iter().flatten().map(Vec::len).sum::<usize>();
+        let total = numbers(&self.total.direct) + numbers(&self.total.indirect);
+        let spread = self.total.spread.iter().map(|s| 2 * s.len()).sum::<usize>();
+        let under_way = passes.map_or(0, |(p, _)| numbers(&p.light.direct) + numbers(&p.light.indirect));
+        // The flats are small beside it.
+        let mut out = Writer { bytes: Vec::with_capacity(4 * (total + spread + under_way) + (1 << 16)) };
+        out.count(self.done);
+        out.count(self.bounces);
+        out.real(self.residual);
+        let c = self.counts;
+        for n in [c.gather_rays, c.shadow_rays, c.families, c.valid, c.masked] {
+            out.bytes.extend(n.to_le_bytes());
+        }
+        if self.done > 0 {
+            out.planes(&self.total.direct);
+            out.planes(&self.total.indirect);
+            self.total.spread.iter().for_each(|s| out.numbers(s.as_flattened()));
+            self.flats.iter().flatten().for_each(|f| out.numbers(f));
+        }
+        out.count(usize::from(passes.is_some()));
+        if let Some((p, flats)) = passes {
+            out.count(p.bounce);
+            out.count(p.averaged);
+            out.numbers(&p.scale);
+            out.count(p.monitor.since.unsigned_abs() as usize);
+            out.count(p.monitor.means.len());
+            let means = p.monitor.means.iter().flatten();
+            means.chain(&p.monitor.ratio).chain(&p.monitor.tail).for_each(|&x| out.real(x));
+            out.planes(&p.light.direct);
+            out.planes(&p.light.indirect);
+            for t in flats.textures.iter().flatten() {
+                out.numbers(&t.direct);
+                out.numbers(&t.radiance);
+            }
+        }
+        out.bytes
+    }
+
+    /// Takes the state back from [`State::bytes`]; the passes of a replicate of `sides` that was under way are returned, and
+    /// the flats take what belongs to them. Nothing is changed if the bytes do not fit.
+    pub(super) fn restore(&mut self, bytes: &[u8], sides: usize, flats: &mut Flats) -> Option<Passes> {
+        let (state, passes) = self.parse(bytes, sides, flats)?;
+        let stored = std::mem::replace(&mut self.total.direct, state.total.direct);
+        debug_assert!(stored.is_empty(), "restored once, into a fresh state");
+        self.total.indirect = state.total.indirect;
+        self.total.spread = state.total.spread;
+        self.total.count = state.done as f32;
+        (self.done, self.flats) = (state.done, state.flats);
+        (self.bounces, self.residual, self.counts) = (state.bounces, state.residual, state.counts);
+        let (passes, light) = passes?;
+        for (texture, [direct, radiance]) in flats.textures.iter_mut().flatten().zip(light) {
+            (texture.direct, texture.radiance) = (direct, radiance);
+        }
+        Some(passes)
+    }
+
+    #[allow(clippy::type_complexity, reason = "a state, and passes with their flats")]
+    fn parse(&self, bytes: &[u8], sides: usize, flats: &Flats) -> Option<(Self, Option<(Passes, Vec<[Vec<f32>; 2]>)>)> {
+        let mut from = Reader { bytes };
+        let nodes = self.total.nodes();
+        let stored = self.total.sides();
+        let mut state = Self::new(stored, 0, 1);
+        state.done = from.count()?;
+        state.bounces = from.count()?;
+        state.residual = from.real()?;
+        let mut count = || from.count().map(|n| n as u64);
+        state.counts = SweepCounts {
+            gather_rays: count()?,
+            shadow_rays: count()?,
+            families: count()?,
+            valid: count()?,
+            masked: count()?,
+        };
+        state.total.spread.clone_from(&self.total.spread);
+        state.flats = flats.textures.iter().map(|_| None).collect();
+        if state.done > 0 {
+            state.total.direct = from.planes(stored.len(), nodes)?;
+            state.total.indirect = from.planes(stored.len(), nodes)?;
+            for spread in &mut state.total.spread {
+                let numbers = from.numbers(2 * nodes)?;
+                spread.iter_mut().zip(numbers.chunks_exact(2)).for_each(|(s, n)| *s = [n[0], n[1]]);
+            }
+            for (sum, texture) in state.flats.iter_mut().zip(&flats.textures) {
+                if let Some(t) = texture {
+                    *sum = Some(from.numbers(t.radiance.len())?);
+                }
+            }
+        }
+        let mut passes = None;
+        if from.count()? == 1 {
+            let (bounce, averaged) = (from.count()?, from.count()?);
+            let scale = from.numbers(3)?.try_into().ok()?;
+            let mut monitor = Monitor { since: i32::try_from(from.count()?).ok()?, ..Monitor::default() };
+            for _ in 0..from.count()? {
+                monitor.means.push(from.three()?);
+            }
+            (monitor.ratio, monitor.tail) = (from.three()?, from.three()?);
+            let light = Replicate { direct: from.planes(sides, nodes)?, indirect: from.planes(sides, nodes)? };
+            let mut textures = Vec::new();
+            for t in flats.textures.iter().flatten() {
+                textures.push([from.numbers(t.direct.len())?, from.numbers(t.radiance.len())?]);
+            }
+            passes = Some((Passes { light, monitor, averaged, bounce, scale }, textures));
+        }
+        from.bytes.is_empty().then_some((state, passes))
+    }
+}
+
+/// Numbers as little-endian bytes.
+struct Writer {
+    bytes: Vec<u8>,
+}
+
+impl Writer {
+    fn count(&mut self, n: usize) {
+        self.bytes.extend((n as u64).to_le_bytes());
+    }
+
+    fn real(&mut self, x: f64) {
+        self.bytes.extend(x.to_le_bytes());
+    }
+
+    fn numbers(&mut self, numbers: &[f32]) {
+        self.bytes.reserve(4 * numbers.len());
+        self.bytes.extend(numbers.iter().flat_map(|x| x.to_le_bytes()));
+    }
+
+    fn planes(&mut self, planes: &[Planes]) {
+        planes.iter().flatten().for_each(|p| self.numbers(p));
+    }
+}
+
+struct Reader<'a> {
+    bytes: &'a [u8],
+}
+
+impl Reader<'_> {
+    fn count(&mut self) -> Option<usize> {
+        let (head, rest) = self.bytes.split_first_chunk()?;
+        self.bytes = rest;
+        usize::try_from(u64::from_le_bytes(*head)).ok()
+    }
+
+    fn real(&mut self) -> Option<f64> {
+        let (head, rest) = self.bytes.split_first_chunk()?;
+        self.bytes = rest;
+        Some(f64::from_le_bytes(*head))
+    }
+
+    fn three(&mut self) -> Option<[f64; 3]> {
+        Some([self.real()?, self.real()?, self.real()?])
+    }
+
+    fn numbers(&mut self, n: usize) -> Option<Vec<f32>> {
+        let (head, rest) = self.bytes.split_at_checked(n.checked_mul(4)?)?;
+        self.bytes = rest;
+        Some(head.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect())
+    }
+
+    fn planes(&mut self, sides: usize, nodes: usize) -> Option<Vec<Planes>> {
+        (0..sides).map(|_| Some([self.numbers(nodes)?, self.numbers(nodes)?, self.numbers(nodes)?])).collect()
+    }
+}
