@@ -20,6 +20,7 @@ use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, masks};
 use crate::progress::Progress;
 use crate::scene::{Policy, Scene};
+use crate::sweep;
 use crate::volume::Lattice;
 use photon_engine::Job;
 use serde::Serialize;
@@ -203,16 +204,13 @@ pub fn bake_fields(
 /// Whether the engine can light the scene.
 ///
 /// # Errors
-/// `NotSupported` for several fields that light each other by the sweep engine.
+/// `NotSupported` as [`sweep::supported`].
 pub fn supported(scene: &Scene, settings: &BakeSettings) -> Result<()> {
-    if settings.engine == Engine::Sweep && scene.policy() == Policy::Joint && scene.fields() > 1 {
-        return Err(Error::NotSupported(
-            "engine = \"sweep\" lights one volume at a time; several that light each other need engine = \"photon\" (or \
-             policy = \"independent\")"
-                .into(),
-        ));
+    match (settings.engine, scene.policy()) {
+        (Engine::Photon, _) => Ok(()),
+        (Engine::Sweep, Policy::Joint) => sweep::supported(scene),
+        (Engine::Sweep, Policy::Independent) => (0..scene.fields()).try_for_each(|n| sweep::supported(&scene.lit(n))),
     }
-    Ok(())
 }
 
 /// Bakes with their reports from what an engine gave.

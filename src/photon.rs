@@ -371,7 +371,7 @@ fn emit(scene: &Scene, settings: &PhotonSettings, sources: &[Source], total: f64
             let diagonal = (lattice.axes() * lattice.far()).length();
             let power = share * field.gradient(origin.as_dvec3()).length() * diagonal;
             let (origin, departure) = match (companion, other) {
-                (Some(n), Some(c)) => (c.from_index(origin.as_dvec3()).as_vec3(), Departure::Companion(n as u8, side)),
+                (Some(n), Some(c)) => (c.to_local(origin.as_dvec3()).as_vec3(), Departure::Companion(n as u8, side)),
                 _ => (origin, Departure::Surface(side)),
             };
             Some(Flight {

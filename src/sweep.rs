@@ -132,12 +132,40 @@ const FULL_PASSES: usize = 2;
 /// Fewest directions of a coarse pass.
 const LEAST: usize = 32;
 
+/// Whether sweeps can light a scene.
+///
+/// # Errors
+/// `NotSupported` as [`sweep`].
+pub fn supported(scene: &Scene) -> Result<()> {
+    if scene.fields() > 1 {
+        return Err(Error::NotSupported(
+            "engine = \"sweep\" lights one volume at a time; several that light each other need engine = \"photon\" (or \
+             policy = \"independent\")"
+                .into(),
+        ));
+    }
+    let polygons = scene.polygons().len();
+    if polygons > MOST_POLYGONS {
+        return Err(Error::NotSupported(format!(
+            "{polygons} polygons: sweeps test each line against all, {MOST_POLYGONS} at most; use --engine photon"
+        )));
+    }
+    let inside = flats::inside(scene);
+    if let Some((_, p)) = inside.iter().zip(scene.polygons()).find(|(inside, p)| **inside && !p.opaque_back) {
+        return Err(Error::NotSupported(format!(
+            "polygon '{}' stands inside the volume, where sweeps cannot see it; use --engine photon",
+            p.name
+        )));
+    }
+    Ok(())
+}
+
 /// Lights every node of the lattice for every isovalue of the sweep. `tick` receives the fraction done (an estimate while
 /// bounces converge); returning false stops early with what there is.
 ///
 /// # Errors
-/// `NotSupported` if a polygon that is not a luminaire stands inside the volume, or if there are more than
-/// [`MOST_POLYGONS`]: that needs the photon engine.
+/// `NotSupported` for several fields that light each other, if a polygon that is not a luminaire stands inside the volume,
+/// or if there are more than [`MOST_POLYGONS`]: that needs the photon engine.
 pub fn sweep(scene: &Scene, settings: &SweepSettings, tick: &(dyn Fn(f64) -> bool + Sync)) -> Result<SweepResult> {
     sweep_resumable(scene, settings, Stage::UNSAVED, tick)
 }
@@ -153,19 +181,8 @@ pub fn sweep_resumable(
     saved: Stage,
     tick: &(dyn Fn(f64) -> bool + Sync),
 ) -> Result<SweepResult> {
-    let polygons = scene.polygons().len();
-    if polygons > MOST_POLYGONS {
-        return Err(Error::NotSupported(format!(
-            "{polygons} polygons: sweeps test each line against all, {MOST_POLYGONS} at most; use --engine photon"
-        )));
-    }
+    supported(scene)?;
     let inside = flats::inside(scene);
-    if let Some((_, p)) = inside.iter().zip(scene.polygons()).find(|(inside, p)| **inside && !p.opaque_back) {
-        return Err(Error::NotSupported(format!(
-            "polygon '{}' stands inside the volume, where sweeps cannot see it; use --engine photon",
-            p.name
-        )));
-    }
     let geometry = Geometry::new(&scene.field);
     let stored = scene.surface.stored_sides();
     let sides = swept_sides(scene);

@@ -41,7 +41,7 @@ pub(super) fn light(
     };
     let stage = progress.stage("sweep", STEPS as u64);
     let done = std::sync::atomic::AtomicU64::new(0);
-    let [saved, _] = stages(checkpoint, 0);
+    let [saved, _] = stages(checkpoint, 4 * number);
     let swept = sweep_resumable(scene, &settings.sweep(), saved, &|fraction| {
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 … 1000")]
         let now = (fraction * STEPS) as u64;

@@ -103,7 +103,7 @@ impl<'a> SurfaceTracer<'a> {
         }
         let mut meshes = vec![own];
         for (mut mesh, companion) in companions.into_iter().zip(scene.companions()) {
-            mesh.vertices.iter_mut().for_each(|v| *v = companion.from_index(*v));
+            mesh.vertices.iter_mut().for_each(|v| *v = companion.to_local(*v));
             if companion.flips() {
                 mesh.triangles.iter_mut().for_each(|t| t.swap(1, 2));
             }

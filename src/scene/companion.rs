@@ -67,7 +67,7 @@ impl Companion {
 
     /// The inverse of [`Companion::to_index`].
     #[inline]
-    pub fn from_index(&self, q: DVec3) -> DVec3 {
+    pub fn to_local(&self, q: DVec3) -> DVec3 {
         self.back * (q - self.forth.1)
     }
 
@@ -126,7 +126,7 @@ impl Companion {
 
     /// The corners of its Ω in the scene's local frame.
     pub fn corners(&self) -> [DVec3; 8] {
-        corners(self.member.field.lattice()).map(|p| self.from_index(p))
+        corners(self.member.field.lattice()).map(|p| self.to_local(p))
     }
 }
 

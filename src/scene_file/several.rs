@@ -6,7 +6,10 @@ use super::{
 };
 use crate::error::{Error, Result};
 use crate::field::{Field, Sweep};
-use crate::scene::{Member, Policy, Scene};
+use crate::flattened::MAX_POLYGONS;
+use crate::isosurface;
+use crate::polygon::Polygon;
+use crate::scene::{Boundary, Member, Policy, Scene, Surface};
 use crate::volume::{Lattice, Volume};
 use glam::{DMat3, DVec3};
 use serde::de::value::{MapAccessDeserializer, SeqAccessDeserializer};
@@ -85,6 +88,8 @@ pub struct VolumeEntry {
     pub scale: Option<f64>,
     /// Its range, which the shared parameter sweeps.
     pub isovalues: Option<[f64; 2]>,
+    /// Instead of a range, the isovalue at which it stands in every hyperplane.
+    pub held: Option<f64>,
     /// Diffuse reflectance.
     pub albedo: Option<Albedo>,
     /// Emitted radiance.
@@ -98,7 +103,8 @@ pub struct VolumeEntry {
 }
 
 impl VolumeEntry {
-    fn load(&self, file: &SceneFile, folder: &Path) -> Result<(Volume, Member)> {
+    /// The volume, where the table puts it.
+    fn volume(&self, folder: &Path) -> Result<Volume> {
         let source = VolumeSource {
             file: self.file.clone(),
             raw: self.raw.clone(),
@@ -116,12 +122,11 @@ impl VolumeEntry {
             let origin = self.origin.map_or(lattice.origin(), DVec3::from_array);
             volume.lattice = Lattice::new(lattice.dims(), origin, lattice.axes() * scale)?;
         }
-        let [lo, hi] = match self.isovalues.or(file.isovalues) {
-            Some(range) => range,
-            None => suggested(&volume)?,
-        };
-        let sweep = Sweep::new(lo, hi)?;
-        let field = Field::new(&volume, sweep)?;
+        Ok(volume)
+    }
+
+    /// What the table says about the surface, `[surface]` in its gaps.
+    fn surface(&self, file: &SceneFile, sweep: Sweep) -> Result<(Surface, Boundary)> {
         let own = SurfaceOptions {
             albedo: self.albedo.clone(),
             emission: self.emission,
@@ -129,8 +134,58 @@ impl VolumeEntry {
             sides: self.sides,
             boundary: self.boundary,
         };
-        let (surface, boundary) = surface(&file.surface, &own, sweep)?;
-        Ok((volume, Member { name: self.name.clone(), field: field.into(), surface, boundary }))
+        surface(&file.surface, &own, sweep)
+    }
+
+    /// A field that takes part in the sweep.
+    fn member(&self, volume: &Volume, file: &SceneFile) -> Result<Member> {
+        let [lo, hi] = match self.isovalues.or(file.isovalues) {
+            Some(range) => range,
+            None => suggested(&volume)?,
+        };
+        let sweep = Sweep::new(lo, hi)?;
+        let field = Field::new(&volume, sweep)?;
+        let (surface, boundary) = self.surface(file, sweep)?;
+        Ok(Member { name: self.name.clone(), field: field.into(), surface, boundary })
+    }
+
+    /// The isosurface of a volume that is held at `isovalue`, as triangles with two faces that stand in every hyperplane.
+    #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
+    fn standing(&self, isovalue: f64, volume: &Volume, file: &SceneFile) -> Result<Vec<Polygon>> {
+        if self.isovalues.is_some() {
+            return Err(Error::Invalid("held and isovalues exclude each other".into()));
+        }
+        let Some((lo, hi)) = volume.range().filter(|(lo, hi)| (*lo..=*hi).contains(&isovalue) && lo < hi) else {
+            return Err(Error::Invalid(format!("held = {isovalue}: the volume has no surface there")));
+        };
+        let sweep = Sweep::new(lo, hi)?;
+        let field = Field::new(volume, sweep)?;
+        let (surface, _) = self.surface(file, sweep)?;
+        if surface.emission != DVec3::ZERO {
+            return Err(Error::NotSupported(
+                "held: a surface that stands still cannot emit light; use a luminaire".into(),
+            ));
+        }
+        let lattice = field.lattice();
+        let mesh = isosurface::extract(lattice.dims(), field.samples(), sweep.isovalue(isovalue))?;
+        let most = MAX_POLYGONS as usize / 2;
+        if mesh.triangles.len() > most {
+            return Err(Error::NotSupported(format!(
+                "held = {isovalue}: {} triangles, {most} at most; hold a coarser copy of the volume",
+                mesh.triangles.len()
+            )));
+        }
+        let albedo = surface.albedo.at(sweep.to_unit(isovalue));
+        let world: Vec<DVec3> = mesh.vertices.iter().map(|&p| lattice.to_world(p)).collect();
+        let mut polygons = Vec::new();
+        for (n, t) in mesh.triangles.iter().enumerate() {
+            let corners = t.map(|v| world[v as usize]).to_vec();
+            // Triangles without an area show nothing.
+            if let Ok(p) = Polygon::new(&format!("{}_{n}", self.name), corners, albedo, DVec3::ZERO) {
+                polygons.extend(p.both_faces());
+            }
+        }
+        Ok(polygons)
     }
 }
 
@@ -154,20 +209,30 @@ pub(super) fn load(entries: &[VolumeEntry], file: &SceneFile, input: &Path, opti
             format!("{flag}: the scene has several volumes; set it in their [[volume]] tables"),
         ));
     }
-    let named = |(n, entry): (usize, &VolumeEntry)| {
-        let name = if entry.name.is_empty() { format!("{}", n + 1) } else { format!("'{}'", entry.name) };
-        entry.load(file, folder).map_err(|e| Error::invalid(input, format!("volume {name}: {e}")))
-    };
-    let (volumes, members): (Vec<Volume>, Vec<Member>) =
-        entries.iter().enumerate().map(named).collect::<Result<Vec<_>>>()?.into_iter().unzip();
+    let (mut volumes, mut members, mut standing, mut lattices) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    for (n, entry) in entries.iter().enumerate() {
+        let named = |e: Error| {
+            let name = if entry.name.is_empty() { format!("{}", n + 1) } else { format!("'{}'", entry.name) };
+            Error::invalid(input, format!("volume {name}: {e}"))
+        };
+        let volume = entry.volume(folder).map_err(named)?;
+        lattices.push(volume.lattice.clone());
+        if let Some(isovalue) = entry.held {
+            standing.extend(entry.standing(isovalue, &volume, file).map_err(named)?);
+        } else {
+            members.push(entry.member(&volume, file).map_err(named)?);
+            volumes.push(volume);
+        }
+    }
     let mut volumes = volumes.into_iter();
     let Some(volume) = volumes.next() else {
-        return Err(Error::invalid(input, "volume: there is none"));
+        return Err(Error::invalid(input, "volume: there is none that takes part in the sweep; give one isovalues"));
     };
-    let around = enclosing(&members).map_err(|e| e.in_file(input))?;
+    let around = enclosing(members[0].field.lattice(), &lattices).map_err(|e| e.in_file(input))?;
     let mut polygons = surroundings(&file.surroundings, &options.surroundings, folder, &around)
         .map_err(|e| Error::invalid(input, format!("box: {e}")))?;
     polygons.extend(context(&file.context, folder).map_err(|e| Error::invalid(input, format!("[[context]]: {e}")))?);
+    polygons.extend(standing);
     let policy = match file.policy {
         Some(PolicyName::Independent) => Policy::Independent,
         Some(PolicyName::Joint) | None => Policy::Joint,
@@ -176,11 +241,10 @@ pub(super) fn load(entries: &[VolumeEntry], file: &SceneFile, input: &Path, opti
     Ok(Loaded { volume, companions: volumes.collect(), scene, bake: file.bake.clone() })
 }
 
-/// A lattice along the axes of the first field whose Ω holds those of all; the first's own if that does.
-fn enclosing(members: &[Member]) -> Result<Lattice> {
-    let first = members[0].field.lattice();
+/// A lattice along the axes of the first whose Ω holds those of all; the first itself if that does.
+fn enclosing(first: &Lattice, all: &[Lattice]) -> Result<Lattice> {
     let (mut lo, mut hi) = (DVec3::ZERO, first.far());
-    for lattice in members.iter().map(|m| m.field.lattice()) {
+    for lattice in all {
         for n in 0..8 {
             let corner = DVec3::new((n & 1) as f64, (n >> 1 & 1) as f64, (n >> 2) as f64) * lattice.far();
             let p = first.to_index(lattice.to_world(corner));
@@ -258,5 +322,25 @@ mod tests {
         let options = SceneOptions { isovalues: Some(vec![1.0, 2.0]), ..SceneOptions::default() };
         let e = load_text(TWO, &options).err().unwrap().to_string();
         assert!(e.contains("--isovalues") && e.contains("[[volume]]"), "{e}");
+    }
+
+    /// The ball of radius 0.15 about (0.65, 0.65, 0.95) as triangles in every hyperplane: area, two faces, colour.
+    #[test]
+    fn a_held_volume_stands_still() {
+        let held = |isovalue: &str| {
+            TWO.replace("isovalues = [0.01, 0.2]", &format!("held = {isovalue}")).replace("size = 7", "size = 17")
+        };
+        let scene = load_text(&held("0.09"), &SceneOptions::default()).unwrap().scene;
+        assert_eq!((scene.fields(), scene.name.as_str()), (1, "a"));
+        let of = |name: &'static str| scene.polygons().iter().filter(move |p| p.name.starts_with(name));
+        let area: f64 = of("b_").map(Polygon::area).sum();
+        let exact = 2.0 * 4.0 * std::f64::consts::PI * 0.15f64.powi(2);
+        assert!((area / exact - 1.0).abs() < 0.02, "{area} {exact}");
+        let centre = DVec3::new(0.75, 0.75, 1.05);
+        assert!(of("b_").all(|p| p.vertices().iter().all(|v| ((*v - centre).length() - 0.15).abs() < 2e-3)));
+        assert!(of("b_").all(|p| (p.albedo - DVec3::new(0.9, 0.1, 0.1)).length() < 1e-12));
+        assert!(error_of(&held("3")).contains("volume 'b': held = 3"));
+        assert!(error_of(&held("0.09\nemission = 1")).contains("emit"));
+        assert!(error_of(&held("0.09\nisovalues = [0, 1]")).contains("exclude"));
     }
 }

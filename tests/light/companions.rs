@@ -3,12 +3,17 @@
 use crate::support::*;
 use glam::{DMat3, DVec3};
 use isolume::bake::{Bake, BakeSettings, bake_fields};
+use isolume::checkpoint;
 use isolume::embree::{Device, GraphTracer, SurfaceTracer};
 use isolume::field::{Field, Sweep};
 use isolume::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target};
 use isolume::mask::Mask;
+use isolume::photon::trace_photons;
+use isolume::photon_map::EstimateSettings;
 use isolume::polygon::Polygon;
 use isolume::progress::Progress;
+use isolume::radiance::{Indirect, sample_radiance};
+use isolume::radiance_cache::{CacheSettings, RadianceCache};
 use isolume::reference::{Integrator, ReferenceSettings, reference};
 use isolume::rng::{Rng, Stage};
 use isolume::scene::{Boundary, Member, Policy, Scene, Surface, cornell_box};
@@ -334,14 +339,16 @@ fn an_integrating_sphere_of_one_field_around_a_source_of_another() {
         ],
         Vec::new(),
     );
-    // A step of the cavity's lattice is a quarter of the sweep, over which its light changes by a third.
-    let mut families = Family::new("sphere in sphere", 0.02);
-    let mut moments = vec![Moments::default(); 8];
+    let mut families = Family::new("sphere in sphere", 0.01);
+    let mut moments = [Moments::default(); 8];
     for seed in 1..=3 {
         let bakes = run_fields(&scene, &BakeSettings { gather_rays: 64, ..quick(seed) });
         for (k, bake) in bakes.iter().enumerate() {
             let mut sums = [(0.0, 0.0); 4];
-            for (_, _, s, radiance, _) in valid(bake, &scene.seen_from(k)) {
+            // E grows with s; at the sweep's ends photons are found on one side only, which costs 2 % on so few cells.
+            for (_, _, s, radiance, _) in
+                valid(bake, &scene.seen_from(k)).into_iter().filter(|v| (0.12..0.88).contains(&v.2))
+            {
                 let r2 = 0.7 + s * 0.6 - 0.5 * shell_step * shell_step;
                 let a2 = 0.06 + s * 0.1 - 0.5 * ball_step * ball_step;
                 let view = a2 / r2;
@@ -398,17 +405,71 @@ fn cross_light_agrees_with_paths_between_two_meshes() {
         assert!(rms <= 2.0, "field {k}: {rms} %");
         assert!((bias / mean).abs().max_element() < 0.02, "field {k}: {:?}", bias / mean);
     }
-    // Each sees the other: alone, the red field has no white shadows and the white field no red light from below.
-    let alone = run_fields(
-        &Scene::with_members(scene.members(), Policy::Independent, scene.polygons().to_vec()).unwrap(),
-        &quick(1),
-    );
+    // Each sees the other: alone, the red field has no white shadows, and the white field no red light from below.
+    let alone = Scene::with_members(scene.members(), Policy::Independent, scene.polygons().to_vec()).unwrap();
+    let alone = run_fields(&alone, &quick(1));
+    let sum = |bake: &Bake, of: fn([f32; 3]) -> f32| -> f64 {
+        let grid = &bake.sides[0].1;
+        (0..grid.mask.len()).filter(|&o| grid.mask[o] == Mask::Valid).map(|o| f64::from(of(grid.radiance[o]))).sum()
+    };
+    let shadow = 1.0 - sum(&bakes[0], |c| c[0]) / sum(&alone[0], |c| c[0]);
+    let redness = |bake: &Bake| sum(bake, |c| c[0]) / sum(bake, |c| c[1]);
+    let reddened = redness(&bakes[1]) / redness(&alone[1]) - 1.0;
+    println!("white shadows take {:.1} % of red, red light reddens white by {:.1} %", 100.0 * shadow, 100.0 * reddened);
+    assert!(shadow > 0.03 && reddened > 0.01, "{shadow} {reddened}");
+}
+
+/// What final gather finds at the vertices themselves, without a grid in between, against path tracing of two meshes: cross
+/// light on nuclear pasta, whose surfaces run through each other. A folder with `pasta-proton.vti` and `pasta-neutron.vti`
+/// (`isolume generate pasta --species both -o pasta.vti`) in ISOLUME_PASTA; by hand.
+#[test]
+#[ignore = "needs simulated volumes and minutes"]
+fn pasta_at_its_vertices() {
+    let Ok(folder) = std::env::var("ISOLUME_PASTA") else { panic!("ISOLUME_PASTA must name a folder") };
+    let text = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/scenes/pasta-both.toml")).unwrap();
+    let path = std::path::Path::new(&folder).join("pasta-both.toml");
+    std::fs::write(&path, text).unwrap();
+    let scene = isolume::scene_file::load(&path, &Default::default()).unwrap().scene;
+    let (device, c) = (Device::new(2).unwrap(), 0.475);
+    let views = [0, 1].map(|n| scene.seen_from(n));
+    let tracers = [0, 1].map(|n| GraphTracer::new(&device, &views[n]).unwrap());
+    let photons = trace_photons(&views[0], &tracers[0], &emission(1 << 22, 1), &|_| true);
+    let settings = CacheSettings {
+        node_shadow_rays: 4,
+        flat_shadow_rays: 32,
+        flat_resolution: 64,
+        isovalue_resolution: 32,
+        seed: 1,
+    };
+    let (estimate, unsaved) = (EstimateSettings::default(), [checkpoint::Stage::UNSAVED; 2]);
+    let mut cache = RadianceCache::new(&views[0], &tracers[0], &photons, estimate, &settings, true, unsaved, &|_| true);
+    cache.fill(&views[1], &tracers[1], &photons, estimate, &settings, unsaved, &|_| true);
     for k in 0..2 {
-        let (a, b) = (&alone[k].sides[0].1, &bakes[k].sides[0].1);
-        let both = (0..a.mask.len()).filter(|&o| a.mask[o] == Mask::Valid);
-        let off: f64 = both.map(|o| f64::from((a.radiance[o][0] - b.radiance[o][0]).abs())).sum();
-        let sum: f64 = a.radiance.iter().map(|r| f64::from(r[0])).sum();
-        assert!(off > 0.02 * sum, "field {k}: {}", off / sum);
+        let seen = &views[k];
+        let mesh = SurfaceMesh::extract(seen, c, 1).unwrap();
+        let triangles = SurfaceTracer::new(&device, seen, c, 1).unwrap();
+        // Surfaces run into the luminaire, where paths are noisy.
+        let paths = [1, 2].map(|seed| {
+            let settings =
+                ReferenceSettings { samples: 2048, vertices: Some(3000), seed, ..ReferenceSettings::default() };
+            reference(seen, &triangles, &mesh, c, &settings, &|_| true)
+        });
+        let chosen: Vec<usize> = (0..mesh.local.len()).filter(|&v| paths[0].sampled[v]).collect();
+        let at: Vec<_> = chosen.iter().map(|&v| mesh.local[v].as_vec3()).collect();
+        let gather = Indirect::Gather(&cache, 256);
+        let side = seen.surface.outside;
+        let got = sample_radiance(seen, &tracers[k], &gather, &at, side, 128, 1, checkpoint::Stage::UNSAVED, &|_| true);
+        let mut moments = Moments::default();
+        for (&v, sample) in chosen.iter().zip(&got.samples) {
+            let Some(sample) = sample else { continue };
+            let shown = |x: DVec3| (x * scene.exposure()).clamp(DVec3::ZERO, DVec3::ONE);
+            let t = shown(sample.radiance.as_dvec3());
+            moments.push((t - shown(paths[0].radiance[v])).dot(t - shown(paths[1].radiance[v])));
+        }
+        let percent = |square: f64| 100.0 * square.max(0.0).sqrt();
+        let [lo, rms, hi] = [-1.96, 0.0, 1.96].map(|z| percent(moments.mean() + z * moments.std_error()));
+        println!("field {k}: {rms:.2} % RMS, 95 % confidence {lo:.2} … {hi:.2}");
+        assert!(lo <= 2.0);
     }
 }
 
