@@ -213,6 +213,11 @@ fn main() {
             ("isolume, 64 rays at most", &ours64),
         ],
     );
+    for most in [32, 64, 128] {
+        let rays = |(i, r)| direct_irradiance(&scene, &tracer, r, most, (0, Stage::Direct, i as u64)).rays;
+        let sum: u64 = receivers.par_iter().enumerate().map(rays).sum();
+        println!("  isolume traces {:.1} of {most} rays on average", sum as f64 / RECEIVERS as f64);
+    }
 
     let sky = |d: DVec3| if d.z > 0.0 { 1.0 } else { 0.2 };
     let gather = |r: &Receiver, u: [f64; 2]| {
