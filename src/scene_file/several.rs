@@ -141,10 +141,10 @@ impl VolumeEntry {
     fn member(&self, volume: &Volume, file: &SceneFile) -> Result<Member> {
         let [lo, hi] = match self.isovalues.or(file.isovalues) {
             Some(range) => range,
-            None => suggested(&volume)?,
+            None => suggested(volume)?,
         };
         let sweep = Sweep::new(lo, hi)?;
-        let field = Field::new(&volume, sweep)?;
+        let field = Field::new(volume, sweep)?;
         let (surface, boundary) = self.surface(file, sweep)?;
         Ok(Member { name: self.name.clone(), field: field.into(), surface, boundary })
     }
