@@ -1,9 +1,10 @@
 //! Gathered light smoothed over neighbouring grid points.
 //!
-//! Each point's gather is unbiased and noisy, and its neighbours' know nearly the same light: a linear function fitted to
-//! those around a point has a small part of the noise and, where light curves, a bias. How far to look is decided at each
-//! place by cross-validation: what half of the rays gives, smoothed, is compared with the other half at the points
-//! around, whose noise is independent; the width that predicts best wins, and "not at all" competes. \[Rousselle12\]
+//! Each point's gather is unbiased and noisy, and its neighbours' know nearly the same light. A linear function fitted to
+//! those around a point, and what that leaves fitted once more, has a small part of the noise and a bias of fourth order in
+//! the radius \[Tukey77\]. How far to trust it is decided at each place by cross-validation: what half of the rays gives,
+//! smoothed by a share λ, is compared with the other half at the points around, whose noise is independent; the λ that
+//! predicts best wins. \[Rousselle12\]
 
 use crate::direct::luminance;
 use crate::field::Field;
@@ -14,8 +15,8 @@ use crate::volume::Lattice;
 use glam::{DMat4, DVec3, DVec4, Vec3};
 use rayon::prelude::*;
 
-/// Radii, in the lattice's shortest spacing.
-const RADII: [f64; 2] = [1.5, 2.5];
+/// Radius of the fits, in the lattice's shortest spacing.
+const RADIUS: f64 = 2.5;
 /// Least cosine between the normals of points that share light.
 const CONE: f32 = 0.7;
 /// Prior weight of "no slope", as a share of what full coverage says.
@@ -26,8 +27,8 @@ const RIDGE: f64 = 0.05;
 pub struct Smoothed {
     /// Mean irradiance.
     pub mean: Vec3,
-    /// Σ of the squared weights: variance after over variance before, if the points around are as noisy.
-    pub gain: f32,
+    /// Variance of its luminance, from how far the halves are apart around.
+    pub variance: f32,
 }
 
 /// A neighbour's place relative to a point.
@@ -38,128 +39,126 @@ struct Tap {
     d2: f32,
 }
 
-/// What the points hold.
+/// Two independent estimates of one irradiance; NaN: none.
+pub type Halves = [Vec3; 2];
+
+/// Where the points stand.
 struct Points<'a> {
     lattice: &'a Lattice,
     taps: Vec<Tap>,
-    /// Both halves; NaN: nothing.
-    halves: &'a [[Vec3; 2]],
-    normals: Vec<Vec3>,
-    isovalues: Vec<f32>,
+    /// Lower or higher unit normal, 0 where there is nothing; isovalue.
+    places: Vec<(Vec3, f32)>,
     /// Largest isovalue difference.
     tau: f32,
 }
 
-/// Smooths the irradiance of points whose two `halves` are given, NaN for those that hold nothing. `tau`: largest
-/// isovalue difference of points that share light, in units of the sweep. The same bits on any number of threads.
-pub fn smooth(scene: &Scene, lattice: &Lattice, side: Side, tau: f64, halves: &[[Vec3; 2]]) -> Vec<Smoothed> {
+/// Smooths the irradiance of points whose two `halves` are given. `tau`: largest isovalue difference of points that share
+/// light, in units of the sweep. The same bits on any number of threads.
+pub fn smooth(scene: &Scene, lattice: &Lattice, side: Side, tau: f64, halves: &[Halves]) -> Vec<Smoothed> {
     let points = Points::new(scene, lattice, side, tau, halves);
-    let range = |f: &(dyn Fn(usize) -> [f32; 3] + Sync)| -> Vec<[f32; 3]> {
-        (0..halves.len()).into_par_iter().with_min_len(1024).map(f).collect()
-    };
-    // (prediction − other half)² at each point, without smoothing and for both radii.
-    let errors = range(&|o| {
-        let own = halves[o];
-        if own[0].is_nan() {
-            return [0.0; 3];
-        }
-        let error = |fit: [Vec3; 2]| {
-            let e = |a: Vec3, b: Vec3| luminance((a - b).as_dvec3()).powi(2) as f32;
-            0.5 * (e(fit[0], own[1]) + e(fit[1], own[0]))
-        };
-        [error(own), error(points.fit(o, RADII[0]).0), error(points.fit(o, RADII[1]).0)]
+    let once = points.each(|o| points.fit(o, |n| halves[n]));
+    let twice = points.each(|o| {
+        let rest = points.fit(o, |n| [0, 1].map(|h| halves[n][h] - once[n][h]));
+        [0, 1].map(|h| once[o][h] + rest[h])
     });
-    (0..halves.len())
-        .into_par_iter()
-        .with_min_len(1024)
-        .map(|o| {
-            let own = halves[o];
-            if own[0].is_nan() {
-                return Smoothed::default();
+    drop(once);
+    let light = |v: Vec3| luminance(v.as_dvec3()) as f32;
+    let blended = points.each(|o| {
+        // Σ (a + λ (ã − a) − b)² over the points around and both ways is least at −Σ (ã − a)(a − b) / Σ (ã − a)².
+        let (mut along, mut squares) = (0.0f32, 0.0f32);
+        points.around(o, |n, tap| {
+            for h in [0, 1] {
+                let change = light(twice[n][h] - halves[n][h]);
+                along += (1.0 - tap.d2) * change * light(halves[n][1 - h] - halves[n][h]);
+                squares += (1.0 - tap.d2) * change * change;
             }
-            let mut sums = [0.0f32; 3];
-            points.around(o, RADII[1], |n, tap, _| {
-                for (sum, e) in sums.iter_mut().zip(errors[n]) {
-                    *sum += (1.0 - tap.d2) * e;
-                }
-            });
-            let (fit, gain) = match (sums[1] < sums[0], sums[2] < sums[0].min(sums[1])) {
-                (_, true) => points.fit(o, RADII[1]),
-                (true, _) => points.fit(o, RADII[0]),
-                _ => (own, 1.0),
-            };
-            Smoothed { mean: 0.5 * (fit[0] + fit[1]), gain }
-        })
-        .collect()
+        });
+        let share = if squares > 0.0 { (along / squares).clamp(0.0, 1.0) } else { 0.0 };
+        [0, 1].map(|h| halves[o][h] + share * (twice[o][h] - halves[o][h]))
+    });
+    points.each(|o| {
+        let (mut sum, mut weight) = (0.0f32, 0.0f32);
+        points.around(o, |n, tap| {
+            let [a, b] = blended[n];
+            sum += (1.0 - tap.d2) * (0.5 * light(a - b)).powi(2);
+            weight += 1.0 - tap.d2;
+        });
+        Smoothed { mean: 0.5 * (blended[o][0] + blended[o][1]), variance: sum / weight }
+    })
 }
 
 impl<'a> Points<'a> {
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-    fn new(scene: &Scene, lattice: &'a Lattice, side: Side, tau: f64, halves: &'a [[Vec3; 2]]) -> Self {
+    fn new(scene: &Scene, lattice: &'a Lattice, side: Side, tau: f64, halves: &[Halves]) -> Self {
         let field: &Field = &scene.field;
         let axes = lattice.axes();
         let shortest = (0..3).map(|a| axes.col(a).length()).fold(f64::INFINITY, f64::min);
-        let largest = RADII[1] * shortest;
+        let radius = RADIUS * shortest;
         let inverse = axes.inverse();
-        let reach: [isize; 3] = std::array::from_fn(|a| (inverse.row(a).length() * largest).floor() as isize);
+        let reach: [isize; 3] = std::array::from_fn(|a| (inverse.row(a).length() * radius).floor() as isize);
         let mut taps = Vec::new();
         for z in -reach[2]..=reach[2] {
             for y in -reach[1]..=reach[1] {
                 for x in -reach[0]..=reach[0] {
-                    let d = axes * DVec3::new(x as f64, y as f64, z as f64) / largest;
+                    let d = axes * DVec3::new(x as f64, y as f64, z as f64) / radius;
                     if d.length_squared() < 1.0 {
                         taps.push(Tap { step: [x, y, z], d: d.as_vec3(), d2: d.length_squared() as f32 });
                     }
                 }
             }
         }
-        let (normals, isovalues) = (0..halves.len())
-            .into_par_iter()
-            .map(|o| {
-                if halves[o][0].is_nan() {
-                    return (Vec3::ZERO, 0.0);
-                }
-                let p = local_position(field, lattice, o);
-                (scene.normal(p, side).unwrap_or_default().as_vec3(), field.value(p) as f32)
-            })
-            .unzip();
-        Self { lattice, taps, halves, normals, isovalues, tau: tau as f32 }
+        let place = |o: usize| {
+            if halves[o][0].is_nan() {
+                return (Vec3::ZERO, 0.0);
+            }
+            let p = local_position(field, lattice, o);
+            (scene.normal(p, side).unwrap_or_default().as_vec3(), field.value(p) as f32)
+        };
+        let places = (0..halves.len()).into_par_iter().with_min_len(1024).map(place).collect();
+        Self { lattice, taps, places, tau: tau as f32 }
     }
 
-    /// Calls `visit(number, tap, (d/r)²)` for the points within `radius` that share the light of point `o`.
+    /// `f` of every point that holds light, nothing of the others.
+    fn each<T: Default + Send>(&self, f: impl Fn(usize) -> T + Sync) -> Vec<T> {
+        let of = |o: usize| if self.places[o].0 == Vec3::ZERO { T::default() } else { f(o) };
+        (0..self.places.len()).into_par_iter().with_min_len(1024).map(of).collect()
+    }
+
+    /// Calls `visit` for the points that share the light of point `o`, itself among them.
     #[inline]
-    fn around(&self, o: usize, radius: f64, mut visit: impl FnMut(usize, &Tap, f32)) {
+    fn around(&self, o: usize, mut visit: impl FnMut(usize, &Tap)) {
         let at = self.lattice.ijk(o).map(|i| i as isize);
         let dims = self.lattice.dims().map(|n| n as isize);
-        let scale = (RADII[1] / radius).powi(2) as f32;
-        let (normal, isovalue) = (self.normals[o], self.isovalues[o]);
-        for tap in self.taps.iter().filter(|t| t.d2 * scale < 1.0) {
+        let (normal, isovalue) = self.places[o];
+        for tap in &self.taps {
             let q: [isize; 3] = std::array::from_fn(|a| at[a] + tap.step[a]);
             if (0..3).any(|a| q[a] < 0 || q[a] >= dims[a]) {
                 continue;
             }
             let n = self.lattice.offset(q[0] as usize, q[1] as usize, q[2] as usize);
-            if !self.halves[n][0].is_nan()
-                && (self.isovalues[n] - isovalue).abs() <= self.tau
-                && self.normals[n].dot(normal) >= CONE
-            {
-                visit(n, tap, tap.d2 * scale);
+            let (other, c) = self.places[n];
+            if other.dot(normal) >= CONE && (c - isovalue).abs() <= self.tau {
+                visit(n, tap);
             }
         }
     }
 
-    /// Both halves at point `o` by a linear fit within `radius`, and Σ of its squared weights.
-    fn fit(&self, o: usize, radius: f64) -> ([Vec3; 2], f32) {
+    /// What a linear fit of `values` around point `o` says there.
+    fn fit(&self, o: usize, values: impl Fn(usize) -> Halves) -> Halves {
         let mut m = [0.0f32; 10];
-        self.around(o, radius, |_, tap, d2| {
-            let (w, d) = (1.0 - d2, tap.d);
+        // Σ K v (1, d) of either half.
+        let mut sums = [[Vec3::ZERO; 4]; 2];
+        self.around(o, |n, tap| {
+            let (w, d) = (1.0 - tap.d2, tap.d);
             let terms = [1.0, d.x, d.y, d.z, d.x * d.x, d.y * d.y, d.z * d.z, d.x * d.y, d.x * d.z, d.y * d.z];
             m.iter_mut().zip(terms).for_each(|(m, t)| *m += w * t);
+            for (sums, v) in sums.iter_mut().zip(values(n)) {
+                sums.iter_mut().zip(terms).for_each(|(s, t)| *s += w * t * v);
+            }
         });
         let m = m.map(f64::from);
-        let r = radius / RADII[1];
-        // ∫K d_x² / ∫K over the ball is r²/7 for Epanechnikov's kernel.
-        let ridge = RIDGE / 7.0 * r * r * m[0];
+        // ∫K d_x² / ∫K over the ball is 1/7 for Epanechnikov's kernel.
+        let ridge = RIDGE / 7.0 * m[0];
         let matrix = DMat4::from_cols(
             DVec4::new(m[0], m[1], m[2], m[3]),
             DVec4::new(m[1], m[4] + ridge, m[7], m[8]),
@@ -167,16 +166,7 @@ impl<'a> Points<'a> {
             DVec4::new(m[3], m[8], m[9], m[6] + ridge),
         );
         let g = matrix.inverse().x_axis.as_vec4();
-        let mut fit = [Vec3::ZERO; 2];
-        let mut gain = 0.0;
-        self.around(o, radius, |n, tap, d2| {
-            let w = (1.0 - d2) * (g.x + g.y * tap.d.x + g.z * tap.d.y + g.w * tap.d.z);
-            let [a, b] = self.halves[n];
-            fit[0] += w * a;
-            fit[1] += w * b;
-            gain += w * w;
-        });
-        (fit, gain)
+        sums.map(|[s, x, y, z]| g.x * s + g.y * x + g.z * y + g.w * z)
     }
 }
 

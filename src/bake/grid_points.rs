@@ -2,6 +2,7 @@
 //! fitted.
 
 use crate::brdf::reflected;
+use crate::direct::luminance;
 use crate::field::Field;
 use crate::fitted_grid::fit;
 use crate::flattened::Side;
@@ -97,7 +98,8 @@ impl<'a> GridPoints<'a> {
             let change = (smoothed[o].mean - 0.5 * (s.indirect[0] + s.indirect[1])).as_dvec3();
             let albedo = scene.surface.albedo.at(f64::from(scene.field.value(s.position.as_dvec3()) as f32));
             grid.radiance[o] = (s.radiance + reflected(albedo, change).as_vec3()).max(Vec3::ZERO).to_array();
-            let variance = s.variance - s.indirect_variance * (1.0 - smoothed[o].gain);
+            let scale = (luminance(albedo) / std::f64::consts::PI) as f32;
+            let variance = s.variance - s.indirect_variance + smoothed[o].variance * scale * scale;
             grid.std_error[o] = variance.max(0.0).sqrt();
         }
     }

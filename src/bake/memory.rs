@@ -90,8 +90,8 @@ impl MemoryEstimate {
                 let gather = settings.gather_rays > 0;
                 // Nodes of both sides, and the same in the checkpoint.
                 let nodes = if gather { 4 * 12 * voxels } else { 0 };
-                // Both halves, normal, isovalue, errors and result at each point.
-                let smoothing = if gather && settings.smoothing { points * (24 + 16 + 12 + 16) } else { 0 };
+                // Both halves, as gathered, fitted twice and blended; normal and isovalue.
+                let smoothing = if gather && settings.smoothing { points * (3 * 24 + 16) } else { 0 };
                 let map = if gather { 0 } else { (mapped * MAP) as u64 };
                 vec![
                     ("photons", base + photons * 9 / 8),
