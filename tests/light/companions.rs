@@ -419,6 +419,45 @@ fn cross_light_agrees_with_paths_between_two_meshes() {
     assert!(shadow > 0.03 && reddened > 0.01, "{shadow} {reddened}");
 }
 
+/// A volume held at an isovalue gives what it gives where it sweeps through that isovalue: in paths and in bakes.
+#[test]
+fn a_held_volume_lights_as_one_that_sweeps() {
+    let dir = tempfile::tempdir().unwrap();
+    let load = |range: &str| {
+        let path = dir.path().join("scene.toml");
+        let text = format!(
+            "[[volume]]\nname = \"a\"\ngenerator = \"bumps\"\nsize = 25\nisovalues = [3.6, 95]\n\
+             [[volume]]\nname = \"b\"\ngenerator = \"sphere\"\nsize = 13\norigin = [0.1, 0.25, 0.05]\nscale = 0.5\n{range}\n\
+             albedo = [0.9, 0.1, 0.1]\noutside = \"higher\"\n"
+        );
+        std::fs::write(&path, text).unwrap();
+        isolume::scene_file::load(&path, &Default::default()).unwrap().scene
+    };
+    let (held, sweeps) = (load("held = 0.1"), load("isovalues = [0.02, 0.18]"));
+    assert_eq!((held.fields(), sweeps.fields()), (1, 2));
+    let (device, c) = (Device::new(1).unwrap(), 0.5);
+    let mean = |scene: &Scene, seed: u64| {
+        let mesh = SurfaceMesh::extract(scene, c, 1).unwrap();
+        let tracer = SurfaceTracer::new(&device, scene, c, 1).unwrap();
+        let settings =
+            ReferenceSettings { samples: 128, vertices: Some(400), seed, batches: 8, ..ReferenceSettings::default() };
+        let paths = reference(scene, &tracer, &mesh, c, &settings, &|_| true);
+        let bake = run(scene, &quick(seed));
+        let (mut sum, mut variance, mut baked, mut n) = (0.0, 0.0, 0.0, 0.0);
+        for v in (0..mesh.local.len()).filter(|&v| paths.sampled[v]) {
+            sum += paths.radiance[v].x;
+            variance += paths.variance[v].x;
+            baked += bake.sides[0].1.interpolate(&bake.lattice, mesh.local[v]).x;
+            n += 1.0;
+        }
+        (sum / n, variance.sqrt() / n, baked / n)
+    };
+    let (a, b) = (mean(&held, 1), mean(&sweeps, 2));
+    println!("paths {:.5} ± {:.5} and {:.5} ± {:.5}, bakes {:.5} and {:.5}", a.0, a.1, b.0, b.1, a.2, b.2);
+    assert!((a.0 - b.0).abs() < 4.0 * a.1.hypot(b.1), "paths");
+    assert!((a.2 / b.2 - 1.0).abs() < 0.01, "bakes");
+}
+
 /// What final gather finds at the vertices themselves, without a grid in between, against path tracing of two meshes: cross
 /// light on nuclear pasta, whose surfaces run through each other. A folder with `pasta-proton.vti` and `pasta-neutron.vti`
 /// (`isolume generate pasta --species both -o pasta.vti`) in ISOLUME_PASTA; by hand.
