@@ -259,6 +259,10 @@ impl BakeSettings {
             Preset::Standard => (128, 32),
             Preset::Reference => (512, 128),
         };
+        let estimator = o.estimator.unwrap_or_default();
+        let gather_rays = o.gather_rays.unwrap_or(gather);
+        // What no gather averages needs more photons; bins make them cheap.
+        let per_estimate = if gather_rays == 0 && estimator == Estimator::Splat { 1000 } else { 64 };
         let settings = Self {
             preset,
             engine: o.engine.unwrap_or_default(),
@@ -266,8 +270,8 @@ impl BakeSettings {
             light_points: o.light_points.unwrap_or(light_points),
             photons: o.photons.unwrap_or(photons),
             bounces: o.bounces.unwrap_or(u16::MAX),
-            estimator: o.estimator.unwrap_or_default(),
-            photons_per_estimate: o.photons_per_estimate.unwrap_or(64),
+            estimator,
+            photons_per_estimate: o.photons_per_estimate.unwrap_or(per_estimate),
             tau: o.tau.unwrap_or(EstimateSettings::default().tau),
             samples: o.samples,
             samples_per_point: density,
@@ -278,7 +282,7 @@ impl BakeSettings {
                 StrategyName::Nodes
             }),
             shadow_rays: o.shadow_rays.unwrap_or(shadow),
-            gather_rays: o.gather_rays.unwrap_or(gather),
+            gather_rays,
             cache_shadow_rays: cache,
             smoothing: o.smoothing.unwrap_or(true),
             neighbours: o.neighbours.unwrap_or(8),
