@@ -184,6 +184,8 @@ fn an_extruded_field_looks_to_n_3_as_to_n_2() {
             photons: Some(if albedo > 0.6 { 1 << 24 } else { 1 << 21 }),
             shadow_rays: Some(64),
             gather_rays: Some(256),
+            // Each point is judged by its own noise.
+            smoothing: Some(false),
             wall_resolution: Some(64),
             ..BakeOptions::default()
         };
