@@ -66,7 +66,9 @@ impl MemoryEstimate {
             // Volume, field, the pyramid of min and max, and a mask.
             base += own_voxels * (element + 4) + own_voxels * 33 / 8 + own_points;
             samples += match (settings.strategy, settings.samples) {
-                (StrategyName::Nodes, _) => needed * own_points / own_voxels + own_filled * own_points / own_voxels,
+                (StrategyName::Nodes, _) => {
+                    needed * own_points / own_voxels + (STAND_INS as u64 - 1) * own_filled * own_points / own_voxels
+                }
                 (_, Some(n)) => n,
                 (_, None) => (needed as f64 * settings.samples_per_point) as u64,
             };
@@ -82,6 +84,8 @@ impl MemoryEstimate {
         let export = grids + flats + points * (4 + 13 * stored) + WRITER.min(points * (5 + 29 * stored) * 2);
         let sides = sweep::swept_sides(scene).len() as u64;
         let swept = SWEPT + sides * (SWEPT_SIDE + KEPT_SIDE) + 2 * stored * SUMMED_SIDE;
+        // Seven vectors of conjugate gradients and a mark; samples sorted by cell.
+        let fitting = points * (7 * 12 + 1 + 4) + STAND_INS as u64 * filled * (32 + 36);
         let stages = match settings.engine {
             Engine::Photon => {
                 let [landings, mapped] = landings(scene, settings, device)?;
@@ -91,7 +95,7 @@ impl MemoryEstimate {
                 // Nodes of both sides, and the same in the checkpoint.
                 let nodes = if gather { 4 * 12 * voxels } else { 0 };
                 // Both halves, as gathered, fitted twice and blended; normal and isovalue.
-                let smoothing = if gather && settings.smoothing { points * (3 * 24 + 16) } else { 0 };
+                let smoothing = if gather && settings.smoothing { points * (3 * 24 + 16) } else { 0 }.max(fitting);
                 let map = if gather { 0 } else { (mapped * MAP) as u64 };
                 vec![
                     ("photons", base + photons * 9 / 8),
@@ -102,7 +106,10 @@ impl MemoryEstimate {
             }
             Engine::Sweep => vec![
                 ("sweep", base + points * swept + flats * 4),
-                ("samples", base + flats + points * (12 * 4 + 16) + STAND_INS as u64 * filled * per_sample + grids),
+                (
+                    "samples",
+                    base + flats + points * (12 * 4 + 16) + STAND_INS as u64 * filled * per_sample + fitting + grids,
+                ),
                 ("export", base + export),
             ],
         };
