@@ -460,7 +460,8 @@ fn a_held_volume_lights_as_one_that_sweeps() {
 
 /// What final gather finds at the vertices themselves, without a grid in between, against path tracing of two meshes: cross
 /// light on nuclear pasta, whose surfaces run through each other. A folder with `pasta-proton.vti` and `pasta-neutron.vti`
-/// (`isolume generate pasta --species both -o pasta.vti`) in ISOLUME_PASTA; by hand.
+/// (`isolume generate pasta --species both -o pasta.vti`) in ISOLUME_PASTA; by hand. Protons pass; neutrons were 4.99 %
+/// [1.04, 6.98], which is an open matter.
 #[test]
 #[ignore = "needs simulated volumes and minutes"]
 fn pasta_at_its_vertices() {
@@ -508,7 +509,7 @@ fn pasta_at_its_vertices() {
         let percent = |square: f64| 100.0 * square.max(0.0).sqrt();
         let [lo, rms, hi] = [-1.96, 0.0, 1.96].map(|z| percent(moments.mean() + z * moments.std_error()));
         println!("field {k}: {rms:.2} % RMS, 95 % confidence {lo:.2} … {hi:.2}");
-        assert!(lo <= 2.0);
+        assert!(rms <= 2.0, "field {k}");
     }
 }
 
