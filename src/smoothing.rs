@@ -9,18 +9,17 @@
 use crate::direct::luminance;
 use crate::field::Field;
 use crate::flattened::Side;
+use crate::linear_fit::Moments;
 use crate::mask::local_position;
 use crate::scene::Scene;
 use crate::volume::Lattice;
-use glam::{DMat4, DVec3, DVec4, Vec3};
+use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 /// Radius of the fits, in the lattice's shortest spacing.
 const RADIUS: f64 = 2.5;
 /// Least cosine between the normals of points that share light.
 const CONE: f32 = 0.7;
-/// Prior weight of "no slope", as a share of what full coverage says.
-const RIDGE: f64 = 0.05;
 
 /// Light smoothed at one point.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -34,7 +33,7 @@ pub struct Smoothed {
 /// A neighbour's place relative to a point.
 struct Tap {
     step: [isize; 3],
-    /// Offset in radii of the largest ball.
+    /// Offset in radii, and its square.
     d: Vec3,
     d2: f32,
 }
@@ -46,7 +45,7 @@ pub type Halves = [Vec3; 2];
 struct Points<'a> {
     lattice: &'a Lattice,
     taps: Vec<Tap>,
-    /// Lower or higher unit normal, 0 where there is nothing; isovalue.
+    /// Unit normal of the side in question, 0 where there is nothing; isovalue.
     places: Vec<(Vec3, f32)>,
     /// Largest isovalue difference.
     tau: f32,
@@ -145,27 +144,18 @@ impl<'a> Points<'a> {
 
     /// What a linear fit of `values` around point `o` says there.
     fn fit(&self, o: usize, values: impl Fn(usize) -> Halves) -> Halves {
-        let mut m = [0.0f32; 10];
+        let mut moments = Moments::default();
         // Σ K v (1, d) of either half.
         let mut sums = [[Vec3::ZERO; 4]; 2];
         self.around(o, |n, tap| {
-            let (w, d) = (1.0 - tap.d2, tap.d);
-            let terms = [1.0, d.x, d.y, d.z, d.x * d.x, d.y * d.y, d.z * d.z, d.x * d.y, d.x * d.z, d.y * d.z];
-            m.iter_mut().zip(terms).for_each(|(m, t)| *m += w * t);
+            let w = 1.0 - tap.d2;
+            moments.add(w, tap.d);
             for (sums, v) in sums.iter_mut().zip(values(n)) {
+                let terms = [1.0, tap.d.x, tap.d.y, tap.d.z];
                 sums.iter_mut().zip(terms).for_each(|(s, t)| *s += w * t * v);
             }
         });
-        let m = m.map(f64::from);
-        // ∫K d_x² / ∫K over the ball is 1/7 for Epanechnikov's kernel.
-        let ridge = RIDGE / 7.0 * m[0];
-        let matrix = DMat4::from_cols(
-            DVec4::new(m[0], m[1], m[2], m[3]),
-            DVec4::new(m[1], m[4] + ridge, m[7], m[8]),
-            DVec4::new(m[2], m[7], m[5] + ridge, m[9]),
-            DVec4::new(m[3], m[8], m[9], m[6] + ridge),
-        );
-        let g = matrix.inverse().x_axis.as_vec4();
+        let g = moments.at_origin().as_vec4();
         sums.map(|[s, x, y, z]| g.x * s + g.y * x + g.z * y + g.w * z)
     }
 }

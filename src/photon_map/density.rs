@@ -9,9 +9,10 @@
 use super::{EstimateSettings, Irradiance};
 use crate::direct::luminance;
 use crate::field::Field;
+use crate::linear_fit::Moments;
 use crate::photon::SurfacePhoton;
 use crate::scene::Scene;
-use glam::{DMat4, DVec3, DVec4, Vec3};
+use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 /// One bin: 12 floats.
@@ -47,8 +48,6 @@ pub(super) struct PhotonDensity<'a> {
 const LEAST: f32 = 1.3;
 const FIRST: f32 = 2.0;
 const MOST: f32 = 5.0;
-/// Prior weight of "no slope", as a share of what full coverage says.
-const RIDGE: f64 = 0.05;
 
 impl<'a> PhotonDensity<'a> {
     /// Counts the photons that `keep` accepts. Bins hold whole voxels, as many as make for a photon in each on average.
@@ -239,10 +238,10 @@ impl<'a> PhotonDensity<'a> {
 /// Weighted least squares of density against (1, d), d in radii.
 #[derive(Default)]
 struct Fit {
-    /// Σ K D (1, d)(1, d)ᵀ: 1, d, d dᵀ as xx, yy, zz, xy, xz, yz.
-    moments: [f32; 10],
-    /// Σ K² Σ lum² (1, d)(1, d)ᵀ, the same order.
-    noise: [f32; 10],
+    /// Weighted by K D.
+    measure: Moments,
+    /// Weighted by K² Σ lum².
+    noise: Moments,
     /// Σ K P (1, d).
     power: [Vec3; 4],
 }
@@ -250,12 +249,8 @@ struct Fit {
 impl Fit {
     #[inline]
     fn add(&mut self, bin: &Bin, kernel: f32, d: Vec3) {
-        let terms = [1.0, d.x, d.y, d.z, d.x * d.x, d.y * d.y, d.z * d.z, d.x * d.y, d.x * d.z, d.y * d.z];
-        let (w, n) = (kernel * bin.measure, kernel * kernel * bin.squares);
-        for (i, t) in terms.into_iter().enumerate() {
-            self.moments[i] += w * t;
-            self.noise[i] += n * t;
-        }
+        self.measure.add(kernel * bin.measure, d);
+        self.noise.add(kernel * kernel * bin.squares, d);
         let p = bin.power * kernel;
         self.power[0] += p;
         self.power[1] += p * d.x;
@@ -264,7 +259,7 @@ impl Fit {
     }
 
     fn any(&self) -> bool {
-        self.moments[0] > 0.0
+        self.measure.weight() > 0.0
     }
 
     /// The value at d = 0 and the variance of its luminance. A channel that the slope would drive below 0 falls back to
@@ -273,23 +268,11 @@ impl Fit {
         if !self.any() {
             return (DVec3::ZERO, 0.0);
         }
-        let m = self.moments.map(f64::from);
-        // ∫K d_x² / ∫K over the ball is 1/7 for Epanechnikov's kernel.
-        let ridge = DMat4::from_diagonal(DVec4::new(0.0, 1.0, 1.0, 1.0) * (RIDGE / 7.0 * m[0]));
-        let g = (symmetric(&m) + ridge).inverse().x_axis;
+        let g = self.measure.at_origin();
         let p = self.power.map(|p| p.as_dvec3());
-        let flat = p[0] / m[0];
+        let flat = p[0] / f64::from(self.measure.weight());
         let fitted = g.x * p[0] + g.y * p[1] + g.z * p[2] + g.w * p[3];
-        let noise = symmetric(&self.noise.map(f64::from));
-        (DVec3::select(fitted.cmpge(DVec3::ZERO), fitted, flat), g.dot(noise * g).max(0.0))
+        let variance = g.dot(self.noise.matrix() * g).max(0.0);
+        (DVec3::select(fitted.cmpge(DVec3::ZERO), fitted, flat), variance)
     }
-}
-
-fn symmetric(m: &[f64; 10]) -> DMat4 {
-    DMat4::from_cols(
-        DVec4::new(m[0], m[1], m[2], m[3]),
-        DVec4::new(m[1], m[4], m[7], m[8]),
-        DVec4::new(m[2], m[7], m[5], m[9]),
-        DVec4::new(m[3], m[8], m[9], m[6]),
-    )
 }
