@@ -23,10 +23,11 @@ demo: deps
 	@echo "                cargo run --release -- render demo/bumps.vti --isovalue 60 -o demo/other.png"
 	@echo "demo/bumps.png  the isosurface at 47"
 
-# The paper's figures and more, into docs/gallery: some minutes. DATA=folder adds ch2.nii.gz (brain) and neuron.mha.
+# The paper's figures and more, into docs/gallery: some minutes. DATA=folder adds ch2.nii.gz (brain) and neuron.mha; QUALITY=full
+# takes standard bakes and larger pictures instead of previews.
 gallery: deps
 	$(CARGO) build --release
-	scripts/gallery $(PROGRAM) docs/gallery --work demo/gallery $(if $(DATA),--data $(DATA))
+	scripts/gallery $(PROGRAM) docs/gallery --work demo/gallery $(if $(DATA),--data $(DATA)) $(if $(QUALITY),--$(QUALITY))
 
 test: deps
 	$(CARGO) test

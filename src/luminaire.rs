@@ -1,5 +1,9 @@
 //! Light from polygons: closed-form irradiance, and points to aim shadow rays at.
 
+mod solid_angle;
+
+pub use solid_angle::Aim;
+
 use crate::polygon::Polygon;
 use glam::DVec3;
 

@@ -69,10 +69,20 @@ fn frames_are_single_bakes_and_blends_those_of_blended_volumes() {
     let with = |args: &[&'static str]| [args, &range].concat();
     let text = ok(dir, &with(&["bake", "ball_%03d.nrrd", "-o", "lit.vti"]));
     assert!(text.contains("frame  3 of 3, time 10") && text.contains("lit.pvd"), "{text}");
-    let collection = fs::read_to_string(dir.join("lit.pvd")).unwrap();
-    for (n, time) in [(0, 0), (1, 5), (2, 10)] {
-        let line = format!("timestep=\"{time}\" group=\"\" part=\"0\" file=\"lit_{n:04}.vti\"");
-        assert!(collection.contains(&line), "{collection}");
+    // As ParaView opens it: a collection whose files, beside it, are image data.
+    let text = fs::read_to_string(dir.join("lit.pvd")).unwrap();
+    let collection = roxmltree::Document::parse(&text).unwrap();
+    let root = collection.root_element();
+    assert_eq!((root.tag_name().name(), root.attribute("type")), ("VTKFile", Some("Collection")));
+    let sets: Vec<_> = collection.descendants().filter(|n| n.has_tag_name("DataSet")).collect();
+    assert!(sets.iter().all(|n| n.parent().unwrap().has_tag_name("Collection")));
+    let times: Vec<f64> = sets.iter().map(|n| n.attribute("timestep").unwrap().parse().unwrap()).collect();
+    assert_eq!(times, [0.0, 5.0, 10.0]);
+    for (n, set) in sets.iter().enumerate() {
+        assert_eq!(set.attribute("file").unwrap(), format!("lit_{n:04}.vti"));
+        let image = fs::read(dir.join(set.attribute("file").unwrap())).unwrap();
+        assert!(String::from_utf8_lossy(&image[..200]).contains("type=\"ImageData\""));
+        assert_eq!(light(&dir.join(set.attribute("file").unwrap())).len(), light(&dir.join("lit_0000.vti")).len());
     }
     ok(dir, &with(&["bake", "ball_005.nrrd", "-o", "single.vti"]));
     assert!(light(&dir.join("lit_0001.vti")) == light(&dir.join("single.vti")));

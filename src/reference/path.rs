@@ -5,7 +5,7 @@ use crate::direct::Receiver;
 use crate::error::Result;
 use crate::export::picture::Picture;
 use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target};
-use crate::luminaire::{point_term, unoccluded};
+use crate::luminaire::{Aim, unoccluded};
 use crate::render::{Camera, trace_picture};
 use crate::rng::{Rng, Sobol, Stage};
 use crate::scene::Scene;
@@ -47,8 +47,8 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
         reflected(scene.surface.albedo.at(f64::from(receiver.isovalue)), direct + indirect) + scene.surface.emission
     }
 
-    /// Direct irradiance by `samples` points uniform over each luminaire:
-    /// β E₀ + A/n Σ g (V − β) with E₀ the closed form without blockers. Unbiased for every β; β is the visible share
+    /// Direct irradiance by `samples` points uniform over the solid angle of each luminaire, each worth g:
+    /// β E₀ + 1/n Σ g (V − β) with E₀ the closed form without blockers. Unbiased for every β; β is the visible share
     /// seen by a pilot of its own, so that what is fully lit or fully dark has no variance.
     pub fn direct(&mut self, receiver: &Receiver, samples: u32, (seed, index): (u64, u64)) -> DVec3 {
         let scene = self.scene;
@@ -64,11 +64,11 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
                 continue;
             }
             let index = index * scene.luminaires().len() as u64 + n as u64;
+            let aim = Aim::new(light, x, receiver.normal);
             let mut shares = |set: Sobol, count: u32| -> (f64, f64) {
                 let (mut all, mut seen) = (0.0, 0.0);
                 for i in 0..count {
-                    let y = light.sample(set.point2(i, 0));
-                    let g = point_term(x, receiver.normal, y, light.normal());
+                    let (y, g) = aim.sample(set.point2(i, 0));
                     all += g;
                     if g > 0.0 && self.visible(receiver, y, l) {
                         seen += g;
@@ -80,7 +80,7 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
             let (all, seen) = shares(Sobol::set(seed, Stage::Direct, !index), PILOT);
             let beta = if all > 0.0 { seen / all } else { 0.0 };
             let (all, seen) = shares(Sobol::set(seed, Stage::Direct, index), samples);
-            let mean = light.area() * (seen - beta * all) / f64::from(samples.max(1));
+            let mean = (seen - beta * all) / f64::from(samples.max(1));
             total += light.emission * (beta * open + mean);
         }
         total
@@ -100,17 +100,16 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
         !self.tracer.occluded(&ray)
     }
 
-    /// Direct irradiance from one random point per luminaire: noisy and unbiased.
+    /// Direct irradiance from one random point per luminaire: noisy, unbiased and bounded.
     pub(super) fn direct_once(&mut self, receiver: &Receiver, rng: &mut Rng) -> DVec3 {
         let scene = self.scene;
         let x = scene.lattice().to_world(receiver.position.as_dvec3());
         let mut total = DVec3::ZERO;
         for &l in scene.luminaires() {
             let light = &scene.polygons()[l as usize];
-            let y = light.sample(rng.unit2());
-            let g = point_term(x, receiver.normal, y, light.normal());
+            let (y, g) = Aim::new(light, x, receiver.normal).sample(rng.unit2());
             if g > 0.0 && receiver.departure != Departure::Polygon(l) && self.visible(receiver, y, l) {
-                total += light.emission * (light.area() * g);
+                total += light.emission * g;
             }
         }
         total

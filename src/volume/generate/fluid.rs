@@ -20,13 +20,13 @@ const LEAST_EDGE: f64 = 6.0;
 /// Two atoms closer than this, σ, belong to the same cluster. \[Stillinger63\]
 pub const LINK: f64 = 1.5;
 
-/// V = 4(r⁻¹² − r⁻⁶) and dV/dr. \[AT17 Eq. 1.6\]
+/// V = 4(r⁻¹² − r⁻⁶) and dV/dr. \[AT17 Code 1.2\]
 pub fn lennard_jones(r: f64) -> [f64; 2] {
     let s = r.powi(-6);
     [4.0 * s * (s - 1.0), -24.0 * s * (2.0 * s - 1.0) / r]
 }
 
-/// V = ε_w (2/15 z⁻⁹ − z⁻³) at a distance z from a wall, and dV/dz: a half-space of Lennard-Jones atoms. \[AT17\]
+/// V = ε_w (2/15 z⁻⁹ − z⁻³) at a distance z from a wall, and dV/dz: a half-space of Lennard-Jones atoms. \[Steele73\]
 pub fn wall(z: f64) -> [f64; 2] {
     let s = z.powi(-3);
     [WALL * s * (2.0 / 15.0 * s * s - 1.0), WALL * s * (3.0 - 1.2 * s * s) / z]

@@ -149,7 +149,7 @@ impl MolecularDynamics {
         self.forces = forces;
     }
 
-    /// One step of velocity Verlet. \[AT17 Sec. 3.2\]
+    /// One step of velocity Verlet. \[AT17 Code 3.1\]
     pub fn step(&mut self, dt: f64) {
         let half = 0.5 * dt / self.mass;
         for ((x, v), (_, f)) in self.positions.iter_mut().zip(&mut self.velocities).zip(&self.forces) {

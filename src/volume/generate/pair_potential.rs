@@ -13,7 +13,7 @@ const BINS: u32 = 8192;
 const INNER: f64 = 1.0 / 16.0;
 
 /// A pair potential, cut off with shifted force: V(r) − V(r_c) − (r − r_c) V′(r_c), 0 beyond r_c, so that neither energy
-/// nor force jumps. \[AT17 Sec. 5.2\]
+/// nor force jumps. \[AT17 Ch. 5\]
 ///
 /// Between nodes it is a cubic Hermite polynomial in r², and the force is that polynomial's own derivative: energy is
 /// conserved as well as by the formula itself.

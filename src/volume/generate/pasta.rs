@@ -9,13 +9,13 @@ use crate::progress::Progress;
 use crate::rng::{Rng, Stage};
 use glam::DVec3;
 
-/// Strength of the short-range repulsion, MeV. \[Horowitz04 Tab. I\]
+/// Strength of the short-range repulsion, MeV. \[Horowitz04\]
 const A: f64 = 110.0;
-/// Strength of the attraction, MeV. \[Horowitz04 Tab. I\]
+/// Strength of the attraction, MeV. \[Horowitz04\]
 const B: f64 = -26.0;
-/// Its dependence on isospin, MeV: + between like nucleons, − between unlike. \[Horowitz04 Tab. I\]
+/// Its dependence on isospin, MeV: + between like nucleons, − between unlike. \[Horowitz04\]
 const C: f64 = 24.0;
-/// Square of the nuclear range, fm². \[Horowitz04 Tab. I\]
+/// Square of the nuclear range, fm². \[Horowitz04\]
 const LAMBDA: f64 = 1.25;
 /// e², MeV fm.
 const COULOMB: f64 = 1.44;
@@ -39,14 +39,14 @@ pub const NEUTRON: u8 = 0;
 /// Two nucleons closer than this, fm, belong to the same cluster.
 pub const LINK: f64 = 2.5;
 
-/// V = a e^(−r²/Λ) + (b ± c) e^(−r²/2Λ) and dV/dr, MeV and MeV/fm, r in fm. \[Horowitz04 Eq. 1\]
+/// V = a e^(−r²/Λ) + (b ± c) e^(−r²/2Λ) and dV/dr, MeV and MeV/fm, r in fm. \[Horowitz04\]
 pub fn nuclear(like: bool, r: f64) -> [f64; 2] {
     let wide = (-r * r / (2.0 * LAMBDA)).exp();
     let (core, tail) = (A * wide * wide, if like { B + C } else { B - C } * wide);
     [core + tail, -r / LAMBDA * (2.0 * core + tail)]
 }
 
-/// V = e²/r e^(−r/λ) between protons and dV/dr, MeV and MeV/fm, r in fm. \[Horowitz04 Eq. 1\]
+/// V = e²/r e^(−r/λ) between protons and dV/dr, MeV and MeV/fm, r in fm. \[Horowitz04\]
 pub fn coulomb(r: f64) -> [f64; 2] {
     let v = COULOMB / r * (-r / SCREENING).exp();
     [v, -v * (1.0 / r + 1.0 / SCREENING)]
