@@ -136,7 +136,7 @@ fn energy_and_momentum_are_conserved() {
         };
         let p = md.momentum();
         let before = window(&mut md);
-        let steps = 4000;
+        let steps = 2000;
         (0..steps).for_each(|_| md.step(dt));
         let after = window(&mut md);
         let particles = md.positions.len() as f64;
