@@ -1,7 +1,7 @@
 //! Direct light at a receiver: closed-form irradiance times the visible share, by shadow rays.
 
 use crate::flattened::{Departure, FlattenedRay};
-use crate::luminaire::{above_horizon, point_term, unoccluded};
+use crate::luminaire::{Aim, above_horizon, point_term, unoccluded};
 use crate::polygon::sample_convex;
 use crate::rng::{Sobol, Stage};
 use crate::scene::Scene;
@@ -41,8 +41,9 @@ pub fn luminance(rgb: DVec3) -> f64 {
 }
 
 /// Irradiance from all luminaires: for each, Lambert's closed form × Σ V_i g_i / Σ g_i over at most `shadow_rays`
-/// low-discrepancy points y_i of its part above the horizon, with g = cos θ cos θ′/r². Exact where all or none are
-/// visible: there a quarter of the points (16 at least) settles it; the rest is spent in penumbras. The ratio's bias
+/// low-discrepancy points y_i of its part above the horizon, with g = cos θ cos θ′/r²; next to a rectangle uniform over its
+/// solid angle, with g = cos θ, since of points spread over the area hardly any lies where a receiver there looks. Exact
+/// where all or none are visible: there a quarter of the points (16 at least) settles it; the rest is spent in penumbras. The ratio's bias
 /// falls with 1/shadow_rays; a sliver of light or shadow below 4/shadow_rays may be missed. The point set is keyed by
 /// (seed, stage, index).
 pub fn direct_irradiance<T: Tracer>(
@@ -70,6 +71,7 @@ pub fn direct_irradiance<T: Tracer>(
         if part.as_ref().is_some_and(|p| p.len() < 3) {
             continue;
         }
+        let near = Aim::near(light, x, receiver.normal, open);
         let set =
             Sobol::set(seed, stage, index.wrapping_mul(scene.luminaires().len() as u64).wrapping_add(u64::from(l)));
         let (mut sum, mut seen, mut squares, mut seen_squares) = (0.0, 0.0, 0.0, 0.0);
@@ -78,8 +80,13 @@ pub fn direct_irradiance<T: Tracer>(
                 break;
             }
             let u = set.point2(i, 0);
-            let y = part.as_ref().map_or_else(|| light.sample(u), |p| sample_convex(p, u));
-            let g = point_term(x, receiver.normal, y, light.normal());
+            let (y, g) = near.as_ref().map_or_else(
+                || {
+                    let y = part.as_ref().map_or_else(|| light.sample(u), |p| sample_convex(p, u));
+                    (y, point_term(x, receiver.normal, y, light.normal()))
+                },
+                |aim| aim.sample(u),
+            );
             if g == 0.0 {
                 continue;
             }

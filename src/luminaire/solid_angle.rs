@@ -8,6 +8,9 @@ use glam::DVec3;
 /// Solid angles below this are sampled by area: cancellation would show, and the area's points hardly vary.
 const LEAST: f64 = 1e-5;
 
+/// Solid angle beyond which a luminaire is near: that of a square seen from 0.8 of its edge away.
+const NEAR: f64 = 1.0;
+
 /// A luminaire as one receiver sees it.
 pub struct Aim<'a> {
     polygon: &'a Polygon,
@@ -22,6 +25,15 @@ impl<'a> Aim<'a> {
         let in_front = (x - polygon.vertices()[0]).dot(polygon.normal()) > 0.0;
         let rectangle = if in_front { SphericalRectangle::new(polygon, x) } else { None };
         Self { polygon, x, n, rectangle: rectangle.filter(|r| r.solid_angle > LEAST) }
+    }
+
+    /// The same where points spread over the area would hardly ever fall on what a receiver next to the luminaire sees of it:
+    /// a rectangle that fills [`NEAR`] and more, and gives `open` > an eighth of that, so that an eighth of the points and more
+    /// lie above the horizon.
+    pub fn near(polygon: &'a Polygon, x: DVec3, n: DVec3, open: f64) -> Option<Self> {
+        let aim = Self::new(polygon, x, n);
+        let fills = aim.rectangle.as_ref().map_or(0.0, |r| r.solid_angle);
+        (fills > NEAR && open > 0.125 * fills).then_some(aim)
     }
 
     /// A point of the luminaire from two uniforms, and the irradiance per unit radiance that it gives: the mean of these is
@@ -143,6 +155,25 @@ mod tests {
                 assert!((mean - exact).abs() < 2e-3 * exact.max(1e-2), "receiver {i}: {mean} {exact}");
             }
         }
+    }
+
+    /// What a receiver next to a luminaire sees through a hole: π r²/(r² + h²) for a disk of radius r at height h. Of points over
+    /// the area one in 80 000 would fall there.
+    #[test]
+    fn a_few_points_find_what_is_seen_of_a_near_luminaire() {
+        let light = rectangle([-0.5, 0.5], [-0.5, 0.5]);
+        let (x, h, r) = (DVec3::new(0.1, -0.2, 0.999), 0.001, 0.002);
+        let aim = Aim::near(&light, x, DVec3::Z, unoccluded(&light, x, DVec3::Z)).unwrap();
+        let set = Sobol::set(5, Stage::Test, 0);
+        let (mut seen, mut all) = (0.0, 0.0);
+        for k in 0..128 {
+            let (y, g) = aim.sample(set.point2(k, 0));
+            all += g;
+            seen += if (y - x).truncate().length() < r { g } else { 0.0 };
+        }
+        assert!((seen / all - r * r / (r * r + h * h)).abs() < 0.05, "{}", seen / all);
+        assert!(Aim::near(&light, DVec3::ZERO, DVec3::Z, 0.5).is_none(), "not near");
+        assert!(Aim::near(&light, x, -DVec3::Z, 0.0).is_none(), "looks away");
     }
 
     #[test]

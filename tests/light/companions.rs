@@ -460,8 +460,8 @@ fn a_held_volume_lights_as_one_that_sweeps() {
 
 /// What final gather finds at the vertices themselves, without a grid in between, against path tracing of two meshes: cross
 /// light on nuclear pasta, whose surfaces run through each other. A folder with `pasta-proton.vti` and `pasta-neutron.vti`
-/// (`isolume generate pasta --species both -o pasta.vti`) in ISOLUME_PASTA; by hand. Protons pass; neutrons were 4.99 %
-/// [1.04, 6.98], which is an open matter.
+/// (`isolume generate pasta --species both -o pasta.vti`) in ISOLUME_PASTA; by hand. Neutrons were 5.07 % [1.33, 7.05] as long as
+/// points spread over the luminaire's area missed what vertices right below it see.
 #[test]
 #[ignore = "needs simulated volumes and minutes"]
 fn pasta_at_its_vertices() {
