@@ -28,7 +28,7 @@ impl<'a> Aim<'a> {
     }
 
     /// The same where points spread over the area would hardly ever fall on what a receiver next to the luminaire sees of it:
-    /// a rectangle that fills [`NEAR`] and more, and gives `open` > an eighth of that, so that an eighth of the points and more
+    /// a rectangle that fills 1 sr and more, and gives `open` > an eighth of that, so that an eighth of the points and more
     /// lie above the horizon.
     pub fn near(polygon: &'a Polygon, x: DVec3, n: DVec3, open: f64) -> Option<Self> {
         let aim = Self::new(polygon, x, n);
