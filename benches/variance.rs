@@ -7,8 +7,7 @@ use isolume::direct::{Receiver, direct_irradiance};
 use isolume::embree::{Device, GraphTracer};
 use isolume::field::{Field, Sweep};
 use isolume::flattened::{Departure, FlattenedRay, Side};
-use isolume::luminaire::{point_term, unoccluded};
-use isolume::polygon::Polygon;
+use isolume::luminaire::{Aim, point_term, unoccluded};
 use isolume::progress::processor_seconds;
 use isolume::rng::{Rng, Sobol, Stage};
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
@@ -19,61 +18,6 @@ use rayon::prelude::*;
 
 const RECEIVERS: usize = 4000;
 const REPETITIONS: u64 = 32;
-
-/// Uniform sampling of the solid angle of a rectangle seen from a point. \[Urena13\]
-struct SphericalRectangle {
-    origin: DVec3,
-    axes: [DVec3; 3],
-    x: [f64; 2],
-    y: [f64; 2],
-    z: f64,
-    b: [f64; 2],
-    k: f64,
-    solid_angle: f64,
-}
-
-impl SphericalRectangle {
-    fn new(rectangle: &Polygon, origin: DVec3) -> Self {
-        let v = rectangle.vertices();
-        let (ex, ey) = (v[1] - v[0], v[3] - v[0]);
-        let (x, y) = (ex.normalize(), ey.normalize());
-        let mut z = x.cross(y);
-        let d = v[0] - origin;
-        let mut z0 = d.dot(z);
-        if z0 > 0.0 {
-            (z, z0) = (-z, -z0);
-        }
-        let (x0, y0) = (d.dot(x), d.dot(y));
-        let (x1, y1) = (x0 + ex.length(), y0 + ey.length());
-        let at = |x, y| DVec3::new(x, y, z0);
-        let corners = [at(x0, y0), at(x1, y0), at(x1, y1), at(x0, y1)];
-        let n: [DVec3; 4] = std::array::from_fn(|i| corners[i].cross(corners[(i + 1) % 4]).normalize());
-        let g: [f64; 4] = std::array::from_fn(|i| (-n[i].dot(n[(i + 1) % 4])).clamp(-1.0, 1.0).acos());
-        let k = 2.0 * std::f64::consts::PI - g[2] - g[3];
-        Self {
-            origin,
-            axes: [x, y, z],
-            x: [x0, x1],
-            y: [y0, y1],
-            z: z0,
-            b: [n[0].z, n[2].z],
-            k,
-            solid_angle: g[0] + g[1] - k,
-        }
-    }
-
-    fn sample(&self, [u, v]: [f64; 2]) -> DVec3 {
-        let au = u * self.solid_angle + self.k;
-        let fu = (au.cos() * self.b[0] - self.b[1]) / au.sin();
-        let cu = (fu.signum() / (fu * fu + self.b[0] * self.b[0]).sqrt()).clamp(-1.0, 1.0);
-        let x = (-cu * self.z / (1.0 - cu * cu).max(1e-14).sqrt()).clamp(self.x[0], self.x[1]);
-        let d2 = x * x + self.z * self.z;
-        let h = self.y.map(|y| y / (d2 + y * y).sqrt());
-        let hv = h[0] + v * (h[1] - h[0]);
-        let y = if hv * hv < 1.0 - 1e-9 { hv * (d2 / (1.0 - hv * hv)).sqrt() } else { self.y[1] };
-        self.origin + x * self.axes[0] + y * self.axes[1] + self.z * self.axes[2]
-    }
-}
 
 /// An estimator of some light at a receiver from a number of rays, a seed and the receiver's number.
 type Estimator<'a> = &'a (dyn Fn(&Receiver, u64, u64) -> f64 + Sync);
@@ -186,11 +130,10 @@ fn main() {
         if open == 0.0 {
             return 0.0;
         }
-        let rectangle = SphericalRectangle::new(light, x);
+        let aim = Aim::new(light, x, r.normal);
         let (mut seen, mut all) = (0.0, 0.0);
         for n in 0..rays {
-            let y = rectangle.sample(set.point2(n, 0));
-            let g = (y - x).normalize().dot(r.normal);
+            let (y, g) = aim.sample(set.point2(n, 0));
             if g > 0.0 {
                 seen += g * visible(r, y);
                 all += g;

@@ -40,12 +40,27 @@ pub fn luminance(rgb: DVec3) -> f64 {
     rgb.dot(DVec3::new(0.2126, 0.7152, 0.0722))
 }
 
+/// No budget is cut below this.
+const LEAST_RAYS: u32 = 8;
+
+/// Shadow rays for a receiver that may get the irradiance `open` (luminance), of at most `shadow_rays`: all from half the
+/// scene's E₀ on, and down to an eighth where there is less to get, so that light is equally certain everywhere.
+fn budget(scene: &Scene, open: f64, shadow_rays: u32) -> u32 {
+    let mut rays = shadow_rays;
+    let mut full = 0.5 * scene.reference_irradiance();
+    while rays > LEAST_RAYS && rays > shadow_rays / 8 && open < full {
+        (rays, full) = (rays / 2, full / 2.0);
+    }
+    rays
+}
+
 /// Irradiance from all luminaires: for each, Lambert's closed form × Σ V_i g_i / Σ g_i over at most `shadow_rays`
 /// low-discrepancy points y_i of its part above the horizon, with g = cos θ cos θ′/r²; next to a rectangle uniform over its
 /// solid angle, with g = cos θ, since of points spread over the area hardly any lies where a receiver there looks. Exact
-/// where all or none are visible: there a quarter of the points (16 at least) settles it; the rest is spent in penumbras. The ratio's bias
-/// falls with 1/shadow_rays; a sliver of light or shadow below 4/shadow_rays may be missed. The point set is keyed by
-/// (seed, stage, index).
+/// where all or none are visible: there a quarter of the points settles it; the rest is spent in penumbras. Receivers that
+/// could get less than half of E₀ ([`Scene::reference_irradiance`]) get fewer rays, in proportion down to an eighth. The
+/// ratio's bias falls with 1/shadow_rays; light or shadow below about 4 E₀/shadow_rays may be missed. The point set is keyed
+/// by (seed, stage, index).
 pub fn direct_irradiance<T: Tracer>(
     scene: &Scene,
     tracer: &T,
@@ -56,7 +71,7 @@ pub fn direct_irradiance<T: Tracer>(
     let lattice = scene.lattice();
     let x = lattice.to_world(receiver.position.as_dvec3());
     let mut out = Estimate::default();
-    let pilot = (shadow_rays / 4).max(16);
+    let (most, most_pilot) = (shadow_rays, (shadow_rays / 4).max(16));
     for &l in scene.luminaires() {
         if receiver.departure == Departure::Polygon(l) {
             continue;
@@ -72,6 +87,9 @@ pub fn direct_irradiance<T: Tracer>(
             continue;
         }
         let near = Aim::near(light, x, receiver.normal, open);
+        let shadow_rays = budget(scene, luminance(light.emission) * open, most);
+        // A share of the budget: what unanimous pilots may miss is then the same irradiance everywhere.
+        let pilot = (most_pilot * shadow_rays / most.max(1)).max(LEAST_RAYS / 2);
         let set =
             Sobol::set(seed, stage, index.wrapping_mul(scene.luminaires().len() as u64).wrapping_add(u64::from(l)));
         let (mut sum, mut seen, mut squares, mut seen_squares) = (0.0, 0.0, 0.0, 0.0);

@@ -69,6 +69,7 @@ pub struct Scene {
     polygons: Vec<Polygon>,
     luminaires: Vec<u32>,
     interior: [DVec3; 2],
+    reference_irradiance: f64,
 }
 
 /// Whether a field can stand among `polygons`.
@@ -133,7 +134,7 @@ impl Scene {
             (lo, hi) = (lo.min(x), hi.max(x));
         }
         let luminaires = (0..u32::try_from(count).expect("checked above")).collect();
-        Ok(Self {
+        let mut scene = Self {
             field,
             surface,
             boundary,
@@ -144,7 +145,10 @@ impl Scene {
             polygons,
             luminaires,
             interior: [lo, hi],
-        })
+            reference_irradiance: 0.0,
+        };
+        scene.reference_irradiance = scene.find_reference_irradiance();
+        Ok(scene)
     }
 
     /// The same scene with its field on another lattice over the same Ω ([`Field::resampled`]).
@@ -192,6 +196,10 @@ impl Scene {
     /// E₀: the unoccluded irradiance of a patch at the centre of the (first) volume that faces the strongest luminaire; the largest
     /// channel of the sum over all luminaires. 0 without luminaires.
     pub fn reference_irradiance(&self) -> f64 {
+        self.reference_irradiance
+    }
+
+    fn find_reference_irradiance(&self) -> f64 {
         let first = self.companions.iter().find(|c| c.number == 0).map_or(self.lattice(), |c| c.member.field.lattice());
         let centre = first.to_world(0.5 * first.far());
         let flux = |p: &Polygon| p.emission.max_element() * p.area();

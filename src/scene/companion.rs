@@ -187,6 +187,7 @@ impl Scene {
             }
             scene.companions.push(companion);
         }
+        scene.reference_irradiance = scene.find_reference_irradiance();
         Ok(scene)
     }
 
