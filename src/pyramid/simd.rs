@@ -139,12 +139,10 @@ mod x86 {
         #[inline(always)]
         fn corners(self, samples: &[f32], at: usize, [y, z]: [usize; 2]) -> __m256 {
             let s = &samples[at..at + z + y + 2];
-            // SAFETY: `self` exists, so `detect` found the features; the pairs lie within `s`.
+            // SAFETY: `self` exists, so `detect` found the features; pairs of samples lie within `s`, and any bits are an f64.
             unsafe {
-                let pair = |at: usize| s.as_ptr().add(at).cast::<f64>();
-                let face = |at: usize| _mm_loadh_pd(_mm_load_sd(pair(at)), pair(at + y));
-                let faces = _mm256_insertf128_pd::<1>(_mm256_castpd128_pd256(face(0)), face(z));
-                _mm256_castpd_ps(faces)
+                let pair = |at: usize| s.as_ptr().add(at).cast::<f64>().read_unaligned();
+                _mm256_castpd_ps(_mm256_setr_pd(pair(0), pair(y), pair(z), pair(z + y)))
             }
         }
 
