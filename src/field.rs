@@ -64,6 +64,8 @@ pub struct Field {
     lattice: Lattice,
     sweep: Sweep,
     samples: Vec<f32>,
+    /// No finite sample is larger in magnitude.
+    largest: f32,
     /// The field that gives receiver normals, if this one is a finer copy of it.
     coarse: Option<Arc<Field>>,
 }
@@ -87,7 +89,8 @@ impl Field {
                 sweep.hi()
             )));
         }
-        if ![min, max].iter().all(|&v| (sweep.to_unit(v) as f32).is_finite()) {
+        let largest = [min, max].iter().fold(0f32, |m, &v| m.max((sweep.to_unit(v) as f32).abs()));
+        if !largest.is_finite() {
             return Err(Error::Invalid(format!(
                 "{name}: data {min} … {max} in units of the sweep {} … {} do not fit 32-bit floats; widen the sweep",
                 sweep.lo(),
@@ -102,7 +105,7 @@ impl Field {
                 if v.is_finite() { sweep.isovalue(v) } else { f32::NAN }
             })
             .collect();
-        Ok(Self { lattice: volume.lattice.clone(), sweep, samples, coarse: None })
+        Ok(Self { lattice: volume.lattice.clone(), sweep, samples, largest, coarse: None })
     }
 
     /// The same function on another lattice over the same Ω: exactly the same where that divides this one's cells.
@@ -116,7 +119,13 @@ impl Field {
             .with_min_len(1 << 14)
             .map(|o| self.value(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)) * scale) as f32)
             .collect();
-        Self { lattice: lattice.clone(), sweep: self.sweep, samples, coarse: Some(Arc::new(self.clone())) }
+        Self {
+            lattice: lattice.clone(),
+            sweep: self.sweep,
+            samples,
+            largest: self.largest,
+            coarse: Some(Arc::new(self.clone())),
+        }
     }
 
     /// Index coordinates of the coarse field at index coordinates of this one.
@@ -126,6 +135,7 @@ impl Field {
     }
 
     /// Where the samples stand.
+    #[inline]
     pub fn lattice(&self) -> &Lattice {
         &self.lattice
     }
@@ -136,8 +146,14 @@ impl Field {
     }
 
     /// Samples in units of the sweep, x fastest; NaN where the source is not finite.
+    #[inline]
     pub fn samples(&self) -> &[f32] {
         &self.samples
+    }
+
+    /// The largest magnitude that a sample may have.
+    pub fn largest(&self) -> f32 {
+        self.largest
     }
 
     /// The cell that holds `p`, and `p` inside it in [0, 1]³.

@@ -3,39 +3,40 @@
 //! A node has 4×4×4 children, and their 64 ranges of h stand together in a tile: so one step of the walk finds, as
 //! the bits of a word, all children of a node that both hold the isovalue and lie on the ray (`walk`).
 
-mod simd;
-mod children;
+mod kernel;
 mod packet;
+mod simd;
 #[cfg(test)]
 mod tests;
 mod walk;
 
 use crate::field::Field;
 use crate::flattened::{FlattenedHit, FlattenedRay};
-use children::Scalar;
+
 use glam::Vec4;
+use kernel::Scalar;
 use rayon::prelude::*;
 use simd::Avx512;
 
 /// Levels at most: children are cells, then blocks of 4³, 16³ and 64³ cells.
 const LEVELS: usize = 4;
 
-/// Ranges of h over the 4×4×4 children of a node, x fastest, quantised by [`quantise`].
+/// Ranges of h over the 4×4×4 children of a node, x fastest, as [`Ranks`].
 #[derive(Clone, Copy, Debug)]
 #[repr(C, align(64))]
 struct Tile {
-    lo: [u16; 64],
-    hi: [u16; 64],
+    lo: [u8; 64],
+    hi: [u8; 64],
 }
 
 impl Tile {
     /// Children without surface: they exclude every isovalue.
-    const EMPTY: Self = Self { lo: [u16::MAX; 64], hi: [0; 64] };
+    const EMPTY: Self = Self { lo: [u8::MAX; 64], hi: [0; 64] };
 
     /// The range of all children.
     #[inline]
-    fn range(&self) -> (u16, u16) {
-        (self.lo.iter().fold(u16::MAX, |a, &b| a.min(b)), self.hi.iter().fold(0, |a, &b| a.max(b)))
+    fn range(&self) -> (u8, u8) {
+        (self.lo.iter().fold(u8::MAX, |a, &b| a.min(b)), self.hi.iter().fold(0, |a, &b| a.max(b)))
     }
 }
 
@@ -47,35 +48,106 @@ struct Level {
 }
 
 impl Level {
-    #[inline]
-    fn tile(&self, [i, j, k]: [usize; 3]) -> &Tile {
-        &self.tiles[(k * self.dims[1] + j) * self.dims[0] + i]
+    /// Where the tile of a node stands.
+    #[inline(always)]
+    fn at(&self, [i, j, k]: [u32; 3]) -> usize {
+        (k as usize * self.dims[1] + j as usize) * self.dims[0] + i as usize
     }
 }
 
-/// Min/max of h over cells and blocks of 4³, 16³ and 64³ cells, quantised to 16 bits over the sweep, so that no block
-/// that holds a piece of L(h, c) is ever excluded. 4.1 bytes per cell.
+/// Where the children of a level's nodes stand in memory: tiles, or the first samples of cells.
+#[derive(Clone, Copy, Debug)]
+struct Places {
+    /// What a step along y or z adds.
+    steps: [usize; 2],
+    /// Of all children, from the first on.
+    child: [usize; 64],
+    /// What one takes in memory, and where what is read of it lies, in bytes.
+    bytes: usize,
+    lines: [usize; 4],
+}
+
+impl Places {
+    fn new(dims: [usize; 3]) -> Self {
+        let steps = [dims[0], dims[0] * dims[1]];
+        let child = std::array::from_fn(|n| n % 4 + n / 4 % 4 * steps[0] + n / 16 * steps[1]);
+        Self { steps, child, bytes: size_of::<Tile>(), lines: [0, 64, 0, 64] }
+    }
+
+    /// The same of samples.
+    fn samples(dims: [usize; 3]) -> Self {
+        let places = Self::new(dims);
+        let [y, z] = places.steps.map(|step| size_of::<f32>() * step);
+        Self { bytes: size_of::<f32>(), lines: [0, y, z, y + z], ..places }
+    }
+}
+
+/// Min/max of h over cells and blocks of 4³, 16³ and 64³ cells, in 8 bits over the sweep, so that no block that holds a
+/// piece of L(h, c) is ever excluded. 2.05 bytes per cell.
 #[derive(Clone, Debug)]
 pub struct Pyramid {
     cells: [usize; 3],
+    /// Ω's far corner; 1 in the fourth place.
+    far: Vec4,
+    /// Beyond what rounding does to h at a point of a cell, and to three times that.
+    rounding: f64,
+    ranks: Ranks,
     levels: Vec<Level>,
+    places: [Places; LEVELS],
+    /// Nodes of the top level.
+    roots: usize,
+    /// What a step along y or z adds to a sample's position in memory.
+    steps: [usize; 2],
     capped: bool,
     wide: Option<Avx512>,
 }
 
-/// A monotone map of isovalues to 16 bits; everything outside the sweep clamps, NaN is 0.
-#[inline]
-fn quantise(s: f32) -> u16 {
-    quantise4(Vec4::splat(s))[0]
+/// A monotone map of isovalues to 8 bits: half linear, half by the share of samples below, so that ranges stay narrow where
+/// h is flat. Everything outside the sweep clamps, NaN is 0.
+#[derive(Clone, Debug)]
+struct Ranks(Box<[u8; Ranks::BINS]>);
+
+impl Ranks {
+    const BINS: usize = 4096;
+    /// Samples that are looked at.
+    const SAMPLES: usize = 1 << 16;
+
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "in [0, 255]")]
+    fn new(samples: &[f32]) -> Self {
+        let mut counts = [0u32; Self::BINS];
+        // Odd, so that it falls in with no row.
+        for &s in samples.iter().step_by((samples.len() / Self::SAMPLES) | 1).filter(|&&s| s > 0.0 && s < 1.0) {
+            counts[bins(Vec4::splat(s))[0]] += 1;
+        }
+        let all = f64::from(counts.iter().sum::<u32>().max(1));
+        let mut below = 0;
+        let rank = |(n, count)| {
+            below += count;
+            let linear = (n + 1) as f64 / Self::BINS as f64;
+            (127.5 * (linear + f64::from(below) / all)) as u8
+        };
+        let ranks: Vec<u8> = counts.into_iter().enumerate().map(rank).collect();
+        Self(ranks.try_into().expect("as many as bins"))
+    }
+
+    #[inline]
+    fn of(&self, s: f32) -> u8 {
+        self.of4(Vec4::splat(s))[0]
+    }
+
+    /// [`Ranks::of`] four.
+    #[inline]
+    fn of4(&self, s: Vec4) -> [u8; 4] {
+        bins(s).map(|bin| self.0[bin])
+    }
 }
 
-/// [`quantise`] of four.
+/// Bins of [`Ranks`].
 #[inline]
-#[allow(clippy::cast_possible_truncation, reason = "the low 16 bits are meant")]
-fn quantise4(s: Vec4) -> [u16; 4] {
+fn bins(s: Vec4) -> [usize; 4] {
     // 2²³ rounds to an integer and leaves it in the low bits.
-    let clamped = (s * 65535.0).max(Vec4::ZERO).min(Vec4::splat(65535.0));
-    (clamped + 8_388_608.0).to_array().map(|x| x.to_bits() as u16)
+    let clamped = (s * 4095.0).max(Vec4::ZERO).min(Vec4::splat(4095.0));
+    (clamped + 8_388_608.0).to_array().map(|x| x.to_bits() as usize % Ranks::BINS)
 }
 
 impl Pyramid {
@@ -83,11 +155,22 @@ impl Pyramid {
     /// sample hold no surface. `capped`: outside Ω counts as below every c, so Ω's faces close what they cut.
     pub fn new(field: &Field, capped: bool) -> Self {
         let cells = field.lattice().cells();
-        let mut levels = vec![finest(field)];
+        let ranks = Ranks::new(field.samples());
+        let mut levels = vec![finest(field, &ranks)];
         while levels.len() < LEVELS && levels[levels.len() - 1].tiles.len() > 1 {
             levels.push(coarser(&levels[levels.len() - 1]));
         }
-        Self { cells, levels, capped, wide: Avx512::detect() }
+        #[allow(clippy::cast_possible_truncation, reason = "lattices fit memory")]
+        let far = field.lattice().far().as_vec3().extend(1.0);
+        let rounding = 32.0 * f64::EPSILON * f64::from(field.largest());
+        let dims = field.lattice().dims();
+        let places = std::array::from_fn(|n| match n.checked_sub(1) {
+            None => Places::samples(dims),
+            Some(below) => Places::new(levels.get(below).map_or([0; 3], |level| level.dims)),
+        });
+        let roots = levels[levels.len() - 1].tiles.len();
+        let steps = [dims[0], dims[0] * dims[1]];
+        Self { cells, far, rounding, ranks, levels, places, roots, steps, capped, wide: Avx512::detect() }
     }
 
     /// The same without SIMD, as on a machine that has none: the same hits, slower.
@@ -99,7 +182,7 @@ impl Pyramid {
 
     /// Bytes of all levels.
     pub fn bytes(&self) -> usize {
-        self.levels.iter().map(|l| size_of::<Tile>() * l.tiles.len()).sum()
+        Ranks::BINS + self.levels.iter().map(|l| size_of::<Tile>() * l.tiles.len()).sum::<usize>()
     }
 
     /// The first hit of `ray` with t ≤ `reach`, or `None`. `field` must be the one the pyramid was built from.
@@ -162,18 +245,18 @@ fn level(dims: [usize; 3], tile: impl Fn([usize; 3]) -> Tile + Sync) -> Level {
 }
 
 /// The nodes of 4³ cells.
-fn finest(field: &Field) -> Level {
+fn finest(field: &Field, ranks: &Ranks) -> Level {
     let cells = field.lattice().cells();
     level(cells.map(|n| n.div_ceil(4)), |node| {
         let first = node.map(|i| 4 * i);
         let whole = (0..3).all(|a| first[a] + 4 <= cells[a]);
-        whole.then(|| whole_tile(field, first)).flatten().unwrap_or_else(|| any_tile(field, first))
+        whole.then(|| whole_tile(field, ranks, first)).flatten().unwrap_or_else(|| any_tile(field, ranks, first))
     })
 }
 
 /// The node whose first cell is `first`, all of whose cells exist. `None` if one of its samples is not a number.
 #[inline]
-fn whole_tile(field: &Field, [i, j, k]: [usize; 3]) -> Option<Tile> {
+fn whole_tile(field: &Field, ranks: &Ranks, [i, j, k]: [usize; 3]) -> Option<Tile> {
     let [nx, ny, _] = field.lattice().dims();
     let samples = field.samples();
     let mut tile = Tile::EMPTY;
@@ -191,8 +274,8 @@ fn whole_tile(field: &Field, [i, j, k]: [usize; 3]) -> Option<Tile> {
                 let along_y = [along_x[0].min(previous[0]), along_x[1].max(previous[1])];
                 if z > 0 {
                     let at = 4 * (y - 1) + 16 * (z - 1);
-                    tile.lo[at..at + 4].copy_from_slice(&quantise4(along_y[0].min(before[y - 1][0])));
-                    tile.hi[at..at + 4].copy_from_slice(&quantise4(along_y[1].max(before[y - 1][1])));
+                    tile.lo[at..at + 4].copy_from_slice(&ranks.of4(along_y[0].min(before[y - 1][0])));
+                    tile.hi[at..at + 4].copy_from_slice(&ranks.of4(along_y[1].max(before[y - 1][1])));
                 }
                 before[y - 1] = along_y;
             }
@@ -205,7 +288,7 @@ fn whole_tile(field: &Field, [i, j, k]: [usize; 3]) -> Option<Tile> {
 
 /// The same for a node that sticks out of the lattice or touches a NaN.
 #[cold]
-fn any_tile(field: &Field, first: [usize; 3]) -> Tile {
+fn any_tile(field: &Field, ranks: &Ranks, first: [usize; 3]) -> Tile {
     let cells = field.lattice().cells();
     let mut tile = Tile::EMPTY;
     for n in 0..64 {
@@ -215,8 +298,8 @@ fn any_tile(field: &Field, first: [usize; 3]) -> Tile {
         }
         let corners = field.corners(cell);
         if !corners.iter().any(|s| s.is_nan()) {
-            tile.lo[n] = quantise(corners.iter().fold(f32::INFINITY, |a, &b| a.min(b)));
-            tile.hi[n] = quantise(corners.iter().fold(f32::NEG_INFINITY, |a, &b| a.max(b)));
+            tile.lo[n] = ranks.of(corners.iter().fold(f32::INFINITY, |a, &b| a.min(b)));
+            tile.hi[n] = ranks.of(corners.iter().fold(f32::NEG_INFINITY, |a, &b| a.max(b)));
         }
     }
     tile
@@ -229,7 +312,7 @@ fn coarser(fine: &Level) -> Level {
         for n in 0..64 {
             let child = [4 * node[0] + n % 4, 4 * node[1] + n / 4 % 4, 4 * node[2] + n / 16];
             if (0..3).all(|a| child[a] < fine.dims[a]) {
-                (tile.lo[n], tile.hi[n]) = fine.tile(child).range();
+                (tile.lo[n], tile.hi[n]) = fine.tiles[fine.at(child.map(|i| i as u32))].range();
             }
         }
         tile

@@ -82,11 +82,13 @@ impl Lattice {
     }
 
     /// Samples along each axis, each at least 2.
+    #[inline]
     pub fn dims(&self) -> [usize; 3] {
         self.dims
     }
 
     /// Cells along each axis: one fewer than the samples.
+    #[inline]
     pub fn cells(&self) -> [usize; 3] {
         self.dims.map(|n| n - 1)
     }

@@ -5,23 +5,13 @@
 //! ray does one after the other, and memory is asked for a round ahead.
 
 use super::Pyramid;
-use super::children::{Children, Line};
-use super::walk::{Stack, Start, Step};
+use super::kernel::Kernel;
+use super::walk::{Begun, Child, Lane, Step};
 use crate::field::Field;
 use crate::flattened::{FlattenedHit, FlattenedRay};
 
 /// Rays in a packet.
 pub(super) const WIDTH: usize = 16;
-
-/// A ray on its way.
-struct Lane<'a, R> {
-    start: Start<'a>,
-    constants: R,
-    stack: Stack,
-    /// What was popped last.
-    level: usize,
-    child: [i32; 3],
-}
 
 /// Lanes by number.
 #[derive(Clone, Copy, Default)]
@@ -45,44 +35,49 @@ impl Queue {
     }
 }
 
-impl<R> Lane<'_, R> {
-    /// Pops what comes next, asks memory for it, and queues the lane for it; with nothing left it is done.
+/// What lanes do in a round.
+#[derive(Clone, Copy, Default)]
+struct Round {
+    climbs: Queue,
+    nodes: Queue,
+    cells: Queue,
+}
+
+impl Round {
+    /// Queues a lane for what comes next, without a branch. With nothing left it is done.
     #[inline(always)]
-    #[allow(clippy::cast_sign_loss, reason = "numbers of nodes and cells are not negative")]
-    fn queue<K: Children<Ray = R>>(
+    fn queue<K: Kernel>(
         &mut self,
         kernel: K,
         pyramid: &Pyramid,
-        field: &Field,
+        memory: &[*const u8; 5],
+        lane: &mut Lane<K::Ray>,
         number: u8,
-        [nodes, cells, done]: [&mut Queue; 3],
-    ) {
-        let more = self.stack.live != 0;
-        done.push(number, !more);
-        if more {
-            (self.level, self.child) = self.stack.pop(&self.start.line);
-            let child = self.child.map(|i| i as usize);
-            if self.level > 0 {
-                kernel.prefetch(pyramid.levels[self.level - 1].tile(child));
-            } else {
-                let [nx, ny, _] = field.lattice().dims();
-                let at = (child[2] * ny + child[1]) * nx + child[0];
-                let samples = &field.samples()[at..];
-                kernel.prefetch(&samples[0]);
-                kernel.prefetch(&samples[nx]);
-                kernel.prefetch(&samples[nx * ny]);
-                kernel.prefetch(&samples[nx * ny + nx]);
-            }
-        }
-        nodes.push(number, more && self.level > 0);
-        cells.push(number, more && self.level == 0);
+    ) -> Child {
+        let more = lane.stack.live != 0;
+        let child = lane.pop(pyramid);
+        self.climbs.push(number, !more & (lane.climbed < pyramid.levels.len()));
+        self.nodes.push(number, more & (child.level > 0));
+        self.cells.push(number, more & (child.level == 0));
+        pyramid.ask(kernel, memory, &child);
+        child
     }
 }
 
 impl Pyramid {
+    /// Asks memory for what a child is read from: tile or samples. `memory`: where samples and levels begin.
+    #[inline(always)]
+    fn ask<K: Kernel>(&self, kernel: K, memory: &[*const u8; 5], child: &Child) {
+        let places = &self.places[child.level];
+        let at = memory[child.level].wrapping_add(child.at.wrapping_mul(places.bytes));
+        for step in places.lines {
+            kernel.ask(at.wrapping_add(step));
+        }
+    }
+
     /// The walks of the rays whose bits are set in `active`; `ray` gives a ray and its reach.
     #[inline(always)]
-    pub(super) fn walk16<const ANY: bool, K: Children>(
+    pub(super) fn walk16<const ANY: bool, K: Kernel>(
         &self,
         kernel: K,
         field: &Field,
@@ -90,8 +85,7 @@ impl Pyramid {
         ray: impl Fn(usize) -> FlattenedRay,
         hits: &mut [Option<FlattenedHit>; WIDTH],
     ) {
-        let top = self.levels.len() - 1;
-        if self.levels[top].dims != [1; 3] {
+        if self.roots != 1 {
             // Several roots: not worth a second way.
             for (n, hit) in hits.iter_mut().enumerate().filter(|(n, _)| active >> n & 1 == 1) {
                 let ray = ray(n);
@@ -99,45 +93,55 @@ impl Pyramid {
             }
             return;
         }
-        let mut lanes: [Option<Lane<K::Ray>>; WIDTH] = [const { None }; WIDTH];
-        let mut nodes = Queue::default();
+        let mut memory = [std::ptr::null(); 5];
+        memory[0] = field.samples().as_ptr().cast();
+        for (memory, level) in memory[1..].iter_mut().zip(&self.levels) {
+            *memory = level.tiles.as_ptr().cast();
+        }
+        for n in (0..WIDTH).filter(|n| active >> n & 1 == 1) {
+            self.ask(kernel, &memory, &self.start(ray(n).origin));
+        }
+        let mut lanes: [Option<Lane<K::Ray>>; WIDTH] = std::array::from_fn(|_| None);
+        let mut next = [Child::default(); WIDTH];
+        let mut round = Round::default();
         for n in (0..WIDTH as u8).filter(|n| active >> n & 1 == 1) {
-            let ray = ray(usize::from(n));
-            match self.begin::<ANY, K>(kernel, field, &ray, f64::from(ray.reach)) {
-                Err(done) => hits[usize::from(n)] = done,
-                Ok(start) => {
-                    let constants = kernel.ray(&start.line);
-                    let stack = Stack::default();
-                    lanes[usize::from(n)] = Some(Lane { start, constants, stack, level: top + 1, child: [0; 3] });
-                    nodes.push(n, true);
-                }
+            let (ray, number) = (ray(usize::from(n)), usize::from(n));
+            match self.begin::<ANY, K>(kernel, field, &ray, f64::from(ray.reach), &mut lanes[number]) {
+                Begun::Done(hit) => hits[number] = hit,
+                Begun::On | Begun::Otherwise => round.climbs.push(n, true),
             }
         }
-        let mut cells = Queue::default();
-        while nodes.len + cells.len > 0 {
-            let (mut next_nodes, mut next_cells, mut done) = (Queue::default(), Queue::default(), Queue::default());
-            for n in nodes.lanes() {
-                let Some(lane) = &mut lanes[usize::from(n)] else { continue };
-                let line: &Line = &lane.start.line;
-                self.open(kernel, line, &lane.constants, &mut lane.stack, lane.level, lane.child);
-                lane.queue(kernel, self, field, n, [&mut next_nodes, &mut next_cells, &mut done]);
+        while round.climbs.len + round.nodes.len + round.cells.len > 0 {
+            let mut then = Round::default();
+            for n in round.climbs.lanes() {
+                let number = usize::from(n) % WIDTH;
+                let Some(lane) = &mut lanes[number] else { continue };
+                self.climb(kernel, lane);
+                next[number] = then.queue(kernel, self, &memory, lane, n);
             }
-            for n in cells.lanes() {
-                let Some(lane) = &mut lanes[usize::from(n)] else { continue };
-                match lane.start.ray.cell::<ANY>(&lane.start.line, lane.child, lane.start.departing) {
-                    Step::On => {
-                        lane.queue(kernel, self, field, n, [&mut next_nodes, &mut next_cells, &mut done]);
-                    }
-                    Step::Hit(hit) => hits[usize::from(n)] = Some(hit),
-                    Step::End => {}
+            for n in round.nodes.lanes() {
+                let number = usize::from(n) % WIDTH;
+                let Some(lane) = &mut lanes[number] else { continue };
+                self.open(kernel, lane, next[number]);
+                next[number] = then.queue(kernel, self, &memory, lane, n);
+            }
+            for n in round.cells.lanes() {
+                let number = usize::from(n) % WIDTH;
+                let Some(lane) = &mut lanes[number] else { continue };
+                match lane.cell::<ANY, K>(kernel, next[number]) {
+                    Step::On => next[number] = then.queue(kernel, self, &memory, lane, n),
+                    Step::Hit(hit) => (hits[number], lane.capped) = (Some(hit), false),
+                    Step::End => lane.capped = false,
                 }
             }
-            if self.capped {
-                for n in done.lanes() {
-                    hits[usize::from(n)] = lanes[usize::from(n)].as_ref().and_then(|lane| self.leave(&lane.start.ray));
+            round = then;
+        }
+        if self.capped {
+            for (hit, lane) in hits.iter_mut().zip(&lanes) {
+                if let Some(lane) = lane.as_ref().filter(|lane| lane.capped) {
+                    *hit = self.leave(&lane.ray);
                 }
             }
-            (nodes, cells) = (next_nodes, next_cells);
         }
     }
 }

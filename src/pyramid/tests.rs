@@ -102,13 +102,18 @@ fn packets_give_the_bits_of_single_rays() {
 }
 
 #[test]
-fn quantisation_is_monotone_and_clamps() {
-    assert_eq!(
-        [f32::NAN, f32::NEG_INFINITY, -1.0, 0.0, 1.0, 2.0, f32::INFINITY].map(quantise),
-        [0, 0, 0, 0, 65535, 65535, 65535]
-    );
-    let values = (0..=1_000_000u32).map(|i| quantise(i as f32 * 1e-6));
-    assert!(values.clone().zip(values.skip(1)).all(|(a, b)| a <= b && b - a <= 1));
+fn ranks_are_monotone_clamp_and_serve_flat_parts() {
+    // Nine samples of ten in a hundredth of the sweep.
+    let mut rng = Rng::stream(6, Stage::Test, 0);
+    let samples: Vec<f32> =
+        (0..200_000).map(|i| (if i % 10 == 0 { rng.unit() } else { 0.5 + 0.01 * rng.unit() }) as f32).collect();
+    let ranks = Ranks::new(&samples);
+    assert_eq!([f32::NAN, f32::NEG_INFINITY, -1.0, 0.0].map(|s| ranks.of(s)), [0; 4]);
+    assert_eq!([1.0, 2.0, f32::INFINITY].map(|s| ranks.of(s)), [255; 3]);
+    let values = (0..=1_000_000u32).map(|i| ranks.of(i as f32 * 1e-6));
+    assert!(values.clone().zip(values.skip(1)).all(|(a, b)| a <= b));
+    let steps = |a: f32, b: f32| ranks.of(b) - ranks.of(a);
+    assert!(steps(0.5, 0.51) > 100 && steps(0.0, 0.5) > 60, "{} {}", steps(0.5, 0.51), steps(0.0, 0.5));
 }
 
 /// Crosses every plane, looks at every cell.
@@ -141,24 +146,56 @@ fn plain_walk(field: &Field, ray: &FlattenedRay) -> Option<f64> {
     None
 }
 
-#[test]
-fn first_hits_are_those_of_a_plain_walk_in_f64() {
-    let field = field([70, 66, 67], 1e4);
-    let pyramid = Pyramid::new(&field, false);
-    let mut rng = Rng::stream(4, Stage::Test, 0);
-    let (mut wrong, mut hits) = (0, 0);
-    for _ in 0..50_000 {
-        let mut ray = ray(&field, &mut rng, 1e4);
+/// Samples without any order: `levels` of them, from `low` on.
+fn noise(levels: u64, low: f64) -> Field {
+    let lattice = Lattice::aligned([33, 34, 35], DVec3::ZERO, DVec3::ONE).unwrap();
+    let mut rng = Rng::stream(8, Stage::Test, levels);
+    let samples = (0..lattice.len()).map(|_| low + (rng.bits() % levels) as f64).collect();
+    let volume = Volume::new("noise", lattice, Samples::F64(samples)).unwrap();
+    Field::new(&volume, Sweep::new(low, low + (levels - 1) as f64).unwrap()).unwrap()
+}
+
+/// Rays out of `count` whose first hit is not that of [`plain_walk`], and rays that hit.
+fn wrong_hits(field: &Field, count: u64) -> (u64, u64) {
+    let pyramid = Pyramid::new(field, false);
+    let judge = |index: u64| {
+        let mut rng = Rng::stream(4, Stage::Test, index);
+        let mut ray = ray(field, &mut rng, 1e4);
         (ray.departure, ray.reach) = (Departure::Free, f32::INFINITY);
         ray.isovalue = rng.unit() as f32;
-        let expected = plain_walk(&field, &ray);
-        let hit = pyramid.intersect(&field, &ray, f64::INFINITY).map(|h| f64::from(h.t));
-        hits += u32::from(hit.is_some());
-        wrong += u32::from(match (hit, expected) {
+        let expected = plain_walk(field, &ray);
+        let hit = pyramid.intersect(field, &ray, f64::INFINITY).map(|h| f64::from(h.t));
+        let wrong = match (hit, expected) {
             (Some(t), Some(expected)) => (t - expected).abs() > 1e-6 * expected.max(1.0),
             (hit, expected) => hit.is_some() != expected.is_some(),
-        });
+        };
+        (u64::from(wrong), u64::from(hit.is_some()))
+    };
+    (0..count).into_par_iter().map(judge).reduce(|| (0, 0), |a, b| (a.0 + b.0, a.1 + b.1))
+}
+
+/// Smooth, noise, plateaus of four levels, and a range that is a hundred thousandth of its place.
+fn hard_fields() -> [Field; 4] {
+    [field([70, 66, 67], 1e4), noise(255, 0.0), noise(4, 0.0), noise(255, 2.55e7)]
+}
+
+#[test]
+fn first_hits_are_those_of_a_plain_walk_in_f64() {
+    for (n, field) in hard_fields().iter().enumerate() {
+        let (wrong, hits) = wrong_hits(field, 30_000);
+        assert!(wrong == 0 && hits > 6_000, "field {n}: {wrong} of {hits} hits are wrong");
     }
-    assert_eq!(wrong, 0, "of {hits}");
-    assert!(hits > 10_000);
+}
+
+/// What docs/performance.md promises; minutes: `cargo test --release --lib ten_million -- --ignored --nocapture`.
+#[test]
+#[ignore = "minutes"]
+fn of_ten_million_first_hits_at_most_one_is_wrong() {
+    let (mut wrong, mut hits) = (0, 0);
+    for field in &hard_fields() {
+        let found = wrong_hits(field, 2_500_000);
+        println!("{} of {} hits are wrong", found.0, found.1);
+        (wrong, hits) = (wrong + found.0, hits + found.1);
+    }
+    assert!(wrong <= 1, "{wrong} of {hits} hits among 10⁷ rays");
 }

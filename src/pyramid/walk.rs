@@ -10,26 +10,48 @@
 //! Cells that are skipped have all their corners on one side. None of the path is skipped wrongly: a cell of the path
 //! is met between two times of its own planes, in order; a block's planes lie around those of its cells and times are
 //! monotone, so that the times of the block are in order too.
+//!
+//! The walk climbs: it looks at the nodes around the start from the smallest up, each without the child it comes from. A
+//! path begins in all of them and leaves each but once, so that this is its order; and no node waits for another.
 
-use super::children::{Children, Line};
-use super::{LEVELS, Pyramid, quantise4};
+use super::kernel::{Kernel, Line, Piece, Scalar};
+use super::{LEVELS, Pyramid, Ranks};
 use crate::cell::Cell;
 use crate::field::Field;
 use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target};
-use glam::{DVec3, Vec4};
+use glam::{DVec3, Vec3, Vec4};
 
 /// Corners on the face across an axis, near and far.
 const FACES: [[u8; 2]; 3] = [[0x55, 0xaa], [0x33, 0xcc], [0x0f, 0xf0]];
 
 /// Directions below this share of the largest component never cross a plane.
-const PARALLEL: f64 = 1e-30;
+const PARALLEL: f32 = 1e-30;
+
+/// Lattices stay below this, where every f32 is an integer from here to twice that.
+const INTEGERS: f32 = 8_388_608.0;
+
+/// [`Line::flip`] of the axes whose bits are set in the index.
+const FLIPS: [u32; 8] = [0, 0x03, 0x0c, 0x0f, 0x30, 0x33, 0x3c, 0x3f];
+
+/// Where the 64 children of a node stand.
+static PLACES: [Vec4; 64] = {
+    let mut places = [Vec4::ZERO; 64];
+    let mut n = 0;
+    while n < 64 {
+        places[n] = Vec4::new((n & 3) as f32, (n >> 2 & 3) as f32, (n >> 4) as f32, 0.0);
+        n += 1;
+    }
+    places
+};
 
 /// A ray within Ω.
 pub(super) struct Ray<'a> {
-    field: &'a Field,
-    o: [f64; 3],
-    d: [f64; 3],
-    inv: [f64; 3],
+    samples: &'a [f32],
+    /// What a step along y or z adds to a sample's position in memory.
+    steps: [usize; 2],
+    o: [f64; 4],
+    d: [f64; 4],
+    inv: [f64; 4],
     /// The isovalue; h at the start if the ray starts on the surface.
     c: f64,
     /// The smallest f32 not below `c`: samples compare to both alike.
@@ -41,12 +63,30 @@ pub(super) struct Ray<'a> {
     within: bool,
 }
 
-/// A ray that is ready for the hierarchy.
-pub(super) struct Start<'a> {
+/// A ray on its way through the hierarchy.
+pub(super) struct Lane<'a, R> {
     pub(super) ray: Ray<'a>,
-    pub(super) line: Line,
-    /// The cell of the start is done.
-    pub(super) departing: bool,
+    line: Line,
+    /// [`Kernel::ray`].
+    constants: R,
+    pub(super) stack: Stack,
+    /// The cell of the start.
+    pub(super) cell: [u32; 3],
+    /// It is done.
+    departing: bool,
+    /// Levels that were looked at around the start.
+    pub(super) climbed: usize,
+    /// It may end on a face of Ω.
+    pub(super) capped: bool,
+}
+
+/// How a ray begins.
+pub(super) enum Begun {
+    /// It has a [`Lane`].
+    On,
+    Done(Option<FlattenedHit>),
+    /// In a way that is not looked for here.
+    Otherwise,
 }
 
 /// Children still to be visited.
@@ -56,23 +96,48 @@ pub(super) struct Stack {
     pub(super) live: u32,
     /// The children, bit by bit, in the ray's order.
     pending: [u64; LEVELS],
-    /// The number of each level's first child, in units of children.
-    first: [[i32; 3]; LEVELS],
+    /// Each level's first child: its place in memory, its number in units of children, and where it stands.
+    first: [usize; LEVELS],
+    number: [[u32; 3]; LEVELS],
+    corner: [Vec4; LEVELS],
+}
+
+/// A child of a level's node.
+#[derive(Clone, Copy, Default)]
+pub(super) struct Child {
+    pub(super) level: usize,
+    n: u32,
+    /// Place in memory: of its tile, or of the cell's first sample.
+    pub(super) at: usize,
+    /// Its first corner in cells.
+    corner: Vec4,
+}
+
+/// The width of a level's children, in cells.
+#[inline(always)]
+fn size(level: usize) -> f32 {
+    f32::from_bits((127 + 2 * level as u32) << 23)
+}
+
+/// A place of the lattice in the tables of places.
+#[inline(always)]
+fn point([x, y, z]: [u32; 3]) -> Vec4 {
+    // Below 2²³ an integer is the low bits of itself plus 2²³.
+    Vec4::from_array([x, y, z, 0].map(|i| f32::from_bits(i | INTEGERS.to_bits()))) - INTEGERS
 }
 
 impl Stack {
-    /// The level and number of the next child. Something must be live.
+    /// The next child; no child if nothing is live.
     #[inline(always)]
-    #[allow(clippy::cast_possible_wrap, reason = "below 64")]
-    pub(super) fn pop(&mut self, line: &Line) -> (usize, [i32; 3]) {
+    fn pop(&mut self, pyramid: &Pyramid, line: &Line) -> Child {
         let level = (self.live.trailing_zeros() as usize) % LEVELS;
         let these = self.pending[level];
         let rest = these & these.wrapping_sub(1);
         self.pending[level] = rest;
-        self.live ^= u32::from(rest == 0) << level;
-        let n = (these.trailing_zeros() ^ line.flip) as i32;
-        let [x, y, z] = self.first[level];
-        (level, [x + (n & 3), y + (n >> 2 & 3), z + (n >> 4)])
+        self.live &= !(u32::from(rest == 0) << level);
+        let n = (these.trailing_zeros() ^ line.flip) % 64;
+        let at = self.first[level].wrapping_add(pyramid.places[level].child[n as usize]);
+        Child { level, n, at, corner: self.corner[level] + PLACES[n as usize] * size(level) }
     }
 }
 
@@ -87,69 +152,236 @@ pub(super) enum Step {
 impl Pyramid {
     /// The walk. With `ANY`, the t of the hit is only a bound.
     #[inline(always)]
-    pub(super) fn walk<const ANY: bool, K: Children>(
+    pub(super) fn walk<const ANY: bool, K: Kernel>(
         &self,
         kernel: K,
         field: &Field,
         ray: &FlattenedRay,
         reach: f64,
     ) -> Option<FlattenedHit> {
-        let start = match self.begin::<ANY, K>(kernel, field, ray, reach) {
-            Ok(start) => start,
-            Err(done) => return done,
-        };
-        let Start { ray, line, .. } = &start;
-        // Nodes larger than 256³ cells are taken in turn; mostly there is one.
-        let top = self.levels.len() - 1;
-        let constants = kernel.ray(line);
-        let roots = self.levels[top].dims;
-        let width = (4 << (2 * top)) as f32;
-        let turn = |a: usize, i: usize| if line.negative(a) { roots[a] - 1 - i } else { i };
-        let met = |a: usize, i: usize| {
-            let (b, e) = (i as f32 * width, (i + 1) as f32 * width);
-            let (b, e) = if line.negative(a) { (e, b) } else { (b, e) };
-            (line.time(a, b), line.time(a, e))
-        };
-        for k in 0..roots[2] {
-            for j in 0..roots[1] {
-                for i in 0..roots[0] {
-                    let root = [turn(0, i), turn(1, j), turn(2, k)];
-                    if roots != [1; 3] {
-                        let [x, y, z] = [0, 1, 2].map(|a| met(a, root[a]));
-                        if !(x.0.max(y.0).max(z.0) <= x.1.min(y.1).min(z.1)) {
-                            continue;
-                        }
-                    }
-                    let mut stack = self.stack(kernel, line, &constants, root);
-                    while stack.live != 0 {
-                        let (level, child) = stack.pop(line);
-                        if level > 0 {
-                            self.open(kernel, line, &constants, &mut stack, level, child);
-                            continue;
-                        }
-                        match ray.cell::<ANY>(line, child, start.departing) {
-                            Step::On => {}
-                            Step::Hit(hit) => return Some(hit),
-                            Step::End => return None,
-                        }
-                    }
+        let mut lane = None;
+        match kernel.outlined(|| self.begin::<ANY, K>(kernel, field, ray, reach, &mut lane)) {
+            Begun::Done(hit) => return hit,
+            Begun::On | Begun::Otherwise => {}
+        }
+        let lane = lane.as_mut()?;
+        let mut turn = 0;
+        loop {
+            while lane.stack.live == 0 {
+                if lane.climbed < self.levels.len() {
+                    self.climb(kernel, lane);
+                } else if self.roots == 1 || !self.next_root(kernel, lane, &mut turn) {
+                    return self.leave(&lane.ray);
                 }
             }
+            let child = lane.pop(self);
+            if child.level > 0 {
+                self.open(kernel, lane, child);
+                continue;
+            }
+            match lane.cell::<ANY, K>(kernel, child) {
+                Step::On => {}
+                Step::Hit(hit) => return Some(hit),
+                Step::End => return None,
+            }
         }
-        self.leave(ray)
     }
 
-    /// What comes before the hierarchy: the part of the ray in Ω, its isovalue, and the cell of its departure. `Err`
-    /// if that is all.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped cell numbers; t leaves as f32")]
+    /// Looks around the start: opens the nodes that hold it on the next two levels, but for the children that hold it and
+    /// are done. What they give comes first on the path, and neither node waits for the other.
     #[inline(always)]
-    pub(super) fn begin<'a, const ANY: bool, K: Children>(
+    pub(super) fn climb<K: Kernel>(&self, kernel: K, lane: &mut Lane<K::Ray>) {
+        let level = lane.climbed;
+        lane.climbed = level + 2;
+        for level in level..(level + 2).min(self.levels.len()) {
+            let shift = 2 * level as u32;
+            let number = lane.cell.map(|i| i >> (shift + 2));
+            let corner = point(lane.cell.map(|i| i >> (shift + 2) << (shift + 2)));
+            self.look(kernel, lane, level, self.levels[level].at(number), number, corner);
+            let [x, y, z] = lane.cell.map(|i| i >> shift & 3);
+            let own = u64::from(level > 0 || lane.departing) << (((x | y << 2 | z << 4) ^ lane.line.flip) % 64);
+            let pending = lane.stack.pending[level % LEVELS] & !own;
+            lane.stack.pending[level % LEVELS] = pending;
+            lane.stack.live &= !(u32::from(pending == 0) << level);
+            if level > 0 {
+                // The first that will be opened after what is found on the levels below.
+                let n = (pending.trailing_zeros() ^ lane.line.flip) % 64;
+                let at = lane.stack.first[level % LEVELS].wrapping_add(self.places[level % LEVELS].child[n as usize]);
+                let tile = self.levels[level - 1].tiles.as_ptr().wrapping_add(at).cast::<u8>();
+                kernel.ask(tile);
+                kernel.ask(tile.wrapping_add(64));
+            }
+        }
+    }
+
+    /// Opens the next node of the top level that the ray may meet after its start's; false if there is none. Nodes larger
+    /// than 256³ cells are taken in turn; mostly there is one.
+    #[cold]
+    #[allow(clippy::cast_possible_truncation, reason = "node numbers are small")]
+    fn next_root<K: Kernel>(&self, kernel: K, lane: &mut Lane<K::Ray>, turn: &mut usize) -> bool {
+        let top = self.levels.len() - 1;
+        let (width, roots) = (size(top + 1), self.levels[top].dims);
+        while *turn < self.roots {
+            let n = [*turn % roots[0], *turn / roots[0] % roots[1], *turn / (roots[0] * roots[1])];
+            *turn += 1;
+            let line = &lane.line;
+            let number = [0, 1, 2].map(|a| if line.negative(a) { roots[a] - 1 - n[a] } else { n[a] } as u32);
+            let corner = point(number) * width;
+            let near = line.times(corner + (Vec4::ONE - line.far) * width);
+            let far = line.times(corner + line.far * width);
+            let met = near.x.max(near.y).max(near.z) <= far.x.min(far.y).min(far.z);
+            if met && number != lane.cell.map(|i| i >> (2 * top + 2)) {
+                self.look(kernel, lane, top, self.levels[top].at(number), number, corner);
+                return true;
+            }
+        }
+        false
+    }
+
+    /// What comes before the hierarchy: the part of the ray in Ω, its isovalue, and the cell of its departure.
+    #[inline(always)]
+    pub(super) fn begin<'a, const ANY: bool, K: Kernel>(
         &self,
         kernel: K,
         field: &'a Field,
         ray: &FlattenedRay,
         reach: f64,
-    ) -> Result<Start<'a>, Option<FlattenedHit>> {
+        lane: &mut Option<Lane<'a, K::Ray>>,
+    ) -> Begun {
+        match self.begin_within(kernel, field, ray, reach, lane) {
+            Begun::Otherwise => kernel.outlined(|| self.begin_anywhere::<ANY, K>(kernel, field, ray, reach, lane)),
+            begun => begun,
+        }
+    }
+
+    /// [`Pyramid::begin`] of most rays: they start amid Ω, and those on the surface leave their cell without meeting it
+    /// again.
+    #[inline(always)]
+    #[allow(clippy::cast_possible_truncation, reason = "clamped: t and c leave as f32")]
+    fn begin_within<'a, K: Kernel>(
+        &self,
+        kernel: K,
+        field: &'a Field,
+        ray: &FlattenedRay,
+        reach: f64,
+        lane: &mut Option<Lane<'a, K::Ray>>,
+    ) -> Begun {
+        let (origin, direction) = (ray.origin.extend(0.5), ray.direction.extend(0.0));
+        let size = direction.abs();
+        let scale = size.max_element();
+        let amid = (origin.cmpgt(Vec4::ZERO) & origin.cmplt(self.far)).all();
+        if !(amid && scale > 0.0 && scale < f32::INFINITY) || matches!(ray.departure, Departure::Cap(..)) {
+            return Begun::Otherwise;
+        }
+        let backward = direction.cmplt(Vec4::ZERO);
+        let floor = origin.floor();
+        // On a shared plane the ray is in the cell it goes to.
+        let corner = floor - Vec4::select(backward & origin.cmpeq(floor), Vec4::ONE, Vec4::ZERO);
+        let [x, y, z, _] = (corner + INTEGERS).to_array().map(|x| x.to_bits() & 0x7f_ffff);
+        let cell = [x, y, z];
+        // What is cold most often, on the way while the first cell is computed.
+        self.prefetch(kernel, cell, 0);
+        let crosses = size.cmpgt(Vec4::splat(PARALLEL * scale));
+        let backward = backward & crosses;
+        let mut line = Line {
+            o: Vec4::select(crosses, origin, corner + 0.5),
+            inv: Vec4::select(crosses, scale / direction, Vec4::splat(1e30)),
+            far: Vec4::select(backward, Vec4::ZERO, Vec4::ONE),
+            flip: FLIPS[backward.bitmask() as usize & 7],
+            // Roughly: the cells decide.
+            end: (reach * f64::from(scale) * (1.0 + 1e-5) + 1e-3) as f32,
+            most_lo: 0,
+            least_hi: 0,
+        };
+        let (o, d) = (origin.to_array().map(f64::from), direction.to_array().map(f64::from));
+        let inv = d.map(|x| 1.0 / x);
+        let (mut c, mut c32) = (f64::from(ray.isovalue), ray.isovalue);
+        let mut departing = false;
+        if let Departure::Surface(side) = ray.departure {
+            let planes = corner + line.far;
+            let (exit, _) = first_of(line.times(planes));
+            let t_exit = ((f64::from(planes.to_array()[exit]) - o[exit]) * inv[exit]).max(0.0);
+            let last = t_exit >= reach;
+            let corners = kernel.corners(field.samples(), self.sample(cell), self.steps);
+            self.ask_around(kernel, field.samples(), &line, cell);
+            let on = if last { 0 } else { 1 << exit };
+            let t = [0.0, if last { reach } else { t_exit }];
+            let v = kernel.span(&corners, &Piece { o: &o, d: &d, far: line.far, cell: corner, t, on: [0, on] });
+            // So that the root at the start is exactly 0.
+            c = v[0];
+            c32 = not_below(c);
+            // The Bernstein coefficients of the cubic without this root, but for factors.
+            let sign = if side == Side::Higher { 1.0 } else { -1.0 };
+            let rises = [(v[1] + v[2] + v[4]) - 3.0 * c, (v[3] + v[5] + v[6]) - 3.0 * c, v[7] - c].map(|x| sign * x);
+            let clear = (rises[0] > self.rounding) & (rises[1] > self.rounding) & (rises[2] > self.rounding);
+            let inside = kernel.inside(&corners, c32);
+            let end = state(inside, exit, !line.negative(exit), v[7] >= c);
+            if !(clear & (last | (end == (side == Side::Higher)))) {
+                return Begun::Otherwise;
+            }
+            if last {
+                return Begun::Done(None);
+            }
+            departing = true;
+        }
+        line.hold(&self.ranks, c32);
+        let ray = Ray { samples: field.samples(), steps: self.steps, o, d, inv, c, c32, t: 0.0, reach, within: true };
+        let constants = kernel.ray(&line);
+        *lane = Some(Lane {
+            ray,
+            line,
+            constants,
+            stack: Stack::default(),
+            cell,
+            departing,
+            climbed: 0,
+            capped: self.capped,
+        });
+        Begun::On
+    }
+
+    /// Asks memory for the rows of samples that the cells after `cell` add: most rays that leave a surface meet it in a
+    /// neighbour's cell, and look there.
+    #[inline(always)]
+    fn ask_around<K: Kernel>(&self, kernel: K, samples: &[f32], line: &Line, cell: [u32; 3]) {
+        let at = samples.as_ptr().wrapping_add(self.sample(cell));
+        let [y, z] = self.steps;
+        let beyond = |axis: usize, step: usize| {
+            at.wrapping_add(if line.negative(axis) { step.wrapping_neg() } else { 2 * step })
+        };
+        for row in [beyond(1, y), beyond(1, y).wrapping_add(z), beyond(2, z), beyond(2, z).wrapping_add(y)] {
+            kernel.ask(row.cast());
+        }
+    }
+
+    /// The cell of a start, roughly: only to ask memory for it.
+    #[inline(always)]
+    pub(super) fn start(&self, origin: Vec3) -> Child {
+        let floor = origin.extend(0.0).max(Vec4::ZERO).min(self.far).floor();
+        let [x, y, z, _] = (floor + INTEGERS).to_array().map(|x| x.to_bits() & 0x7f_ffff);
+        Child { at: self.sample([x, y, z]), ..Child::default() }
+    }
+
+    /// Asks memory for the nodes of two levels that hold `cell`.
+    #[inline(always)]
+    pub(super) fn prefetch<K: Kernel>(&self, kernel: K, cell: [u32; 3], level: usize) {
+        for level in level..(level + 2).min(self.levels.len()) {
+            let nodes = &self.levels[level];
+            kernel.prefetch(&nodes.tiles[nodes.at(cell.map(|i| i >> (2 * level + 2)))]);
+        }
+    }
+
+    /// [`Pyramid::begin`] of any ray.
+    #[allow(clippy::cast_possible_truncation, reason = "clamped cell numbers; t leaves as f32")]
+    #[inline(always)]
+    fn begin_anywhere<'a, const ANY: bool, K: Kernel>(
+        &self,
+        kernel: K,
+        field: &'a Field,
+        ray: &FlattenedRay,
+        reach: f64,
+        lane: &mut Option<Lane<'a, K::Ray>>,
+    ) -> Begun {
         let n = self.cells;
         let mut o = ray.origin.as_dvec3().to_array();
         let d = ray.direction.as_dvec3().to_array();
@@ -158,11 +390,11 @@ impl Pyramid {
             let (axis, far) = (usize::from(face % 3), face >= 3);
             let inward = if far { d[axis] < 0.0 } else { d[axis] > 0.0 };
             if inward != (side == Side::Higher) && d[axis] != 0.0 {
-                return Err(Some(FlattenedHit { t: 0.0, target: cap(axis, far, side) }));
+                return Begun::Done(Some(FlattenedHit { t: 0.0, target: cap(axis, far, side) }));
             }
             if side == Side::Lower {
                 // Ω is convex: what leaves it never comes back.
-                return Err(None);
+                return Begun::Done(None);
             }
             o[axis] = if far { n[axis] as f64 } else { 0.0 };
         }
@@ -172,7 +404,7 @@ impl Pyramid {
                 // It leaves Ω where it starts. There h = c counts as inside, which must not end a ray from the lower side.
                 let closed = self.capped && side == Side::Higher;
                 let target = cap(axis, d[axis] > 0.0, side);
-                return Err(closed.then_some(FlattenedHit { t: 0.0, target }));
+                return Begun::Done(closed.then_some(FlattenedHit { t: 0.0, target }));
             }
         }
         let inv = d.map(|x| 1.0 / x);
@@ -183,7 +415,7 @@ impl Pyramid {
                 let far = n[a] as f64;
                 if d[a] == 0.0 {
                     if !(o[a] >= 0.0 && o[a] <= far) {
-                        return Err(None);
+                        return Begun::Done(None);
                     }
                     continue;
                 }
@@ -197,95 +429,115 @@ impl Pyramid {
         }
         let scale = d[0].abs().max(d[1].abs()).max(d[2].abs());
         if !(t <= t_out) || scale == 0.0 {
-            return Err(None);
+            return Begun::Done(None);
         }
         // The cell of the start, and the line from there.
-        let mut cell = [0i32; 3];
-        let mut line = Line { o: [0.0; 3], inv: [1e30; 3], flip: 0, end: 0.0, most_lo: 0, least_hi: 0 };
+        let mut cell = [0u32; 3];
+        let mut line = Line {
+            o: Vec4::ZERO,
+            inv: Vec4::splat(1e30),
+            far: Vec4::ONE,
+            flip: 0,
+            // Roughly: the cells decide.
+            end: ((reach - t) * scale * (1.0 + 1e-5) + 1e-3) as f32,
+            most_lo: 0,
+            least_hi: 0,
+        };
         for a in 0..3 {
             let p = o[a] + t * d[a];
             // On a shared plane the ray is in the cell it goes to.
             let below = d[a] < 0.0 && p == p.floor();
-            cell[a] = (p.floor() as i32 - i32::from(below)).clamp(0, n[a] as i32 - 1);
-            if d[a].abs() > PARALLEL * scale {
+            cell[a] = (p.floor() as i32 - i32::from(below)).clamp(0, n[a] as i32 - 1).cast_unsigned();
+            if d[a].abs() > f64::from(PARALLEL) * scale {
                 (line.o[a], line.inv[a]) = (p as f32, (scale * inv[a]) as f32);
                 line.flip |= (u32::from(d[a] < 0.0) * 3) << (2 * a);
+                line.far[a] = if d[a] < 0.0 { 0.0 } else { 1.0 };
             } else {
                 line.o[a] = cell[a] as f32 + 0.5;
             }
         }
-        // What is cold most often, on the way while the first cell is computed.
-        for (level, shift) in [(0, 2), (1, 4)] {
-            if let Some(level) = self.levels.get(level) {
-                kernel.prefetch(level.tile(cell.map(|i| i as usize >> shift)));
-            }
-        }
-        // Roughly: the cells decide.
-        line.end = ((reach - t) * scale * (1.0 + 1e-5) + 1e-3) as f32;
+        self.prefetch(kernel, cell, 0);
 
-        let mut c = f64::from(ray.isovalue);
+        let c = f64::from(ray.isovalue);
+        let within = entry.is_none();
+        let four = |[x, y, z]: [f64; 3]| [x, y, z, 0.0];
+        let (samples, steps) = (field.samples(), self.steps);
+        let (o, d, inv) = (four(o), four(d), four(inv));
+        let mut ray_in = Ray { samples, steps, o, d, inv, c, c32: ray.isovalue, t, reach, within };
         let mut departing = None;
-        if let (Departure::Surface(side), None) = (ray.departure, entry) {
-            let local = DVec3::from_array(std::array::from_fn(|a| (o[a] - f64::from(cell[a])).clamp(0.0, 1.0)));
-            let here = Cell { s: field.corners(cell.map(|i| i as usize)) }.value(local);
+        if let (Departure::Surface(side), true) = (ray.departure, within) {
+            let here = ray_in.cell_at(self.sample(cell)).value(ray_in.local(point(cell), 0.0));
             if here.is_finite() {
                 // So that the root at the start is exactly 0.
-                c = here;
+                (ray_in.c, ray_in.c32) = (here, not_below(here));
                 departing = Some(side);
             }
         }
-        let nearest = c as f32;
-        let c32 = if f64::from(nearest) < c { nearest.next_up() } else { nearest };
-        [line.most_lo, line.least_hi, ..] = quantise4(Vec4::new(c32.next_down(), c32, 0.0, 0.0));
-
-        let ray = Ray { field, o, d, inv, c, c32, t, reach, within: entry.is_none() };
+        line.hold(&self.ranks, ray_in.c32);
+        let ray = ray_in;
         if let Some(axis) = entry {
             let far = d[axis] < 0.0;
-            if self.capped && ray.cell_at(cell).face_inside_ray(axis, far, &ray, cell, t) {
-                return Err(Some(FlattenedHit { t: t as f32, target: cap(axis, far, Side::Lower) }));
+            if self.capped && ray.cell_at(self.sample(cell)).face_inside_ray(axis, far, &ray, point(cell), t) {
+                return Begun::Done(Some(FlattenedHit { t: t as f32, target: cap(axis, far, Side::Lower) }));
             }
         }
         if let Some(side) = departing {
-            match ray.first_cell::<ANY>(&line, cell, side) {
+            match ray.first_cell::<ANY>(&line, self.sample(cell), point(cell), side) {
                 Step::On => {}
-                Step::Hit(hit) => return Err(Some(hit)),
-                Step::End => return Err(None),
+                Step::Hit(hit) => return Begun::Done(Some(hit)),
+                Step::End => return Begun::Done(None),
             }
         }
 
-        Ok(Start { ray, line, departing: departing.is_some() })
+        let (constants, departing) = (kernel.ray(&line), departing.is_some());
+        *lane = Some(Lane {
+            ray,
+            line,
+            constants,
+            stack: Stack::default(),
+            cell,
+            departing,
+            climbed: 0,
+            capped: self.capped,
+        });
+        Begun::On
     }
 
-    /// The root with its children.
+    /// Pushes the active children of a node that was popped.
     #[inline(always)]
-    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, reason = "node numbers are small")]
-    pub(super) fn stack<K: Children>(&self, kernel: K, line: &Line, constants: &K::Ray, root: [usize; 3]) -> Stack {
-        let mut stack = Stack::default();
-        self.open(kernel, line, constants, &mut stack, self.levels.len(), root.map(|i| i as i32));
-        stack
+    pub(super) fn open<K: Kernel>(&self, kernel: K, lane: &mut Lane<K::Ray>, node: Child) {
+        let [x, y, z] = lane.stack.number[node.level % LEVELS];
+        let number = [x + (node.n & 3), y + (node.n >> 2 & 3), z + (node.n >> 4)];
+        self.look(kernel, lane, (node.level - 1) % LEVELS, node.at, number, node.corner);
     }
 
-    /// Pushes the active children of node `node`, itself a child at `level`.
+    /// Pushes the active children of node `number` of `level`, whose tile stands `at` and which begins at `corner`.
     #[inline(always)]
-    #[allow(clippy::cast_sign_loss, reason = "node numbers are not negative")]
-    pub(super) fn open<K: Children>(
+    fn look<K: Kernel>(
         &self,
         kernel: K,
-        line: &Line,
-        constants: &K::Ray,
-        stack: &mut Stack,
+        lane: &mut Lane<K::Ray>,
         level: usize,
-        node: [i32; 3],
+        at: usize,
+        number: [u32; 3],
+        corner: Vec4,
     ) {
-        let level = (level - 1) % LEVELS;
-        let first = node.map(|i| 4 * i);
-        let shift = 2 * level;
-        let base = [first[0] << shift, first[1] << shift, first[2] << shift, 0];
-        let tile = self.levels[level].tile(node.map(|i| i as usize));
-        let found = kernel.children(line, constants, tile, base, (1 << shift) as f32);
-        stack.first[level] = first;
+        let tile = &self.levels[level].tiles[at];
+        let found = kernel.children(&lane.line, &lane.constants, tile, corner, size(level));
+        let stack = &mut lane.stack;
+        let first = number.map(|i| 4 * i);
+        let [y, z] = self.places[level].steps;
+        stack.first[level] = first[0] as usize + first[1] as usize * y + first[2] as usize * z;
+        stack.number[level] = first;
+        stack.corner[level] = corner;
         stack.pending[level] = found;
         stack.live |= u32::from(found != 0) << level;
+    }
+
+    /// Where the samples of a cell begin.
+    #[inline(always)]
+    fn sample(&self, [i, j, k]: [u32; 3]) -> usize {
+        i as usize + j as usize * self.steps[0] + k as usize * self.steps[1]
     }
 
     /// What a ray finds that leaves Ω within its reach, if Ω is capped.
@@ -311,99 +563,56 @@ impl Pyramid {
         let far = ray.d[axis] > 0.0;
         let cell = std::array::from_fn(|a| {
             let last = self.cells[a] as i32 - 1;
-            if a != axis {
-                ((ray.o[a] + t * ray.d[a]).floor() as i32).clamp(0, last)
-            } else if far {
-                last
-            } else {
-                0
-            }
+            let i = if a != axis { (ray.o[a] + t * ray.d[a]).floor() as i32 } else { i32::from(far) * last };
+            i.clamp(0, last).cast_unsigned()
         });
-        let inside = ray.cell_at(cell).face_inside_ray(axis, far, ray, cell, t);
+        let inside = ray.cell_at(self.sample(cell)).face_inside_ray(axis, far, ray, point(cell), t);
         inside.then(|| FlattenedHit { t: t as f32, target: cap(axis, far, Side::Higher) })
     }
 }
 
 impl Ray<'_> {
+    /// The cell whose samples begin at `at`.
     #[inline(always)]
-    #[allow(clippy::cast_sign_loss, reason = "cells of the lattice")]
-    fn cell_at(&self, cell: [i32; 3]) -> Cell {
-        Cell { s: self.field.corners(cell.map(|i| i as usize)) }
+    fn cell_at(&self, at: usize) -> Cell {
+        Cell { s: Scalar.corners(self.samples, at, self.steps) }
     }
 
-    /// Where the ray crosses the near or far plane of a cell, in f64.
+    /// Where the ray crosses a plane of the lattice, in f64.
     #[inline(always)]
-    fn time(&self, axis: usize, plane: i32) -> f64 {
+    fn time(&self, axis: usize, plane: f32) -> f64 {
         (f64::from(plane) - self.o[axis]) * self.inv[axis]
     }
 
-    /// Cell-local position at `t`.
+    /// Position at `t` in the cell at `corner`.
     #[inline(always)]
-    fn local(&self, cell: [i32; 3], t: f64) -> DVec3 {
-        let at = |a: usize| (self.o[a] + t * self.d[a] - f64::from(cell[a])).clamp(0.0, 1.0);
+    fn local(&self, corner: Vec4, t: f64) -> DVec3 {
+        let at = |a: usize| (self.o[a] + t * self.d[a] - f64::from(corner[a])).clamp(0.0, 1.0);
         DVec3::new(at(0), at(1), at(2))
     }
 
-    /// A cell of the path, or one that the path only touches.
     #[inline(always)]
-    pub(super) fn cell<const ANY: bool>(&self, line: &Line, cell: [i32; 3], departing: bool) -> Step {
-        let corners = self.cell_at(cell);
-        let inside = corners.inside(self.c32);
-        if inside == 0 || inside == u8::MAX {
-            return Step::On;
-        }
-        let far = [0, 1, 2].map(|a| i32::from(!line.negative(a)));
-        let t_in = [0, 1, 2].map(|a| line.time(a, (cell[a] + 1 - far[a]) as f32));
-        let t_out = [0, 1, 2].map(|a| line.time(a, (cell[a] + far[a]) as f32));
-        // The last plane before the cell and the first behind it.
-        let entry = last_of(t_in);
-        let exit = first_of(t_out);
-        // Touched, not crossed: another cell's planes lie between these two.
-        if !(t_in[entry] < t_out[exit] || (t_in[entry] == t_out[exit] && entry < exit)) {
-            return Step::On;
-        }
-        let first = self.within && t_in[entry] <= 0.0;
-        if first && departing {
-            return Step::On;
-        }
-        let t = if first { 0.0 } else { self.time(entry, cell[entry] + 1 - far[entry]).max(0.0) };
-        if t > self.reach {
-            return Step::End;
-        }
-        let t_exit = self.time(exit, cell[exit] + far[exit]).max(t);
-        let last = t_exit >= self.reach;
-        let local = self.local(cell, t);
-        let cubic = corners.cubic(self.c, local, DVec3::from_array(self.d));
-        // Signs come from weights, not from the cubic's coefficients, which a huge corner far away may have rounded off.
-        let start = if first {
-            corners.value(local) >= self.c
-        } else {
-            self.crossing(&corners, inside, entry, far[entry] == 0, cell, t)
-        };
-        let span = if last { (self.reach - t).max(0.0) } else { t_exit - t };
-        let end = if last {
-            corners.value(self.local(cell, t + span)) >= self.c
-        } else {
-            self.crossing(&corners, inside, exit, far[exit] == 1, cell, t_exit)
-        };
-        let crossing = if ANY && start != end { Some(0.0) } else { cubic.first_crossing(span, start, end) };
-        match crossing {
-            Some(dt) => Step::Hit(self.hit(t + dt, start)),
-            None if last => Step::End,
-            None => Step::On,
-        }
+    fn direction(&self) -> DVec3 {
+        DVec3::new(self.d[0], self.d[1], self.d[2])
+    }
+
+    /// Where h − c changes its sign after `t`, within `span`, the states at both ends being given.
+    #[inline(never)]
+    fn crossing(&self, cell: &Child, t: f64, span: f64, [begins, ends]: [bool; 2]) -> Option<f64> {
+        let cubic = self.cell_at(cell.at).cubic(self.c, self.local(cell.corner, t), self.direction());
+        cubic.first_crossing(span, begins, ends)
     }
 
     /// The cell from whose surface the ray departs.
     #[inline(always)]
-    fn first_cell<const ANY: bool>(&self, line: &Line, cell: [i32; 3], side: Side) -> Step {
-        let corners = self.cell_at(cell);
-        let far = [0, 1, 2].map(|a| i32::from(!line.negative(a)));
-        let exit = first_of([0, 1, 2].map(|a| line.time(a, (cell[a] + far[a]) as f32)));
-        let t_exit = self.time(exit, cell[exit] + far[exit]).max(0.0);
+    fn first_cell<const ANY: bool>(&self, line: &Line, at: usize, corner: Vec4, side: Side) -> Step {
+        let corners = self.cell_at(at);
+        let planes = corner + line.far;
+        let (exit, _) = first_of(line.times(planes));
+        let t_exit = self.time(exit, planes[exit]).max(0.0);
         let last = t_exit >= self.reach;
         // f(t) = t q(t): the sign of q is the sign of h − c once the ray has left.
-        let (local, d) = (self.local(cell, 0.0), DVec3::from_array(self.d));
+        let (local, d) = (self.local(corner, 0.0), self.direction());
         let mut cubic = corners.cubic(self.c, local, d).deflate();
         cubic.c[0] = corners.slope(local, d);
         let start = cubic.c.iter().find(|&&x| x != 0.0).is_none_or(|&x| x > 0.0);
@@ -414,7 +623,7 @@ impl Ray<'_> {
         let end = if last {
             cubic.value(span) >= 0.0
         } else {
-            self.crossing(&corners, corners.inside(self.c32), exit, far[exit] == 1, cell, t_exit)
+            corners.face_inside_ray(exit, !line.negative(exit), self, corner, t_exit)
         };
         let crossing = if ANY && start != end { Some(0.0) } else { cubic.first_crossing(span, start, end) };
         match crossing {
@@ -430,41 +639,115 @@ impl Ray<'_> {
         let side = if from_inside { Side::Higher } else { Side::Lower };
         FlattenedHit { t: t.min(self.reach) as f32, target: Target::Surface(side) }
     }
+}
 
-    /// The shared state of a crossing: whether h ≥ c where the ray meets the face of `cell` across `axis`.
-    /// `inside`: the corners of the cell that are.
+impl<R> Lane<'_, R> {
+    /// [`Stack::pop`].
     #[inline(always)]
-    fn crossing(&self, corners: &Cell, inside: u8, axis: usize, far: bool, cell: [i32; 3], t: f64) -> bool {
-        let face = FACES[axis][usize::from(far)];
-        match inside & face {
-            0 => false,
-            all if all == face => true,
-            _ => corners.face_inside_ray(axis, far, self, cell, t),
+    pub(super) fn pop(&mut self, pyramid: &Pyramid) -> Child {
+        self.stack.pop(pyramid, &self.line)
+    }
+
+    /// A cell of the path, or one that the path only touches.
+    #[inline(always)]
+    pub(super) fn cell<const ANY: bool, K: Kernel>(&self, kernel: K, cell: Child) -> Step {
+        let (ray, line) = (&self.ray, &self.line);
+        let corners = kernel.corners(ray.samples, cell.at, ray.steps);
+        let inside = kernel.inside(&corners, ray.c32);
+        let (near, far) = (cell.corner + (Vec4::ONE - line.far), cell.corner + line.far);
+        // The last plane before the cell and the first behind it.
+        let (entry, t_in) = last_of(line.times(near));
+        let (exit, t_out) = first_of(line.times(far));
+        // Touched, not crossed: another cell's planes lie between these two.
+        let crossed = (t_in < t_out) | ((t_in == t_out) & (entry < exit));
+        let first = ray.within & (t_in <= 0.0);
+        if (inside == 0) | (inside == u8::MAX) | !crossed | (first & self.departing) {
+            return Step::On;
         }
+        let t = ray.time(entry, near.to_array()[entry]).max(0.0);
+        let t = if first { 0.0 } else { t };
+        if t > ray.reach {
+            return Step::End;
+        }
+        let t_exit = ray.time(exit, far.to_array()[exit]).max(t);
+        let last = t_exit >= ray.reach;
+        let span = if last { (ray.reach - t).max(0.0) } else { t_exit - t };
+        let piece = Piece {
+            o: &ray.o,
+            d: &ray.d,
+            far: line.far,
+            cell: cell.corner,
+            t: [t, if last { t + span } else { t_exit }],
+            on: [if first { 0 } else { 1 << entry }, if last { 0 } else { 1 << exit }],
+        };
+        let v = kernel.span(&corners, &piece);
+        let above = kernel.at_least(&v, ray.c);
+        // Signs come from weights, not from the cubic's coefficients, which a huge corner far away may have rounded off.
+        let (begins, ends) = (above & 1 == 1, above >> 7 == 1);
+        let begins = if first { begins } else { state(inside, entry, line.negative(entry), begins) };
+        let ends = if last { ends } else { state(inside, exit, !line.negative(exit), ends) };
+        // Between equal states nothing happens if all Bernstein coefficients agree.
+        if (begins == ends) & (above == if begins { u8::MAX } else { 0 }) {
+            return if last { Step::End } else { Step::On };
+        }
+        if ANY && begins != ends {
+            return Step::Hit(ray.hit(t, begins));
+        }
+        match ray.crossing(&cell, t, span, [begins, ends]) {
+            Some(dt) => Step::Hit(ray.hit(t + dt, begins)),
+            None if last => Step::End,
+            None => Step::On,
+        }
+    }
+}
+
+/// The shared state of a crossing: whether h ≥ c where the ray meets the face across `axis`. `inside`: the corners of the
+/// cell that are; `here`: what [`Cell::value`] says there. Equal signs of all four corners decide without arithmetic.
+#[inline(always)]
+fn state(inside: u8, axis: usize, far: bool, here: bool) -> bool {
+    let face = FACES[axis][usize::from(far)];
+    inside & face == face || (here && inside & face != 0)
+}
+
+impl Line {
+    /// Sets what ranges that hold the isovalue begin and end at; `c32` is the smallest f32 not below it.
+    #[inline(always)]
+    fn hold(&mut self, ranks: &Ranks, c32: f32) {
+        [self.most_lo, self.least_hi, ..] = ranks.of4(Vec4::new(c32.next_down(), c32, 0.0, 0.0));
     }
 }
 
 impl Cell {
     /// [`Cell::face_inside`] where the ray meets the face at `t`.
     #[inline(always)]
-    fn face_inside_ray(&self, axis: usize, far: bool, ray: &Ray, cell: [i32; 3], t: f64) -> bool {
-        let at = |a: usize| (ray.o[a] + t * ray.d[a] - f64::from(cell[a])).clamp(0.0, 1.0);
+    fn face_inside_ray(&self, axis: usize, far: bool, ray: &Ray, corner: Vec4, t: f64) -> bool {
+        let at = |a: usize| (ray.o[a] + t * ray.d[a] - f64::from(corner[a])).clamp(0.0, 1.0);
         self.face_inside(axis, far, ray.c, at((axis + 1) % 3), at((axis + 2) % 3))
     }
 }
 
-/// The axis of the largest number; of equal ones the last.
+/// The smallest f32 not below `c`.
 #[inline(always)]
-fn last_of(t: [f32; 3]) -> usize {
-    let a = usize::from(t[1] >= t[0]);
-    if t[2] >= t[a] { 2 } else { a }
+#[allow(clippy::cast_possible_truncation, reason = "rounded up")]
+fn not_below(c: f64) -> f32 {
+    let nearest = c as f32;
+    if f64::from(nearest) < c { nearest.next_up() } else { nearest }
 }
 
-/// The axis of the smallest number; of equal ones the first.
+/// The axis of the largest number, of equal ones the last, and that number.
 #[inline(always)]
-fn first_of(t: [f32; 3]) -> usize {
-    let a = usize::from(t[1] < t[0]);
-    if t[2] < t[a] { 2 } else { a }
+fn last_of(t: Vec4) -> (usize, f32) {
+    let [x, y, z, _] = t.to_array();
+    let (a, t) = (usize::from(y >= x), if y >= x { y } else { x });
+    (if z >= t { 2 } else { a }, if z >= t { z } else { t })
+}
+
+/// The axis of the smallest number, of equal ones the first, and that number.
+#[inline(always)]
+fn first_of(t: Vec4) -> (usize, f32) {
+    let [x, y, z, _] = t.to_array();
+    let (a, t) = (usize::from(y < x), if y < x { y } else { x });
+    (if z < t { 2 } else { a }, if z < t { z } else { t })
 }
 
 #[inline]
