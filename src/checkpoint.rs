@@ -456,6 +456,7 @@ mod tests {
         // Written one by one: the first creates the file, the others are appended.
         for n in 0..3 {
             first.stage(1).save(n, || vec![5; 40 - n]);
+            first.save().unwrap();
         }
         let whole = held(&first);
         assert_eq!(whole.len(), 3);
@@ -479,6 +480,7 @@ mod tests {
                 assert_eq!(held(&cut), whole.clone().into_iter().take(left).collect(), "cut at {n}");
                 // What is appended then stands behind the last whole block.
                 cut.stage(2).save(9, || vec![1, 2]);
+                cut.save().unwrap();
                 let after = held(&resumed(&std::fs::read(&path).unwrap()).unwrap());
                 assert_eq!((after.len(), after.get(&(2, 9))), (left + 1, Some(&vec![1, 2])));
             }
@@ -495,6 +497,7 @@ mod tests {
         let c = Checkpoint::new(&path, job(1), Duration::ZERO).unwrap();
         for n in 0..100u8 {
             c.stage(1).save(0, || vec![n; 10_000]);
+            c.save().unwrap();
             assert!(c.state.lock().unwrap().waiting.is_empty());
             assert!(std::fs::metadata(&path).unwrap().len() < 31_000);
             assert_eq!(c.stage(1).load(0, 10_000), Some(vec![n; 10_000]));

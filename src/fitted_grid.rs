@@ -81,7 +81,8 @@ pub fn fit(
         return start;
     }
     // Diagonal of the normal equations: preconditioner, and the scale of the pull.
-    let diagonal: Vec<f32> = sorted.gather(&free, |n| Vec3::splat(sorted.samples[n].weight)).iter().map(|d| d.x).collect();
+    let diagonal: Vec<f32> =
+        sorted.gather(&free, |n| Vec3::splat(sorted.samples[n].weight)).iter().map(|d| d.x).collect();
     let seen = diagonal.par_iter().filter(|d| **d > 0.0).count().max(1);
     let pull = PULL * diagonal.iter().map(|d| f64::from(*d)).sum::<f64>() as f32 / seen as f32;
     // What each sample's cell says, from the values of its nodes two by two along x.

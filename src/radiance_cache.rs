@@ -64,13 +64,15 @@ impl<'a> NodePhotons<'a> {
     pub fn new(scene: &'a Scene, photons: &Photons, estimate: EstimateSettings) -> Self {
         let masks = masks(&scene.field, scene.lattice());
         let own = |p: &SurfacePhoton| usize::from(p.field) == scene.number();
-        let maps = [Side::Lower, Side::Higher].map(|side| {
+        let map = |side: Side| {
             let used = side == scene.surface.outside
                 || scene.surface.both_sides
                 || photons.surface.par_iter().any(|p| own(p) && p.side == side);
             used.then(|| PhotonMap::new(scene, &photons.surface, side, |p| p.bounces > 0, estimate))
-        });
-        Self { maps, masks }
+        };
+        // Counting photons is one thread's work.
+        let (lower, higher) = rayon::join(|| map(Side::Lower), || map(Side::Higher));
+        Self { maps: [lower, higher], masks }
     }
 
     /// The map of one side.

@@ -102,7 +102,8 @@ pub fn smooth(
         let before = |stages: usize| k.checked_sub(stages * reach).filter(|&z| z < nz);
         let keep = |stages: usize| k.saturating_sub(stages * reach);
         if let Some(z) = before(0) {
-            let slice: Vec<Halves> = (0..area).into_par_iter().with_min_len(1024).map(|n| halves(z * area + n)).collect();
+            let slice: Vec<Halves> =
+                (0..area).into_par_iter().with_min_len(1024).map(|n| halves(z * area + n)).collect();
             points.places.push(points.placed(z, &slice), keep(5));
             raw.push(slice, keep(4));
         }

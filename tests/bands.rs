@@ -122,7 +122,8 @@ fn memory_that_is_allowed_decides_the_bands() {
     };
     assert_eq!(run(&["generate", "bumps", "--size", "101", "-o", "b.vti", "-q"]).0, Some(0));
     let few = ["--isovalues", "3.6", "95", "--photons", "2000", "--gather", "2", "--shadow-rays", "1"];
-    let bake = |more: &[&str]| run(&[&["bake", "b.vti", "-o", "o.vti", "--wall-resolution", "8"], &few[..], more].concat());
+    let bake =
+        |more: &[&str]| run(&[&["bake", "b.vti", "-o", "o.vti", "--wall-resolution", "8"], &few[..], more].concat());
     // What the estimate says of one band and of many.
     let estimate = |bands: &str| {
         let (code, text) = bake(&["--dry-run", "--bands", bands]);

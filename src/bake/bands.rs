@@ -70,9 +70,9 @@ impl Levels {
                 a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
                 a
             };
-            let sums =
-                (0..masks.len().div_ceil(CHUNK)).into_par_iter().map(count).reduce(|| vec![0; 3 * STEPS], add);
-            for (all, new) in [&mut levels.own, &mut levels.least, &mut levels.most].into_iter().zip(sums.chunks(STEPS)) {
+            let sums = (0..masks.len().div_ceil(CHUNK)).into_par_iter().map(count).reduce(|| vec![0; 3 * STEPS], add);
+            for (all, new) in [&mut levels.own, &mut levels.least, &mut levels.most].into_iter().zip(sums.chunks(STEPS))
+            {
                 all.iter_mut().zip(new).for_each(|(a, b)| *a += b);
             }
         }

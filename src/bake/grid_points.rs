@@ -111,7 +111,8 @@ impl<'a> GridPoints<'a> {
     /// Darkness on one side; `smoothing`: whether what is gathered will be smoothed.
     pub(super) fn dark(&self, smoothing: bool) -> PointLight {
         let n = self.lattice.len();
-        let grid = IlluminationGrid { radiance: vec![[0.0; 3]; n], std_error: vec![0.0; n], mask: vec![Mask::Empty; n] };
+        let grid =
+            IlluminationGrid { radiance: vec![[0.0; 3]; n], std_error: vec![0.0; n], mask: vec![Mask::Empty; n] };
         PointLight { grid, halves: smoothing.then(|| vec![Packed::NONE; self.set.len()]) }
     }
 
@@ -346,7 +347,8 @@ mod tests {
                 let v: Halves = std::array::from_fn(|_| {
                     Vec3::from_array(std::array::from_fn(|_| scale * (2.0 * rng.unit() as f32 - 1.0)))
                 });
-                let (back, most) = (Packed::new(v).unpack(), v.iter().map(|v| v.abs().max_element()).fold(0.0, f32::max));
+                let (back, most) =
+                    (Packed::new(v).unpack(), v.iter().map(|v| v.abs().max_element()).fold(0.0, f32::max));
                 for (a, b) in v.iter().zip(back) {
                     assert!((*a - b).abs().max_element() <= most / 32767.0 + 2e-45, "{v:?} {back:?}");
                 }

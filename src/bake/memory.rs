@@ -1,6 +1,6 @@
 //! How much memory a bake takes, before it takes it.
 
-use super::bands::Levels;
+use super::bands::{Band, Levels};
 use super::grid_points::STAND_INS;
 use super::{BakeSettings, Engine, MOST_BANDS, StrategyName};
 use crate::checkpoint;
@@ -145,6 +145,8 @@ struct Parts {
     /// Counts: places beside points, and points with such.
     beside: u64,
     filled: u64,
+    /// Samples of all sides.
+    samples: u64,
     /// Scattered samples and their interpolation.
     scattered: u64,
     scattering: u64,
@@ -174,9 +176,11 @@ impl Parts {
             let element = volume.samples().element_type().size() as u64;
             // Volume, field, the pyramid of min and max, the masks of volume and grid.
             base += own_voxels * (element + 4 + 1) + own_voxels * 33 / 8 + own_points;
-            samples += match settings.samples {
-                Some(n) => n,
-                None => ((valid + own_filled) as f64 * settings.samples_per_point) as u64,
+            let spread = own_filled * STAND_INS as u64;
+            samples += match (settings.strategy, settings.samples) {
+                (StrategyName::Nodes, _) => valid + spread,
+                (_, Some(n)) => n,
+                (_, None) => ((valid + own_filled) as f64 * settings.samples_per_point) as u64,
             };
             grids += own_points * 17 * sides;
             if smoothing {
@@ -218,6 +222,7 @@ impl Parts {
             slices,
             beside: if nodes { STAND_INS as u64 * filled } else { 0 },
             filled,
+            samples: samples * stored,
             scattered,
             scattering,
             swept,
@@ -239,14 +244,21 @@ impl Parts {
         let light = base + flats + grids + beside * (20 + 16);
         let bands = bands.len() as u64;
         let waiting = checkpoint::MOST_WAITING as u64;
-        let written = cache + self.points * RadianceSample::SAVED as u64;
+        let written = self.samples * RadianceSample::SAVED as u64 + self.cached * 12 * self.levels.needed(Band::WHOLE);
         let stages = match self.engine {
             Engine::Photon => vec![
                 ("photons", base + photons * 9 / 8),
                 ("walls", base + photons + maps + (maps / 50 * 8) + flats * 3),
                 (
                     "light",
-                    light + maps + halves + cache + sets + beside / bands * SAMPLE + self.scattered + waiting.min(written),
+                    light
+                        + maps
+                        + halves
+                        + cache
+                        + sets
+                        + beside / bands * SAMPLE
+                        + self.scattered
+                        + waiting.min(written),
                 ),
                 ("interpolate", light + (halves + self.slices).max(fitting).max(self.scattered + self.scattering)),
             ],

@@ -78,8 +78,7 @@ pub(super) fn light(
     let gather = settings.gather_rays > 0;
     let unsaved = [checkpoint::Stage::UNSAVED; 2];
     let tick = |n| stage.tick(n);
-    let mut cache =
-        RadianceCache::new(first, &tracers[0], &photons, estimate, &cache_settings, false, unsaved, &tick);
+    let mut cache = RadianceCache::new(first, &tracers[0], &photons, estimate, &cache_settings, false, unsaved, &tick);
     let sources: Vec<NodePhotons> = jobs.iter().map(|job| NodePhotons::new(&job.scene, &photons, estimate)).collect();
     drop(photons);
     stage.end()?;
@@ -241,11 +240,7 @@ impl<'a> FieldLight<'a> {
     }
 
     /// The grids of all sides.
-    fn finish(
-        self,
-        settings: &BakeSettings,
-        tick: &(dyn Fn(u64) -> bool + Sync),
-    ) -> Vec<(Side, IlluminationGrid)> {
+    fn finish(self, settings: &BakeSettings, tick: &(dyn Fn(u64) -> bool + Sync)) -> Vec<(Side, IlluminationGrid)> {
         let Self { job: Job { scene, lattice, masks, .. }, places, sides } = self;
         let each = |SideLight { side, points, scattered }: SideLight| {
             let grid = match (&places, points) {

@@ -191,7 +191,12 @@ impl<'a> VtiWriter<'a> {
 
     /// As [`VtiWriter::computed`], of bytes.
     #[must_use]
-    pub fn computed_bytes(mut self, name: &str, components: usize, of: impl Fn(usize) -> u8 + Send + Sync + 'a) -> Self {
+    pub fn computed_bytes(
+        mut self,
+        name: &str,
+        components: usize,
+        of: impl Fn(usize) -> u8 + Send + Sync + 'a,
+    ) -> Self {
         let samples = Values::U8(components * self.lattice.len(), Arc::new(of));
         self.point_data.push(Array { name: name.into(), components, samples });
         self
