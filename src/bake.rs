@@ -1,5 +1,6 @@
 //! The main job: from a scene to its illumination grid, by either engine, with counts and seconds.
 
+mod bands;
 mod grid_points;
 mod memory;
 mod photon_engine;
@@ -8,7 +9,7 @@ mod sweep_engine;
 mod time;
 
 pub use memory::MemoryEstimate;
-pub use settings::{BakeOptions, BakeSettings, Engine, Interpolation, Preset, StrategyName};
+pub use settings::{BakeOptions, BakeSettings, Engine, Interpolation, MOST_BANDS, Preset, StrategyName};
 pub use time::TimeEstimate;
 
 use crate::checkpoint::{self, Checkpoint};
@@ -18,11 +19,13 @@ use crate::flat::FlatTexture;
 use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, masks};
-use crate::progress::Progress;
+use crate::progress::{Clock, Progress};
 use crate::scene::{Policy, Scene};
 use crate::sweep;
 use crate::volume::Lattice;
+use grid_points::Counts;
 use photon_engine::Job;
+use rayon::prelude::*;
 use serde::Serialize;
 
 /// Wall seconds per stage.
@@ -58,6 +61,10 @@ pub struct PhotonCounts {
 pub struct BakeReport {
     /// Wall seconds.
     pub seconds: Seconds,
+    /// Seconds that all threads together worked, NaN where the system does not tell.
+    pub processor_seconds: Seconds,
+    /// Bands of isovalues that were baked one after another: at most as many as the settings ask for.
+    pub bands: usize,
     /// Exact rays traced.
     pub rays: u64,
     /// Gather and visibility queries answered by sweeps.
@@ -117,12 +124,30 @@ struct Lit {
     fields: Vec<Vec<(Side, IlluminationGrid)>>,
     flats: Vec<Option<FlatTexture>>,
     seconds: Seconds,
+    processor_seconds: Seconds,
+    bands: usize,
     rays: u64,
     sweep_queries: u64,
     photons: PhotonCounts,
     samples: u64,
     without_gradient: u64,
     misses: u64,
+}
+
+impl Lit {
+    /// Adds the seconds of a clock to those of a stage.
+    fn spend(&mut self, clock: Clock, stage: fn(&mut Seconds) -> &mut f64) {
+        let [wall, processor] = clock.seconds();
+        *stage(&mut self.seconds) += wall;
+        *stage(&mut self.processor_seconds) += processor;
+    }
+
+    fn count(&mut self, c: Counts) {
+        self.rays += c.rays;
+        self.misses += c.misses;
+        self.samples += c.samples;
+        self.without_gradient += c.without_gradient;
+    }
 }
 
 /// Stages `first` and the next of a checkpoint.
@@ -234,17 +259,16 @@ fn finish(
         }
         let mut non_finite = 0;
         for (_, grid) in &mut sides {
-            for (rgb, mask) in grid.radiance.iter_mut().zip(&mut grid.mask) {
-                if !rgb.iter().all(|x| x.is_finite()) {
-                    (*rgb, *mask) = ([0.0; 3], Mask::Empty);
-                    non_finite += 1;
-                }
-            }
+            let points = grid.radiance.par_iter_mut().zip(&mut grid.mask);
+            let bad = points.filter(|(rgb, _)| !rgb.iter().all(|x| x.is_finite()));
+            non_finite += bad.map(|(rgb, mask)| (*rgb, *mask) = ([0.0; 3], Mask::Empty)).count() as u64;
         }
-        let count = |m: Mask| sides[0].1.mask.iter().filter(|&&x| x == m).count() as u64;
+        let count = |m: Mask| sides[0].1.mask.par_iter().filter(|&&x| x == m).count() as u64;
         let (empty, filled) = (count(Mask::Empty), count(Mask::Filled));
         let report = BakeReport {
             seconds: s,
+            processor_seconds: lit.processor_seconds,
+            bands: lit.bands,
             rays: lit.rays,
             sweep_queries: lit.sweep_queries,
             rays_per_second: (lit.rays + lit.sweep_queries) as f64 / (s.photons + s.cache + s.sweep + s.samples),
@@ -255,7 +279,7 @@ fn finish(
             filled,
             misses: lit.misses,
             non_finite,
-            non_finite_voxels: job.scene.field.samples().iter().filter(|s| !s.is_finite()).count() as u64,
+            non_finite_voxels: job.scene.field.samples().par_iter().filter(|s| !s.is_finite()).count() as u64,
             threads: rayon::current_num_threads(),
             seed: settings.seed,
             embree: device.version(),
@@ -295,7 +319,14 @@ pub fn job(scene: &Scene, settings: &BakeSettings) -> String {
         add("lattice", format!("{:?} {:?} {:?}", lattice.dims(), lattice.origin(), lattice.axes()));
         add("isovalues", format!("{:?}", member.field.sweep()));
         let mut crc = flate2::Crc::new();
-        member.field.samples().iter().for_each(|s| crc.update(&s.to_le_bytes()));
+        let part = |samples: &[f32]| {
+            let mut crc = flate2::Crc::new();
+            let bytes = |s: &[f32]| s.iter().flat_map(|s| s.to_le_bytes()).collect::<Vec<u8>>();
+            samples.chunks(1 << 12).for_each(|s| crc.update(&bytes(s)));
+            crc
+        };
+        let parts: Vec<flate2::Crc> = member.field.samples().par_chunks(1 << 18).map(part).collect();
+        parts.iter().for_each(|part| crc.combine(part));
         add("samples' checksum", format!("{:08x}", crc.sum()));
         add("surface", format!("{:?}", member.surface));
         add("boundary", format!("{:?}", member.boundary));

@@ -1,21 +1,27 @@
 //! Checkpoints of long work: finished blocks of its long stages, in one file that is always whole.
 //!
-//! A stage is cut into numbered blocks whose bits depend on nothing but the job. Finished ones are kept in memory and
-//! written together every now and then, under a temporary name that replaces the old file only when it is complete: a
-//! process that is killed at any time leaves the last checkpoint intact. Who resumes gets the same bits, since blocks are
-//! either read back whole or computed anew.
+//! A stage is cut into numbered blocks whose bits depend on nothing but the job. Finished ones are appended to the file every
+//! now and then and leave memory; each has a checksum, and what a killed process wrote half is cut off by the next. A file
+//! that is mostly blocks since replaced is written anew under a temporary name. Who resumes gets the same bits, since blocks
+//! are either read back whole or computed anew.
 
 use crate::atomic;
 use crate::error::{Error, Result};
 use crate::files;
 use flate2::Crc;
 use std::collections::BTreeMap;
-use std::io::{Read, Write};
+use std::fs::{File, OpenOptions};
+use std::io::{BufReader, BufWriter, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-const MAGIC: &[u8] = b"isolume checkpoint 1\n";
+const MAGIC: &[u8] = b"isolume checkpoint 2\n";
+/// What the magic of any version starts with.
+const ANY_MAGIC: &[u8] = b"isolume checkpoint ";
+
+/// Bytes that may wait to be written, however long ago the last writing was.
+pub const MOST_WAITING: usize = 128 << 20;
 
 /// Writing may take this share of the time.
 const WRITING_SHARE: u32 = 20;
@@ -32,12 +38,27 @@ pub struct Checkpoint {
 
 #[derive(Debug)]
 struct State {
-    blocks: BTreeMap<(u32, u64), Vec<u8>>,
-    /// Whether there are blocks that the file does not hold.
-    dirty: bool,
+    /// Blocks that wait to be written.
+    waiting: BTreeMap<Key, Vec<u8>>,
+    waiting_bytes: usize,
+    /// The file, once it holds anything of this job.
+    log: Option<Log>,
     due: Instant,
-    written: bool,
     warned: bool,
+}
+
+/// Stage and number of a block.
+type Key = (u32, u64);
+
+/// A checkpoint's file.
+#[derive(Debug)]
+struct Log {
+    file: File,
+    /// Where each block begins, and its bytes.
+    blocks: BTreeMap<Key, (u64, usize)>,
+    /// Bytes of the file that are whole, and of those, bytes of blocks since replaced.
+    length: u64,
+    dead: u64,
 }
 
 /// One stage of a job, with its checkpoint if there is one.
@@ -54,13 +75,13 @@ impl Stage<'_> {
     /// A finished block, if it was saved with exactly `length` bytes.
     pub fn load(&self, block: usize, length: usize) -> Option<Vec<u8>> {
         let state = self.checkpoint?.state.lock().ok()?;
-        state.blocks.get(&(self.number, block as u64)).filter(|b| b.len() == length).cloned()
+        state.load((self.number, block as u64)).filter(|b| b.len() == length)
     }
 
     /// What `parse` makes of a saved block, if there is one.
     pub fn read<T>(&self, block: usize, parse: impl FnOnce(&[u8]) -> T) -> Option<T> {
         let state = self.checkpoint?.state.lock().ok()?;
-        state.blocks.get(&(self.number, block as u64)).map(|bytes| parse(bytes))
+        state.load((self.number, block as u64)).map(|bytes| parse(&bytes))
     }
 
     /// Whether the file is to be written as soon as something is saved: the time to save what is large.
@@ -74,7 +95,7 @@ impl Stage<'_> {
             let key = (self.number, block as u64);
             // Never both: a block may be as large as the work itself. The file holds the earlier one.
             if let Ok(mut state) = checkpoint.state.lock() {
-                state.blocks.remove(&key);
+                state.drop_waiting(key);
             }
             checkpoint.put(key, bytes());
         }
@@ -92,12 +113,12 @@ impl Checkpoint {
             let mut head = Vec::new();
             let read = files::open(path)?.take(MAGIC.len() as u64).read_to_end(&mut head);
             read.map_err(|e| Error::io(path, e))?;
-            if head != MAGIC {
+            if !head.starts_with(ANY_MAGIC) {
                 return Err(Error::invalid(path, "exists and is no checkpoint; give --checkpoint another name"));
             }
         }
         let due = Instant::now() + every;
-        let state = State { blocks: BTreeMap::new(), dirty: false, due, written: false, warned: false };
+        let state = State { waiting: BTreeMap::new(), waiting_bytes: 0, log: None, due, warned: false };
         Ok(Self { path: path.to_path_buf(), job, every, state: Mutex::new(state) })
     }
 
@@ -111,8 +132,7 @@ impl Checkpoint {
         if !self.path.exists() {
             return Ok(false);
         }
-        let bytes = files::read(&self.path)?;
-        let (job, blocks) = decode(&bytes).ok_or_else(|| {
+        let (job, log) = Log::open(&self.path)?.ok_or_else(|| {
             Error::invalid(&self.path, "is no checkpoint or is damaged; delete it and start without --resume")
         })?;
         if job != self.job {
@@ -127,8 +147,7 @@ impl Checkpoint {
             ));
         }
         if let Ok(mut state) = self.state.lock() {
-            state.blocks = blocks;
-            state.written = true;
+            state.log = Some(log);
         }
         Ok(true)
     }
@@ -145,22 +164,31 @@ impl Checkpoint {
 
     /// Blocks held.
     pub fn blocks(&self) -> usize {
-        self.state.lock().map_or(0, |s| s.blocks.len())
+        self.state.lock().map_or(0, |s| {
+            let written = s.log.as_ref().map_or(0, |log| log.blocks.len());
+            let again = |key: &&Key| s.log.as_ref().is_some_and(|log| log.blocks.contains_key(key));
+            written + s.waiting.len() - s.waiting.keys().filter(again).count()
+        })
     }
 
-    fn put(&self, key: (u32, u64), bytes: Vec<u8>) {
+    fn put(&self, key: Key, bytes: Vec<u8>) {
         let Ok(mut state) = self.state.lock() else { return };
-        state.blocks.insert(key, bytes);
-        state.dirty = true;
-        if Instant::now() < state.due {
+        state.drop_waiting(key);
+        state.waiting_bytes += bytes.len();
+        state.waiting.insert(key, bytes);
+        if Instant::now() < state.due && state.waiting_bytes < MOST_WAITING {
             return;
         }
         // A full disk ends no work: the result may still find room, or another checkpoint may.
-        if let Err(e) = self.write(&mut state)
-            && !state.warned
-        {
-            state.warned = true;
-            eprintln!("warning: no checkpoint could be written: {e}");
+        if let Err(e) = self.write(&mut state) {
+            // What can be computed again is not worth the memory.
+            if state.waiting_bytes >= MOST_WAITING {
+                (state.waiting, state.waiting_bytes) = (BTreeMap::new(), 0);
+            }
+            if !state.warned {
+                state.warned = true;
+                eprintln!("warning: no checkpoint could be written: {e}");
+            }
         }
     }
 
@@ -171,10 +199,10 @@ impl Checkpoint {
     pub fn save(&self) -> Result<bool> {
         match self.state.lock() {
             Ok(mut state) => {
-                if state.dirty {
+                if !state.waiting.is_empty() {
                     self.write(&mut state)?;
                 }
-                Ok(state.written)
+                Ok(state.log.is_some())
             }
             Err(_) => Ok(false),
         }
@@ -182,75 +210,196 @@ impl Checkpoint {
 
     fn write(&self, state: &mut State) -> Result<()> {
         let begun = Instant::now();
-        let written = files::write_atomically(&self.path, |out| encode(out, &self.job, &state.blocks));
+        let written = match &mut state.log {
+            Some(log) if 2 * log.dead_with(&state.waiting) <= log.length => {
+                log.append(&state.waiting).map_err(|e| Error::io(&self.path, e))
+            }
+            log => Log::create(&self.path, &self.job, log.as_ref(), &state.waiting).map(|new| *log = Some(new)),
+        };
         state.due = Instant::now() + self.every.max(begun.elapsed() * WRITING_SHARE);
         written?;
-        (state.dirty, state.written) = (false, true);
+        (state.waiting, state.waiting_bytes) = (BTreeMap::new(), 0);
         Ok(())
     }
 
     /// Deletes the file: the job is done.
     pub fn remove(&self) {
-        if self.state.lock().is_ok_and(|s| s.written) {
+        if self.state.lock().is_ok_and(|s| s.log.is_some()) {
             // It does no harm if it stays.
             let _ = std::fs::remove_file(&self.path);
         }
     }
 }
 
-/// Writes and sums.
-struct Summed<W> {
-    out: W,
-    crc: Crc,
-}
+impl State {
+    fn drop_waiting(&mut self, key: Key) {
+        if let Some(bytes) = self.waiting.remove(&key) {
+            self.waiting_bytes -= bytes.len();
+        }
+    }
 
-impl<W: Write> Summed<W> {
-    fn put(&mut self, bytes: &[u8]) -> std::io::Result<()> {
-        self.crc.update(bytes);
-        self.out.write_all(bytes)
+    fn load(&self, key: Key) -> Option<Vec<u8>> {
+        self.waiting.get(&key).cloned().or_else(|| self.log.as_ref()?.load(key).ok()?)
     }
 }
 
-fn encode(out: impl Write, job: &str, blocks: &BTreeMap<(u32, u64), Vec<u8>>) -> std::io::Result<()> {
-    let mut out = Summed { out, crc: Crc::new() };
-    out.put(MAGIC)?;
-    out.put(&(job.len() as u64).to_le_bytes())?;
-    out.put(job.as_bytes())?;
-    for ((stage, block), bytes) in blocks {
-        out.put(&stage.to_le_bytes())?;
-        out.put(&block.to_le_bytes())?;
-        out.put(&(bytes.len() as u64).to_le_bytes())?;
-        out.put(bytes)?;
-    }
-    let sum = out.crc.sum();
-    out.out.write_all(&sum.to_le_bytes())
-}
+/// Bytes before a block's own: stage, number, length, checksum of the block, checksum of these.
+const HEAD: usize = 28;
 
-/// `None` if anything is wrong.
-#[allow(clippy::type_complexity, reason = "a pair")]
-fn decode(bytes: &[u8]) -> Option<(String, BTreeMap<(u32, u64), Vec<u8>>)> {
-    let (body, sum) = bytes.split_last_chunk::<4>().filter(|(body, _)| body.starts_with(MAGIC))?;
+fn checksum(bytes: &[u8]) -> u32 {
     let mut crc = Crc::new();
-    crc.update(body);
-    if crc.sum() != u32::from_le_bytes(*sum) {
-        return None;
+    crc.update(bytes);
+    crc.sum()
+}
+
+fn head((stage, block): Key, bytes: &[u8]) -> [u8; HEAD] {
+    let mut head = [0; HEAD];
+    head[..4].copy_from_slice(&stage.to_le_bytes());
+    head[4..12].copy_from_slice(&block.to_le_bytes());
+    head[12..20].copy_from_slice(&(bytes.len() as u64).to_le_bytes());
+    head[20..24].copy_from_slice(&checksum(bytes).to_le_bytes());
+    let own = checksum(&head[..24]);
+    head[24..].copy_from_slice(&own.to_le_bytes());
+    head
+}
+
+impl Log {
+    /// Writes a file of the blocks of an older one that are not replaced, and of `new` ones.
+    fn create(path: &Path, job: &str, old: Option<&Self>, new: &BTreeMap<Key, Vec<u8>>) -> Result<Self> {
+        let mut blocks = BTreeMap::new();
+        let mut length = 0;
+        files::write_atomically(path, |out| {
+            let mut put = |bytes: &[u8]| -> std::io::Result<u64> {
+                out.write_all(bytes)?;
+                length += bytes.len() as u64;
+                Ok(length)
+            };
+            put(MAGIC)?;
+            put(&(job.len() as u64).to_le_bytes())?;
+            put(job.as_bytes())?;
+            put(&checksum(job.as_bytes()).to_le_bytes())?;
+            for (&key, bytes) in new {
+                let start = put(&head(key, bytes))?;
+                put(bytes)?;
+                blocks.insert(key, (start, bytes.len()));
+            }
+            for (&key, _) in old.into_iter().flat_map(|old| &old.blocks) {
+                if new.contains_key(&key) {
+                    continue;
+                }
+                if let Some(bytes) = old.map_or(Ok(None), |old| old.load(key))? {
+                    let start = put(&head(key, &bytes))?;
+                    put(&bytes)?;
+                    blocks.insert(key, (start, bytes.len()));
+                }
+            }
+            Ok(())
+        })?;
+        let file = OpenOptions::new().read(true).write(true).open(path).map_err(|e| Error::io(path, e))?;
+        Ok(Self { file, blocks, length, dead: 0 })
     }
-    let mut rest = &body[MAGIC.len()..];
-    let mut take = |n: usize| -> Option<&[u8]> {
-        let (head, tail) = rest.split_at_checked(n)?;
-        rest = tail;
-        Some(head)
-    };
-    let length = u64::from_le_bytes(take(8)?.try_into().ok()?);
-    let job = String::from_utf8(take(usize::try_from(length).ok()?)?.to_vec()).ok()?;
-    let mut blocks = BTreeMap::new();
-    while let Some(stage) = take(4) {
-        let stage = u32::from_le_bytes(stage.try_into().ok()?);
-        let block = u64::from_le_bytes(take(8)?.try_into().ok()?);
-        let length = u64::from_le_bytes(take(8)?.try_into().ok()?);
-        blocks.insert((stage, block), take(usize::try_from(length).ok()?)?.to_vec());
+
+    /// The job of a file and its blocks; `None` if anything is wrong but an end that is missing.
+    fn open(path: &Path) -> Result<Option<(String, Self)>> {
+        let file = OpenOptions::new().read(true).write(true).open(path).map_err(|e| Error::io(path, e))?;
+        let found = Self::scan(BufReader::with_capacity(1 << 20, &file)).map_err(|e| Error::io(path, e))?;
+        Ok(found.map(|(job, blocks, length, dead)| (job, Self { file, blocks, length, dead })))
     }
-    Some((job, blocks))
+
+    /// The job, where the blocks are, the bytes that are whole and those of blocks since replaced.
+    #[allow(clippy::type_complexity, reason = "the parts of a log")]
+    fn scan(mut from: impl Read) -> std::io::Result<Option<(String, BTreeMap<Key, (u64, usize)>, u64, u64)>> {
+        // At most `n` bytes: fewer at the end.
+        let mut take = |n: u64| -> std::io::Result<Vec<u8>> {
+            let mut bytes = Vec::new();
+            from.by_ref().take(n).read_to_end(&mut bytes)?;
+            Ok(bytes)
+        };
+        let number = |bytes: &[u8]| bytes.try_into().map(u64::from_le_bytes).ok();
+        let small = |bytes: &[u8]| bytes.try_into().map(u32::from_le_bytes).ok();
+        if take(MAGIC.len() as u64)? != MAGIC {
+            return Ok(None);
+        }
+        let Some(count) = number(&take(8)?) else { return Ok(None) };
+        let job = take(count)?;
+        if job.len() as u64 != count || small(&take(4)?) != Some(checksum(&job)) {
+            return Ok(None);
+        }
+        let Ok(job) = String::from_utf8(job) else { return Ok(None) };
+        let mut length = (MAGIC.len() + 8 + job.len() + 4) as u64;
+        let (mut blocks, mut dead) = (BTreeMap::new(), 0);
+        loop {
+            let head = take(HEAD as u64)?;
+            if head.len() < HEAD {
+                break;
+            }
+            if small(&head[24..]) != Some(checksum(&head[..24])) {
+                return Ok(None);
+            }
+            let (Some(stage), Some(block), Some(count), sum) =
+                (small(&head[..4]), number(&head[4..12]), number(&head[12..20]), small(&head[20..24]))
+            else {
+                return Ok(None);
+            };
+            let bytes = take(count)?;
+            if (bytes.len() as u64) < count {
+                break;
+            }
+            if Some(checksum(&bytes)) != sum {
+                return Ok(None);
+            }
+            let start = length + HEAD as u64;
+            length = start + count;
+            if let Some((_, before)) = blocks.insert((stage, block), (start, bytes.len())) {
+                dead += (HEAD + before) as u64;
+            }
+        }
+        Ok(Some((job, blocks, length, dead)))
+    }
+
+    /// Bytes of blocks that are replaced once `new` ones are written.
+    fn dead_with(&self, new: &BTreeMap<Key, Vec<u8>>) -> u64 {
+        let replaced = new.keys().filter_map(|key| self.blocks.get(key));
+        self.dead + replaced.map(|(_, n)| (HEAD + n) as u64).sum::<u64>()
+    }
+
+    /// Adds blocks behind those that are there, or nothing if that fails.
+    fn append(&mut self, new: &BTreeMap<Key, Vec<u8>>) -> std::io::Result<()> {
+        let write = || -> std::io::Result<()> {
+            let mut file = &self.file;
+            // What a killed process wrote half is behind.
+            file.set_len(self.length)?;
+            file.seek(SeekFrom::Start(self.length))?;
+            let mut out = BufWriter::with_capacity(1 << 20, file);
+            for (&key, bytes) in new {
+                out.write_all(&head(key, bytes))?;
+                out.write_all(bytes)?;
+            }
+            out.into_inner().map_err(std::io::IntoInnerError::into_error)?.sync_data()
+        };
+        if let Err(e) = write() {
+            // If not even that succeeds, the next reader cuts it.
+            let _ = self.file.set_len(self.length);
+            return Err(e);
+        }
+        self.dead = self.dead_with(new);
+        for (&key, bytes) in new {
+            let start = self.length + HEAD as u64;
+            self.length = start + bytes.len() as u64;
+            self.blocks.insert(key, (start, bytes.len()));
+        }
+        Ok(())
+    }
+
+    /// A block, if there is one.
+    fn load(&self, key: Key) -> std::io::Result<Option<Vec<u8>>> {
+        let Some(&(start, count)) = self.blocks.get(&key) else { return Ok(None) };
+        let mut bytes = vec![0; count];
+        let mut file = &self.file;
+        file.seek(SeekFrom::Start(start))?;
+        file.read_exact(&mut bytes)?;
+        Ok(Some(bytes))
+    }
 }
 
 #[cfg(test)]
@@ -292,17 +441,74 @@ mod tests {
         assert!(!path.exists());
     }
 
+    /// What an open checkpoint holds.
+    fn held(c: &Checkpoint) -> BTreeMap<Key, Vec<u8>> {
+        let state = c.state.lock().unwrap();
+        let keys = state.log.iter().flat_map(|l| l.blocks.keys()).chain(state.waiting.keys());
+        keys.map(|&k| (k, state.load(k).unwrap())).collect()
+    }
+
     #[test]
-    fn any_damage_is_seen() {
-        let mut bytes = Vec::new();
-        let blocks = BTreeMap::from([((1, 0), vec![5; 40]), ((1, 1), vec![])]);
-        encode(&mut bytes, &job(1), &blocks).unwrap();
-        assert_eq!(decode(&bytes), Some((job(1), blocks)));
+    fn any_damage_is_seen_and_a_missing_end_costs_only_its_blocks() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.checkpoint");
+        let first = Checkpoint::new(&path, job(1), Duration::ZERO).unwrap();
+        // Written one by one: the first creates the file, the others are appended.
+        for n in 0..3 {
+            first.stage(1).save(n, || vec![5; 40 - n]);
+            first.save().unwrap();
+        }
+        let whole = held(&first);
+        assert_eq!(whole.len(), 3);
+        let bytes = std::fs::read(&path).unwrap();
+        let resumed = |bytes: &[u8]| {
+            std::fs::write(&path, bytes).unwrap();
+            let c = Checkpoint::new(&path, job(1), Duration::ZERO).ok()?;
+            c.resume().ok().map(|_| c)
+        };
+        assert_eq!(held(&resumed(&bytes).unwrap()), whole);
+        let start = MAGIC.len() + 8 + job(1).len() + 4;
+        let ends: Vec<usize> = (0..=3).map(|n| start + (0..n).map(|b| HEAD + 40 - b).sum::<usize>()).collect();
+        assert_eq!(ends[3], bytes.len());
         for n in 0..bytes.len() {
-            assert_eq!(decode(&bytes[..n]), None, "cut at {n}");
+            let cut = resumed(&bytes[..n]);
+            if n < start {
+                assert!(cut.is_none(), "cut at {n}");
+            } else {
+                let cut = cut.unwrap();
+                let left = ends.iter().filter(|&&e| e <= n).count() - 1;
+                assert_eq!(held(&cut), whole.clone().into_iter().take(left).collect(), "cut at {n}");
+                // What is appended then stands behind the last whole block.
+                cut.stage(2).save(9, || vec![1, 2]);
+                cut.save().unwrap();
+                let after = held(&resumed(&std::fs::read(&path).unwrap()).unwrap());
+                assert_eq!((after.len(), after.get(&(2, 9))), (left + 1, Some(&vec![1, 2])));
+            }
             let mut bad = bytes.clone();
             bad[n] ^= 0x10;
-            assert_eq!(decode(&bad), None, "bit of byte {n}");
+            assert!(resumed(&bad).is_none(), "bit of byte {n}");
         }
+    }
+
+    #[test]
+    fn blocks_leave_memory_and_replaced_ones_leave_the_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.checkpoint");
+        let c = Checkpoint::new(&path, job(1), Duration::ZERO).unwrap();
+        for n in 0..100u8 {
+            c.stage(1).save(0, || vec![n; 10_000]);
+            c.save().unwrap();
+            assert!(c.state.lock().unwrap().waiting.is_empty());
+            assert!(std::fs::metadata(&path).unwrap().len() < 31_000);
+            assert_eq!(c.stage(1).load(0, 10_000), Some(vec![n; 10_000]));
+        }
+        assert_eq!(c.blocks(), 1);
+        // Not due, but too much to hold.
+        let c = Checkpoint::new(&folder.path().join("b"), job(1), Duration::from_secs(3600)).unwrap();
+        c.stage(1).save(0, || vec![1; MOST_WAITING / 2]);
+        assert!(!c.path().exists());
+        c.stage(1).save(1, || vec![2; MOST_WAITING / 2]);
+        assert!(c.path().exists() && c.state.lock().unwrap().waiting_bytes == 0);
+        assert_eq!(c.stage(1).read(1, |b| (b.len(), b[7])), Some((MOST_WAITING / 2, 2)));
     }
 }

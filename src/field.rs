@@ -181,6 +181,21 @@ impl Field {
         [s[0], s[1], s[y], s[y + 1], s[z], s[z + 1], s[z + y], s[z + y + 1]]
     }
 
+    /// Least and greatest sample of the cells around node `o`; infinities of the wrong order if none is finite.
+    pub fn range_around(&self, o: usize) -> [f32; 2] {
+        let ([i, j, k], dims) = (self.lattice.ijk(o), self.lattice.dims());
+        let (mut lo, mut hi) = (f32::INFINITY, f32::NEG_INFINITY);
+        for z in k.saturating_sub(1)..=(k + 1).min(dims[2] - 1) {
+            for y in j.saturating_sub(1)..=(j + 1).min(dims[1] - 1) {
+                let row = self.lattice.offset(0, y, z);
+                for &s in &self.samples[row + i.saturating_sub(1)..=row + (i + 1).min(dims[0] - 1)] {
+                    (lo, hi) = (lo.min(s), hi.max(s));
+                }
+            }
+        }
+        [lo, hi]
+    }
+
     /// h at `p` (trilinear), exact at the nodes; NaN in a cell that holds no surface.
     pub fn value(&self, p: DVec3) -> f64 {
         let (cell, u) = self.locate(p);

@@ -9,6 +9,7 @@
 use crate::field::Field;
 use crate::illumination_grid::IlluminationGrid;
 use crate::mask::Mask;
+use crate::node_set::NodeSet;
 use crate::radiance::RadianceSample;
 use crate::volume::Lattice;
 use glam::{DVec3, Vec3};
@@ -19,20 +20,34 @@ const PULL: f32 = 0.01;
 /// Conjugate-gradient steps: the residual falls below the samples' noise well before.
 const STEPS: usize = 16;
 
-/// What a sample adds to its nodes: from the sample, its corner weights and its cell.
-type Term<'a> = &'a (dyn Fn(&Placed, &[f32; 8], [usize; 3]) -> Vec3 + Sync);
+/// What a place of the lattice should look like.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Wish {
+    /// Where, local frame.
+    pub position: Vec3,
+    /// Radiance wished for.
+    pub radiance: Vec3,
+}
+
+impl From<&RadianceSample> for Wish {
+    fn from(s: &RadianceSample) -> Self {
+        Self { position: s.position, radiance: s.radiance }
+    }
+}
 
 /// Samples sorted by the cell of the grid they lie in.
 struct Sorted {
-    /// First sample of each cell; one more entry than cells.
-    starts: Vec<u32>,
+    /// First sample of each row of cells; one more entry than rows.
+    starts: Vec<usize>,
     samples: Vec<Placed>,
-    cells: [usize; 3],
+    dims: [usize; 3],
 }
 
 /// A sample inside its cell.
 #[derive(Clone, Copy, Default)]
 struct Placed {
+    /// Its cell, x fastest.
+    cell: u64,
     /// Position in the cell, [0, 1]³.
     u: Vec3,
     weight: f32,
@@ -50,49 +65,44 @@ impl Placed {
 }
 
 /// Improves `start` (Shepard's grid on `lattice`, say) by the least-squares fit described above at the nodes that `free`
-/// picks by their mask; the others stay as they are. The result does not depend on the number of threads.
+/// picks by their mask; the others stay as they are. The result does not depend on the number of threads. Beside the grid it
+/// takes 84 bytes per free node and 110 per sample.
 pub fn fit(
     field: &Field,
     lattice: &Lattice,
-    samples: &[RadianceSample],
-    start: IlluminationGrid,
+    samples: &[Wish],
+    mut start: IlluminationGrid,
     free: impl Fn(Mask) -> bool + Sync,
     tick: &(dyn Fn(u64) -> bool + Sync),
 ) -> IlluminationGrid {
     let sorted = Sorted::new(field, lattice, samples);
-    let nodes: Vec<Vec3> = start.radiance.iter().map(|&r| Vec3::from_array(r)).collect();
-    let dims = lattice.dims();
-    let gather = |term: Term<'_>| -> Vec<Vec3> {
-        let mut out = vec![Vec3::ZERO; nodes.len()];
-        out.par_chunks_mut(dims[0]).enumerate().for_each(|(row, out)| {
-            sorted.accumulate(dims, row % dims[1], row / dims[1], out, term);
-        });
-        out
-    };
-    let free: Vec<bool> = start.mask.iter().map(|&m| free(m)).collect();
+    let free = NodeSet::new(lattice.len(), |o| free(start.mask[o]));
+    if free.is_empty() || samples.is_empty() {
+        return start;
+    }
     // Diagonal of the normal equations: preconditioner, and the scale of the pull.
-    let diagonal = gather(&|s, _, _| Vec3::splat(s.weight));
-    let seen = diagonal.par_iter().filter(|d| d.x > 0.0).count().max(1);
-    let pull = PULL * diagonal.iter().map(|d| f64::from(d.x)).sum::<f64>() as f32 / seen as f32;
-    let value = |x: &[Vec3], w: &[f32; 8], [i, j, k]: [usize; 3]| {
-        let o = lattice.offset(i, j, k);
-        let (y, z) = (dims[0], dims[0] * dims[1]);
-        let at = [o, o + 1, o + y, o + y + 1, o + z, o + z + 1, o + z + y, o + z + y + 1];
-        at.iter().zip(w).fold(Vec3::ZERO, |sum, (&n, &w)| sum + w * x[n])
+    let diagonal: Vec<f32> =
+        sorted.gather(&free, |n| Vec3::splat(sorted.samples[n].weight)).iter().map(|d| d.x).collect();
+    let seen = diagonal.par_iter().filter(|d| **d > 0.0).count().max(1);
+    let pull = PULL * diagonal.iter().map(|d| f64::from(*d)).sum::<f64>() as f32 / seen as f32;
+    // What each sample's cell says, from the values of its nodes two by two along x.
+    let each = |pair: &(dyn Fn(usize) -> [Vec3; 2] + Sync)| -> Vec<Vec3> {
+        sorted.samples.par_iter().with_min_len(1024).map(|s| sorted.value(s, pair)).collect()
     };
     let apply = |x: &[Vec3]| -> Vec<Vec3> {
-        let mut y = gather(&|s, w, cell| s.weight * value(x, w, cell));
+        let said = each(&|o| free.pair(o).map(|slot| slot.map_or(Vec3::ZERO, |slot| x[slot])));
+        let mut y = sorted.gather(&free, |n| sorted.samples[n].weight * said[n]);
         y.par_iter_mut().zip(x).for_each(|(y, x)| *y += pull * *x);
         y
     };
     // A x = b with x = start + d: r = Σ w φ (r_j − interpolated start).
-    let mut r = gather(&|s, w, cell| s.weight * (s.radiance - value(&nodes, w, cell)));
-    let mut d = vec![Vec3::ZERO; nodes.len()];
+    let mut r = {
+        let said = each(&|o| [o, o + 1].map(|o| Vec3::from_array(start.radiance[o])));
+        sorted.gather(&free, |n| sorted.samples[n].weight * (sorted.samples[n].radiance - said[n]))
+    };
+    let mut d = vec![Vec3::ZERO; free.len()];
     let precondition = |r: &[Vec3]| -> Vec<Vec3> {
-        let step = |((r, d), &free): ((&Vec3, &Vec3), &bool)| {
-            if free { *r / (d.x + pull).max(f32::MIN_POSITIVE) } else { Vec3::ZERO }
-        };
-        r.par_iter().zip(&diagonal).zip(&free).map(step).collect()
+        r.par_iter().zip(&diagonal).map(|(r, d)| *r / (d + pull).max(f32::MIN_POSITIVE)).collect()
     };
     let mut z = precondition(&r);
     let mut p = z.clone();
@@ -108,18 +118,15 @@ pub fn fit(
         z = precondition(&r);
         let next = dot(&r, &z);
         let beta = divide(next, rz);
-        rz = next;
         p.par_iter_mut().zip(&z).for_each(|(p, z)| *p = *z + beta * *p);
-        tick((nodes.len() / STEPS) as u64);
+        rz = next;
     }
-    let mut grid = start;
-    grid.radiance.par_iter_mut().zip(&free).zip(nodes.par_iter().zip(&d)).for_each(|((out, free), (x, d))| {
-        if *free {
-            // Radiance is not negative, but a fit through noise may be.
-            *out = (*x + *d).max(Vec3::ZERO).to_array();
-        }
-    });
-    grid
+    tick(lattice.len() as u64);
+    for (o, d) in free.members(0..lattice.len()).zip(d) {
+        // Radiance is not negative, but a fit through noise may be.
+        start.radiance[o] = (Vec3::from_array(start.radiance[o]) + d).max(Vec3::ZERO).to_array();
+    }
+    start
 }
 
 /// Sums per channel in f64, in fixed blocks.
@@ -140,10 +147,10 @@ fn divide(a: DVec3, b: DVec3) -> Vec3 {
 
 impl Sorted {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "cells are clamped, weights are f32")]
-    fn new(field: &Field, lattice: &Lattice, samples: &[RadianceSample]) -> Self {
-        let cells = lattice.cells();
+    fn new(field: &Field, lattice: &Lattice, samples: &[Wish]) -> Self {
+        let (dims, cells) = (lattice.dims(), lattice.cells());
         let scale = lattice.far() / field.lattice().far();
-        let placed: Vec<(u32, Placed)> = samples
+        let mut placed: Vec<Placed> = samples
             .par_iter()
             .map(|s| {
                 let local = s.position.as_dvec3();
@@ -152,46 +159,66 @@ impl Sorted {
                 let u = p - DVec3::from_array(cell.map(|c| c as f64));
                 let index = (cell[2] * cells[1] + cell[1]) * cells[0] + cell[0];
                 let weight = field.gradient(local).length() as f32;
-                (index as u32, Placed { u: u.as_vec3(), weight, radiance: s.radiance })
+                Placed { cell: index as u64, u: u.as_vec3(), weight, radiance: s.radiance }
             })
             .collect();
-        let mut starts = vec![0u32; cells.iter().product::<usize>() + 1];
-        placed.iter().for_each(|(c, _)| starts[*c as usize + 1] += 1);
-        for i in 1..starts.len() {
-            starts[i] += starts[i - 1];
-        }
-        let mut next = starts.clone();
-        let mut sorted = vec![Placed::default(); placed.len()];
-        for (c, s) in placed {
-            sorted[next[c as usize] as usize] = s;
-            next[c as usize] += 1;
-        }
-        Self { starts, samples: sorted, cells }
+        // Stable: samples of one cell keep their order.
+        placed.par_sort_by_key(|s| s.cell);
+        let first = |row: usize| placed.partition_point(|s| s.cell < (row * cells[0]) as u64);
+        let starts = (0..=cells[1] * cells[2]).into_par_iter().map(first).collect();
+        Self { starts, samples: placed, dims }
     }
 
-    /// Adds φ_n · `term` of every sample around each node of row (j, k) to `out`: each node gathers from its up to eight
-    /// cells in a fixed order, so nothing is shared between threads.
-    fn accumulate(&self, dims: [usize; 3], j: usize, k: usize, out: &mut [Vec3], term: Term<'_>) {
+    /// Σ φ_n · `term` of every sample around each node n of `free`: each node gathers from its up to eight cells in a fixed
+    /// order, so nothing is shared between threads.
+    fn gather(&self, free: &NodeSet, term: impl Fn(usize) -> Vec3 + Sync) -> Vec<Vec3> {
+        let [nx, ny, _] = self.dims;
+        let mut out = vec![Vec3::ZERO; free.len()];
+        let rows = free.split(&mut out, nx);
+        rows.into_par_iter().enumerate().filter(|(_, out)| !out.is_empty()).for_each(|(row, out)| {
+            let mut sums = vec![Vec3::ZERO; nx];
+            self.accumulate(row % ny, row / ny, &mut sums, &term);
+            for (out, o) in out.iter_mut().zip(free.members(row * nx..(row + 1) * nx)) {
+                *out = sums[o - row * nx];
+            }
+        });
+        out
+    }
+
+    /// Adds φ_n · `term` of every sample around each node of row (j, k) to `out`.
+    fn accumulate(&self, j: usize, k: usize, out: &mut [Vec3], term: &(impl Fn(usize) -> Vec3 + Sync)) {
+        let cells = self.dims.map(|n| n - 1);
         for dz in 0..2 {
             for dy in 0..2 {
-                // The cell whose far (d = 0) or near (d = 1) corner row this is.
+                // The row of cells whose far (d = 0) or near (d = 1) nodes these are.
                 let (Some(cj), Some(ck)) = ((j + dy).checked_sub(1), (k + dz).checked_sub(1)) else { continue };
-                if cj >= self.cells[1] || ck >= self.cells[2] {
+                if cj >= cells[1] || ck >= cells[2] {
                     continue;
                 }
-                let row = (ck * self.cells[1] + cj) * self.cells[0];
-                for ci in 0..dims[0] - 1 {
-                    let range = self.starts[row + ci] as usize..self.starts[row + ci + 1] as usize;
-                    for s in &self.samples[range] {
-                        let w = s.corners();
-                        let t = term(s, &w, [ci, cj, ck]);
-                        let corner = 2 * (1 - dy) + 4 * (1 - dz);
-                        out[ci] += w[corner] * t;
-                        out[ci + 1] += w[corner + 1] * t;
-                    }
+                let row = ck * cells[1] + cj;
+                for n in self.starts[row]..self.starts[row + 1] {
+                    let s = &self.samples[n];
+                    let (w, t, ci) = (s.corners(), term(n), s.cell as usize - row * cells[0]);
+                    let corner = 2 * (1 - dy) + 4 * (1 - dz);
+                    out[ci] += w[corner] * t;
+                    out[ci + 1] += w[corner + 1] * t;
                 }
             }
         }
+    }
+
+    /// Interpolation at a sample of node values that `pair` tells for two neighbours along x.
+    #[inline]
+    fn value(&self, s: &Placed, pair: &(dyn Fn(usize) -> [Vec3; 2] + Sync)) -> Vec3 {
+        let [nx, ny, _] = self.dims;
+        let (cx, cy) = (nx - 1, ny - 1);
+        let cell = s.cell as usize;
+        let o = (cell / (cx * cy) * ny + cell / cx % cy) * nx + cell % cx;
+        let w = s.corners();
+        [o, o + nx, o + nx * ny, o + nx * ny + nx].into_iter().enumerate().fold(Vec3::ZERO, |sum, (n, o)| {
+            let [a, b] = pair(o);
+            sum + w[2 * n] * a + w[2 * n + 1] * b
+        })
     }
 }
 
@@ -235,7 +262,8 @@ mod tests {
             (squares / 4096.0).sqrt()
         };
         let before = error(&start);
-        let after = error(&fit(&field, field.lattice(), &samples, start, |m| m != Mask::Empty, &|_| true));
+        let wishes: Vec<Wish> = samples.iter().map(Wish::from).collect();
+        let after = error(&fit(&field, field.lattice(), &wishes, start, |m| m != Mask::Empty, &|_| true));
         println!("RMS error: Shepard {before}, fitted {after}");
         assert!(before > 0.02 && after < 0.2 * before, "Shepard {before}, fitted {after}");
     }

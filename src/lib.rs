@@ -15,6 +15,7 @@ pub mod stats;
 pub mod warp;
 pub mod cubic;
 pub mod nearest;
+pub mod node_set;
 pub mod linear_fit;
 pub mod progress;
 pub mod checkpoint;

@@ -5,6 +5,7 @@ use crate::rng::{Rng, Stage};
 use crate::volume::Lattice;
 use glam::DVec3;
 use rayon::prelude::*;
+use std::borrow::Cow;
 
 /// What a grid point holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -30,11 +31,11 @@ pub fn local_position(field: &Field, lattice: &Lattice, o: usize) -> DVec3 {
 pub fn masks(field: &Field, lattice: &Lattice) -> Vec<Mask> {
     let dims = lattice.dims();
     let at = |o: usize| local_position(field, lattice, o);
-    let values: Vec<f32> = if lattice == field.lattice() {
-        field.samples().to_vec()
+    let values: Cow<'_, [f32]> = if lattice == field.lattice() {
+        field.samples().into()
     } else {
         #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-        (0..lattice.len()).into_par_iter().map(|o| field.value(at(o)) as f32).collect()
+        (0..lattice.len()).into_par_iter().map(|o| field.value(at(o)) as f32).collect::<Vec<_>>().into()
     };
     (0..lattice.len())
         .into_par_iter()

@@ -95,6 +95,15 @@ pub struct Photons {
 }
 
 impl Photons {
+    fn append(&mut self, part: &Self) {
+        self.surface.extend_from_slice(&part.surface);
+        self.flat.extend_from_slice(&part.flat);
+        self.emitted += part.emitted;
+        self.rays += part.rays;
+        self.flat_gradient += part.flat_gradient;
+        self.energy.iter_mut().zip(part.energy).for_each(|(a, b)| *a += b);
+    }
+
     /// The energy of all bins.
     pub fn total_energy(&self) -> Energy {
         let mut total = Energy::default();
@@ -124,7 +133,7 @@ pub struct PhotonSettings {
 /// Photons per task: fixed, so that sums are made in the same order on any number of threads.
 const CHUNK: u64 = 1 << 14;
 /// Chunks whose parts are joined at once.
-const ROUND: usize = 64;
+const ROUND: usize = 32;
 
 /// One source of photons with its total power × isovalue per channel.
 enum Source {
@@ -157,9 +166,8 @@ pub fn trace_photons<T: Tracer>(
     }
     let mut all = Photons::default();
     let chunks = settings.count.div_ceil(CHUNK) as usize;
-    // Joined round by round: all of it and one round's parts are held, never everything twice.
-    for round in (0..chunks).step_by(ROUND) {
-        let parts: Vec<Photons> = (round..chunks.min(round + ROUND))
+    let trace = |round: usize| -> Vec<Photons> {
+        (round.min(chunks)..chunks.min(round + ROUND))
             .into_par_iter()
             .map(|chunk| {
                 let mut out = Photons::default();
@@ -171,15 +179,13 @@ pub fn trace_photons<T: Tracer>(
                 }
                 out
             })
-            .collect();
-        for c in parts {
-            all.surface.extend_from_slice(&c.surface);
-            all.flat.extend_from_slice(&c.flat);
-            all.emitted += c.emitted;
-            all.rays += c.rays;
-            all.flat_gradient += c.flat_gradient;
-            all.energy.iter_mut().zip(c.energy).for_each(|(a, b)| *a += b);
-        }
+            .collect()
+    };
+    // Joined round by round, while the next one is traced: all of it and two rounds' parts are held, never everything twice.
+    let mut parts = trace(0);
+    for next in (ROUND..chunks + ROUND).step_by(ROUND) {
+        let ((), traced) = rayon::join(|| parts.iter().for_each(|part| all.append(part)), || trace(next));
+        parts = traced;
     }
     all
 }

@@ -28,6 +28,25 @@ pub enum Progress {
     Shown,
 }
 
+/// Wall and processor seconds since it was started.
+#[derive(Clone, Copy, Debug)]
+pub struct Clock {
+    begun: Instant,
+    processor: f64,
+}
+
+impl Clock {
+    /// Starts now.
+    pub fn start() -> Self {
+        Self { begun: Instant::now(), processor: processor_seconds() }
+    }
+
+    /// Wall seconds, and those that all threads of the process have worked, NaN where the system does not tell.
+    pub fn seconds(&self) -> [f64; 2] {
+        [self.begun.elapsed().as_secs_f64(), processor_seconds() - self.processor]
+    }
+}
+
 /// One running stage.
 pub struct Stage {
     bar: Option<ProgressBar>,
@@ -37,6 +56,13 @@ pub struct Stage {
 }
 
 impl Progress {
+    /// Prints how long a part of the work took.
+    pub fn line(self, name: &str, seconds: f64) {
+        if self == Self::Shown {
+            eprintln!("{name:>14}  {seconds:.2} s");
+        }
+    }
+
     /// Begins a stage of `total` units of work.
     pub fn stage(self, name: &str, total: u64) -> Stage {
         let shown = self == Progress::Shown;
@@ -61,6 +87,15 @@ impl Stage {
             bar.inc(n);
         }
         !interrupted()
+    }
+
+    /// Prints a line without disturbing the bar.
+    pub fn note(&self, label: &str, text: &str) {
+        match &self.bar {
+            Some(bar) => bar.suspend(|| eprintln!("{label:>14}  {text}")),
+            None if self.shown => eprintln!("{label:>14}  {text}"),
+            None => {}
+        }
     }
 
     /// Ends the stage; returns its wall seconds.

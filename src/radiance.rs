@@ -66,10 +66,10 @@ fn to_block(counts: [u64; 2], samples: &[Option<RadianceSample>]) -> Vec<u8> {
     counts.into_iter().flat_map(u64::to_le_bytes).chain(numbers.flat_map(f32::to_le_bytes)).collect()
 }
 
-/// The inverse of [`to_block`], for samples at `positions`, into `out`; the counts.
-fn from_block(bytes: &[u8], positions: &[Vec3], out: &mut [Option<RadianceSample>]) -> [u64; 2] {
+/// The inverse of [`to_block`], for samples at `places`, into `out`; the counts.
+fn from_block(bytes: &[u8], places: &[(u64, Vec3)], out: &mut [Option<RadianceSample>]) -> [u64; 2] {
     let (counts, numbers) = bytes.split_at(16);
-    for ((b, &position), out) in numbers.as_chunks::<{ RadianceSample::SAVED }>().0.iter().zip(positions).zip(out) {
+    for ((b, &(_, position)), out) in numbers.as_chunks::<{ RadianceSample::SAVED }>().0.iter().zip(places).zip(out) {
         let n: [f32; 11] = std::array::from_fn(|i| f32::from_le_bytes(std::array::from_fn(|k| b[4 * i + k])));
         let vector = |i: usize| Vec3::new(n[i], n[i + 1], n[i + 2]);
         *out = (n[3] != -1.0).then(|| RadianceSample {
@@ -83,9 +83,98 @@ fn from_block(bytes: &[u8], positions: &[Vec3], out: &mut [Option<RadianceSample
     [0, 8].map(|i| u64::from_le_bytes(std::array::from_fn(|k| counts[i + k])))
 }
 
+/// What samples of one side of a scene's level sets are taken with.
+pub struct Sampler<'a, T> {
+    /// The scene.
+    pub scene: &'a Scene,
+    /// Its tracer.
+    pub tracer: &'a T,
+    /// Where indirect light comes from.
+    pub indirect: &'a Indirect<'a>,
+    /// The side.
+    pub side: Side,
+    /// Shadow rays per luminaire, the most.
+    pub shadow_rays: u32,
+    /// Seed of the run.
+    pub seed: u64,
+}
+
+impl<T: Tracer> Sampler<'_, T> {
+    /// The sample at `position`, its random numbers keyed by `key`; `None` where ∇h vanishes. Adds rays and misses to
+    /// `counts`.
+    #[allow(clippy::cast_possible_truncation, reason = "isovalues and storage are f32")]
+    pub fn sample(
+        &self,
+        key: u64,
+        position: Vec3,
+        scratch: &mut Neighbours,
+        counts: &mut [u64; 2],
+    ) -> Option<RadianceSample> {
+        let Self { scene, tracer, side, .. } = *self;
+        let p = position.as_dvec3();
+        let isovalue = scene.field.value(p);
+        let receiver = Receiver {
+            position,
+            normal: scene.normal(p, side)?,
+            isovalue: isovalue as f32,
+            departure: Departure::Surface(side),
+        };
+        let index = key * 2 + side.index() as u64;
+        let direct = direct_irradiance(scene, tracer, &receiver, self.shadow_rays, (self.seed, Stage::Direct, index));
+        counts[0] += direct.rays;
+        let mut halves = [DVec3::ZERO; 2];
+        let (mean, variance) = match self.indirect {
+            Indirect::Map(map) => {
+                let e = map.irradiance(p, isovalue, scratch);
+                (e.mean, e.variance)
+            }
+            Indirect::Gather(cache, rays) => {
+                let g = gathered_irradiance(scene, tracer, cache, &receiver, *rays, (self.seed, index));
+                halves = g.halves;
+                let e = g.estimate;
+                counts[0] += e.rays;
+                counts[1] += e.misses;
+                (e.mean, e.variance)
+            }
+        };
+        let albedo = scene.surface.albedo.at(isovalue);
+        let scale = luminance(albedo) / std::f64::consts::PI;
+        Some(RadianceSample {
+            position,
+            // The cache's flats may be a little negative where few photons land.
+            radiance: (reflected(albedo, (direct.mean + mean).max(DVec3::ZERO)) + scene.surface.emission).as_vec3(),
+            variance: ((direct.variance + variance) * scale * scale) as f32,
+            indirect: halves.map(|h| h.as_vec3()),
+            indirect_variance: (variance * scale * scale) as f32,
+        })
+    }
+
+    /// A block of samples into `out`: taken from `saved` if it holds the block, else made at the `places` (keys and
+    /// positions) and kept there. Returns rays and misses.
+    pub fn block(
+        &self,
+        places: &[(u64, Vec3)],
+        out: &mut [Option<RadianceSample>],
+        saved: checkpoint::Stage<'_>,
+        block: usize,
+    ) -> [u64; 2] {
+        if let Some(bytes) = saved.load(block, 16 + RadianceSample::SAVED * places.len()) {
+            return from_block(&bytes, places, out);
+        }
+        let (mut scratch, mut counts) = (Neighbours::default(), [0; 2]);
+        for (out, &(key, position)) in out.iter_mut().zip(places) {
+            *out = self.sample(key, position, &mut scratch, &mut counts);
+        }
+        saved.save(block, || to_block(counts, out));
+        counts
+    }
+}
+
+/// Samples per block.
+pub const BLOCK: usize = 1024;
+
 /// Samples `side` of the level sets through `positions`. `tick(n)` reports n samples done; returning false stops early.
 /// Blocks are kept in `saved` and looked for there.
-#[allow(clippy::cast_possible_truncation, reason = "isovalues and storage are f32")]
 #[allow(clippy::too_many_arguments, reason = "one call per bake")]
 pub fn sample_radiance<T: Tracer>(
     scene: &Scene,
@@ -98,69 +187,32 @@ pub fn sample_radiance<T: Tracer>(
     saved: checkpoint::Stage<'_>,
     tick: &(dyn Fn(u64) -> bool + Sync),
 ) -> RadianceSamples {
+    let sampler = Sampler { scene, tracer, indirect, side, shadow_rays, seed };
+    sample_places(&sampler, positions.len(), &|n| (n as u64, positions[n]), saved, 0, tick)
+}
+
+/// As [`sample_radiance`], at places given by number with the keys of their random numbers; `first` is the number of their
+/// first block.
+pub fn sample_places<T: Tracer>(
+    sampler: &Sampler<'_, T>,
+    count: usize,
+    place: &(dyn Fn(usize) -> (u64, Vec3) + Sync),
+    saved: checkpoint::Stage<'_>,
+    first: usize,
+    tick: &(dyn Fn(u64) -> bool + Sync),
+) -> RadianceSamples {
     let (rays, misses) = (AtomicU64::new(0), AtomicU64::new(0));
-    const CHUNK: usize = 1024;
-    let mut samples = vec![None; positions.len()];
-    samples.par_chunks_mut(CHUNK).zip(positions.par_chunks(CHUNK)).enumerate().for_each(|(chunk, (out, positions))| {
+    let mut samples = vec![None; count];
+    samples.par_chunks_mut(BLOCK).enumerate().for_each(|(n, out)| {
         if !tick(0) {
             return;
         }
-        if let Some(bytes) = saved.load(chunk, 16 + RadianceSample::SAVED * positions.len()) {
-            let counts = from_block(&bytes, positions, out);
-            rays.fetch_add(counts[0], Ordering::Relaxed);
-            misses.fetch_add(counts[1], Ordering::Relaxed);
-            tick(positions.len() as u64);
-            return;
-        }
-        let mut scratch = Neighbours::default();
-        let (mut traced, mut missed) = (0, 0);
-        let mut sample = |n: usize, position: Vec3| {
-            let index = (chunk * CHUNK + n) as u64;
-            let p = position.as_dvec3();
-            let isovalue = scene.field.value(p);
-            let receiver = Receiver {
-                position,
-                normal: scene.normal(p, side)?,
-                isovalue: isovalue as f32,
-                departure: Departure::Surface(side),
-            };
-            let key = (index * 2 + side.index() as u64, seed);
-            let direct = direct_irradiance(scene, tracer, &receiver, shadow_rays, (key.1, Stage::Direct, key.0));
-            traced += direct.rays;
-            let mut halves = [DVec3::ZERO; 2];
-            let (mean, variance) = match indirect {
-                Indirect::Map(map) => {
-                    let e = map.irradiance(p, isovalue, &mut scratch);
-                    (e.mean, e.variance)
-                }
-                Indirect::Gather(cache, rays) => {
-                    let g = gathered_irradiance(scene, tracer, cache, &receiver, *rays, (key.1, key.0));
-                    halves = g.halves;
-                    let e = g.estimate;
-                    traced += e.rays;
-                    missed += e.misses;
-                    (e.mean, e.variance)
-                }
-            };
-            let albedo = scene.surface.albedo.at(isovalue);
-            let scale = luminance(albedo) / std::f64::consts::PI;
-            Some(RadianceSample {
-                position,
-                // The cache's flats may be a little negative where few photons land.
-                radiance: (reflected(albedo, (direct.mean + mean).max(DVec3::ZERO)) + scene.surface.emission).as_vec3(),
-                variance: ((direct.variance + variance) * scale * scale) as f32,
-                indirect: halves.map(|h| h.as_vec3()),
-                indirect_variance: (variance * scale * scale) as f32,
-            })
-        };
-        for (n, (place, &position)) in out.iter_mut().zip(positions).enumerate() {
-            *place = sample(n, position);
-        }
-        rays.fetch_add(traced, Ordering::Relaxed);
-        misses.fetch_add(missed, Ordering::Relaxed);
-        saved.save(chunk, || to_block([traced, missed], out));
-        tick(positions.len() as u64);
+        let places: Vec<(u64, Vec3)> = (n * BLOCK..n * BLOCK + out.len()).map(place).collect();
+        let counts = sampler.block(&places, out, saved, first + n);
+        rays.fetch_add(counts[0], Ordering::Relaxed);
+        misses.fetch_add(counts[1], Ordering::Relaxed);
+        tick(out.len() as u64);
     });
-    let without_gradient = samples.iter().filter(|s| s.is_none()).count() as u64;
+    let without_gradient = samples.par_iter().filter(|s| s.is_none()).count() as u64;
     RadianceSamples { samples, without_gradient, rays: rays.into_inner(), misses: misses.into_inner() }
 }

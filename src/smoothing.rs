@@ -15,6 +15,7 @@ use crate::scene::Scene;
 use crate::volume::Lattice;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
+use std::collections::VecDeque;
 
 /// Radius of the fits, in the lattice's shortest spacing.
 const RADIUS: f64 = 2.5;
@@ -43,53 +44,116 @@ pub type Halves = [Vec3; 2];
 
 /// Where the points stand.
 struct Points<'a> {
+    scene: &'a Scene,
     lattice: &'a Lattice,
+    side: Side,
     taps: Vec<Tap>,
+    /// Steps that taps span along z.
+    reach: usize,
     /// Unit normal of the side in question, 0 where there is nothing; isovalue.
-    places: Vec<(Vec3, f32)>,
+    places: Slices<(Vec3, f32)>,
     /// Largest isovalue difference.
     tau: f32,
 }
 
-/// Smooths the irradiance of points whose two `halves` are given. `tau`: largest isovalue difference of points that share
-/// light, in units of the sweep. The same bits on any number of threads.
-pub fn smooth(scene: &Scene, lattice: &Lattice, side: Side, tau: f64, halves: &[Halves]) -> Vec<Smoothed> {
-    let points = Points::new(scene, lattice, side, tau, halves);
-    let once = points.each(|o| points.fit(o, |n| halves[n]));
-    let twice = points.each(|o| {
-        let rest = points.fit(o, |n| [0, 1].map(|h| halves[n][h] - once[n][h]));
-        [0, 1].map(|h| once[o][h] + rest[h])
-    });
-    drop(once);
+/// A few of a lattice's slices of constant z.
+#[derive(Default)]
+struct Slices<T> {
+    first: usize,
+    slices: VecDeque<Vec<T>>,
+}
+
+impl<T> Slices<T> {
+    /// Adds the next slice and drops those below slice `keep`.
+    fn push(&mut self, slice: Vec<T>, keep: usize) {
+        self.slices.push_back(slice);
+        while self.first < keep && !self.slices.is_empty() {
+            self.slices.pop_front();
+            self.first += 1;
+        }
+    }
+
+    /// Point `n` of slice `z`.
+    #[inline]
+    fn at(&self, (z, n): (usize, usize)) -> &T {
+        &self.slices[z - self.first][n]
+    }
+}
+
+/// Smooths the irradiance of points whose two `halves` are given by their offset. `tau`: largest isovalue difference of
+/// points that share light, in units of the sweep. Slice after slice of the lattice goes to `out`, with its number:
+/// about 770 bytes per point of a slice are held at once. The same bits on any number of threads.
+pub fn smooth(
+    scene: &Scene,
+    lattice: &Lattice,
+    side: Side,
+    tau: f64,
+    halves: &(dyn Fn(usize) -> Halves + Sync),
+    out: &mut dyn FnMut(usize, Vec<Smoothed>),
+) {
+    let mut points = Points::new(scene, lattice, side, tau);
+    let [nx, ny, nz] = lattice.dims();
+    let (area, reach) = (nx * ny, points.reach);
+    let (mut raw, mut once, mut twice, mut blended) =
+        (Slices::default(), Slices::default(), Slices::default(), Slices::default());
     let light = |v: Vec3| luminance(v.as_dvec3()) as f32;
-    let blended = points.each(|o| {
-        // Σ (a + λ (ã − a) − b)² over the points around and both ways is least at −Σ (ã − a)(a − b) / Σ (ã − a)².
-        let (mut along, mut squares) = (0.0f32, 0.0f32);
-        points.around(o, |n, tap| {
-            for h in [0, 1] {
-                let change = light(twice[n][h] - halves[n][h]);
-                along += (1.0 - tap.d2) * change * light(halves[n][1 - h] - halves[n][h]);
-                squares += (1.0 - tap.d2) * change * change;
-            }
-        });
-        let share = if squares > 0.0 { (along / squares).clamp(0.0, 1.0) } else { 0.0 };
-        [0, 1].map(|h| halves[o][h] + share * (twice[o][h] - halves[o][h]))
-    });
-    points.each(|o| {
-        let (mut sum, mut weight) = (0.0f32, 0.0f32);
-        points.around(o, |n, tap| {
-            let [a, b] = blended[n];
-            sum += (1.0 - tap.d2) * (0.5 * light(a - b)).powi(2);
-            weight += 1.0 - tap.d2;
-        });
-        Smoothed { mean: 0.5 * (blended[o][0] + blended[o][1]), variance: sum / weight }
-    })
+    // Each stage looks `reach` slices ahead into the one before.
+    for k in 0..nz + 4 * reach {
+        let before = |stages: usize| k.checked_sub(stages * reach).filter(|&z| z < nz);
+        let keep = |stages: usize| k.saturating_sub(stages * reach);
+        if let Some(z) = before(0) {
+            let slice: Vec<Halves> =
+                (0..area).into_par_iter().with_min_len(1024).map(|n| halves(z * area + n)).collect();
+            points.places.push(points.placed(z, &slice), keep(5));
+            raw.push(slice, keep(4));
+        }
+        if let Some(z) = before(1) {
+            once.push(points.each(z, |n| points.fit((z, n), |m| *raw.at(m))), keep(3));
+        }
+        if let Some(z) = before(2) {
+            let slice = points.each(z, |n| {
+                let rest = points.fit((z, n), |m| [0, 1].map(|h| raw.at(m)[h] - once.at(m)[h]));
+                [0, 1].map(|h| once.at((z, n))[h] + rest[h])
+            });
+            twice.push(slice, keep(4));
+        }
+        if let Some(z) = before(3) {
+            let slice = points.each(z, |n| {
+                // Σ (a + λ (ã − a) − b)² over the points around and both ways is least at −Σ (ã − a)(a − b) / Σ (ã − a)².
+                let (mut along, mut squares) = (0.0f32, 0.0f32);
+                points.around((z, n), |m, tap| {
+                    let (raw, twice): (&Halves, &Halves) = (raw.at(m), twice.at(m));
+                    for h in [0, 1] {
+                        let change = light(twice[h] - raw[h]);
+                        along += (1.0 - tap.d2) * change * light(raw[1 - h] - raw[h]);
+                        squares += (1.0 - tap.d2) * change * change;
+                    }
+                });
+                let share = if squares > 0.0 { (along / squares).clamp(0.0, 1.0) } else { 0.0 };
+                let (raw, twice): (&Halves, &Halves) = (raw.at((z, n)), twice.at((z, n)));
+                [0, 1].map(|h| raw[h] + share * (twice[h] - raw[h]))
+            });
+            blended.push(slice, keep(5));
+        }
+        if let Some(z) = before(4) {
+            let slice = points.each(z, |n| {
+                let (mut sum, mut weight) = (0.0f32, 0.0f32);
+                points.around((z, n), |m, tap| {
+                    let [a, b]: Halves = *blended.at(m);
+                    sum += (1.0 - tap.d2) * (0.5 * light(a - b)).powi(2);
+                    weight += 1.0 - tap.d2;
+                });
+                let [a, b] = *blended.at((z, n));
+                Smoothed { mean: 0.5 * (a + b), variance: sum / weight }
+            });
+            out(z, slice);
+        }
+    }
 }
 
 impl<'a> Points<'a> {
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-    fn new(scene: &Scene, lattice: &'a Lattice, side: Side, tau: f64, halves: &[Halves]) -> Self {
-        let field: &Field = &scene.field;
+    fn new(scene: &'a Scene, lattice: &'a Lattice, side: Side, tau: f64) -> Self {
         let axes = lattice.axes();
         let shortest = (0..3).map(|a| axes.col(a).length()).fold(f64::INFINITY, f64::min);
         let radius = RADIUS * shortest;
@@ -106,44 +170,57 @@ impl<'a> Points<'a> {
                 }
             }
         }
-        let place = |o: usize| {
-            if halves[o][0].is_nan() {
+        let reach = reach[2].unsigned_abs();
+        Self { scene, lattice, side, taps, reach, places: Slices::default(), tau: tau as f32 }
+    }
+
+    /// Points of a slice.
+    fn area(&self) -> usize {
+        let [nx, ny, _] = self.lattice.dims();
+        nx * ny
+    }
+
+    /// Where the points of slice `z` with light stand.
+    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+    fn placed(&self, z: usize, halves: &[Halves]) -> Vec<(Vec3, f32)> {
+        let field: &Field = &self.scene.field;
+        let place = |(n, halves): (usize, &Halves)| {
+            if halves[0].is_nan() {
                 return (Vec3::ZERO, 0.0);
             }
-            let p = local_position(field, lattice, o);
-            (scene.normal(p, side).unwrap_or_default().as_vec3(), field.value(p) as f32)
+            let p = local_position(field, self.lattice, z * self.area() + n);
+            (self.scene.normal(p, self.side).unwrap_or_default().as_vec3(), field.value(p) as f32)
         };
-        let places = (0..halves.len()).into_par_iter().with_min_len(1024).map(place).collect();
-        Self { lattice, taps, places, tau: tau as f32 }
+        halves.par_iter().enumerate().with_min_len(1024).map(place).collect()
     }
 
-    /// `f` of every point that holds light, nothing of the others.
-    fn each<T: Default + Send>(&self, f: impl Fn(usize) -> T + Sync) -> Vec<T> {
-        let of = |o: usize| if self.places[o].0 == Vec3::ZERO { T::default() } else { f(o) };
-        (0..self.places.len()).into_par_iter().with_min_len(1024).map(of).collect()
+    /// `f` of every point of slice `z` that holds light, nothing of the others.
+    fn each<T: Default + Send>(&self, z: usize, f: impl Fn(usize) -> T + Sync) -> Vec<T> {
+        let of = |n: usize| if self.places.at((z, n)).0 == Vec3::ZERO { T::default() } else { f(n) };
+        (0..self.area()).into_par_iter().with_min_len(256).map(of).collect()
     }
 
-    /// Calls `visit` for the points that share the light of point `o`, itself among them.
+    /// Calls `visit` for the points that share the light of point `n` of slice `z`, itself among them.
     #[inline]
-    fn around(&self, o: usize, mut visit: impl FnMut(usize, &Tap)) {
-        let at = self.lattice.ijk(o).map(|i| i as isize);
-        let dims = self.lattice.dims().map(|n| n as isize);
-        let (normal, isovalue) = self.places[o];
+    fn around(&self, (z, n): (usize, usize), mut visit: impl FnMut((usize, usize), &Tap)) {
+        let [nx, ny, nz] = self.lattice.dims().map(|n| n as isize);
+        let at = [(n as isize) % nx, (n as isize) / nx, z as isize];
+        let &(normal, isovalue) = self.places.at((z, n));
         for tap in &self.taps {
-            let q: [isize; 3] = std::array::from_fn(|a| at[a] + tap.step[a]);
-            if (0..3).any(|a| q[a] < 0 || q[a] >= dims[a]) {
+            let [x, y, z]: [isize; 3] = std::array::from_fn(|a| at[a] + tap.step[a]);
+            if x < 0 || x >= nx || y < 0 || y >= ny || z < 0 || z >= nz {
                 continue;
             }
-            let n = self.lattice.offset(q[0] as usize, q[1] as usize, q[2] as usize);
-            let (other, c) = self.places[n];
+            let m = (z as usize, (y * nx + x) as usize);
+            let &(other, c) = self.places.at(m);
             if other.dot(normal) >= CONE && (c - isovalue).abs() <= self.tau {
-                visit(n, tap);
+                visit(m, tap);
             }
         }
     }
 
     /// What a linear fit of `values` around point `o` says there.
-    fn fit(&self, o: usize, values: impl Fn(usize) -> Halves) -> Halves {
+    fn fit(&self, o: (usize, usize), values: impl Fn((usize, usize)) -> Halves) -> Halves {
         let mut moments = Moments::default();
         // Σ K v (1, d) of either half.
         let mut sums = [[Vec3::ZERO; 4]; 2];
@@ -183,7 +260,11 @@ mod tests {
                 [noise(), noise()].map(|n| Vec3::splat(light(place(o)) + n as f32))
             })
             .collect();
-        let smoothed = smooth(&scene, &lattice, Side::Lower, 0.2, &halves);
+        let mut smoothed = Vec::new();
+        smooth(&scene, &lattice, Side::Lower, 0.2, &|o| halves[o], &mut |z, slice| {
+            assert_eq!(smoothed.len(), z * 16 * 17);
+            smoothed.extend(slice);
+        });
         let (mut sums, mut count) = ([0.0; 2], 0.0);
         for o in (0..lattice.len()).filter(|&o| judged(place(o))) {
             let truth = light(place(o));

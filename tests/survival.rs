@@ -73,6 +73,11 @@ fn twenty_kills_leave_no_trace_in_the_result() {
 }
 
 #[test]
+fn ten_kills_between_bands_leave_no_trace_in_the_result() {
+    killed(10, &["--bands", "5"], |found| assert!(found >= 8, "kills came too early to test anything"));
+}
+
+#[test]
 fn ten_kills_of_a_sweep_leave_no_trace_in_the_result() {
     // One block holds all finished passes.
     let sweep = ["--engine", "sweep", "--directions", "256", "--light-points", "16"];
@@ -259,6 +264,7 @@ fn the_memory_estimate_is_near_the_peak() {
     for (size, more, within) in [
         ("33", &["--photons", "1000000"][..], 0.5..1.3),
         ("101", &["--photons", "200000"], 0.5..1.3),
+        ("101", &["--photons", "200000", "--bands", "16", "--sides=both"], 0.5..1.3),
         // What a checkpoint holds is part of it.
         ("64", &sweep, 0.7..1.3),
         ("101", &sweep, 0.7..1.3),

@@ -1,114 +1,361 @@
-//! Samples at the grid's own points; where a point holds no level set of the sweep, samples around it, to which its value is
+//! Light at a grid's own points; where a point holds no level set of the sweep, at places around it, to which its value is
 //! fitted.
 
+use super::bands::Band;
 use crate::brdf::reflected;
+use crate::checkpoint;
 use crate::direct::luminance;
 use crate::field::Field;
-use crate::fitted_grid::fit;
+use crate::fitted_grid::{Wish, fit};
 use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
-use crate::mask::{Mask, stand_ins};
-use crate::radiance::RadianceSample;
+use crate::mask::{Mask, local_position, stand_ins};
+use crate::node_set::NodeSet;
+use crate::radiance::{BLOCK, RadianceSample, Sampler, sample_places};
 use crate::scene::Scene;
-use crate::smoothing::smooth;
+use crate::smoothing::{Halves, smooth};
+use crate::tracer::Tracer;
 use crate::volume::Lattice;
-use glam::Vec3;
+use glam::{DVec3, Vec3};
+use rayon::prelude::*;
+use std::f64::consts::PI;
+use std::ops::AddAssign;
 
-/// Where the points of a grid are sampled.
+/// Places around a point without a level set of its own.
+pub(super) const STAND_INS: usize = 4;
+
+/// What samples cost.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct Counts {
+    pub(super) rays: u64,
+    pub(super) misses: u64,
+    pub(super) samples: u64,
+    pub(super) without_gradient: u64,
+}
+
+impl AddAssign for Counts {
+    fn add_assign(&mut self, o: Self) {
+        self.rays += o.rays;
+        self.misses += o.misses;
+        self.samples += o.samples;
+        self.without_gradient += o.without_gradient;
+    }
+}
+
+/// The points of a grid on a level set of the sweep.
 pub(super) struct GridPoints<'a> {
     field: &'a Field,
     lattice: &'a Lattice,
-    masks: &'a [Mask],
-    positions: Vec<Vec3>,
-    /// The point that each position stands for, in rising order.
-    owners: Vec<usize>,
+    set: NodeSet,
 }
 
-/// Samples around a point without a level set of its own.
-pub(super) const STAND_INS: usize = 4;
+/// Light at such points of one side, as far as it is known.
+pub(super) struct PointLight {
+    /// Radiance as sampled; the standard error, or before smoothing what of the variance is not the gather's.
+    grid: IlluminationGrid,
+    /// Gathered light of the points, if it is to be smoothed.
+    halves: Option<Vec<Packed>>,
+}
+
+/// Two RGB irradiances in 14 bytes, to 1/65534 of the largest of their numbers: far below their noise.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Packed {
+    /// In units of 2^exponent / 32767.
+    numbers: [i16; 6],
+    exponent: i16,
+}
+
+impl Packed {
+    /// Nothing.
+    const NONE: Self = Self { numbers: [0; 6], exponent: i16::MIN };
+
+    #[allow(clippy::cast_possible_truncation, reason = "scaled to fit")]
+    fn new([a, b]: Halves) -> Self {
+        let all = [a.x, a.y, a.z, b.x, b.y, b.z];
+        let most = all.iter().fold(0.0f32, |m, x| m.max(x.abs()));
+        if !all.iter().all(|x| x.is_finite()) {
+            return Self::NONE;
+        }
+        // The least power of two above, from the bits of an f64: f32 has denormals.
+        let exponent = if most == 0.0 { 0 } else { (f64::from(most).to_bits() >> 52) as i16 - 1022 };
+        let scale = 32767.0 * 2f64.powi(-i32::from(exponent));
+        Self { numbers: all.map(|x| (f64::from(x) * scale).round() as i16), exponent }
+    }
+
+    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+    fn unpack(self) -> Halves {
+        if self == Self::NONE {
+            return [Vec3::NAN; 2];
+        }
+        let scale = 2f64.powi(i32::from(self.exponent)) / 32767.0;
+        let n = self.numbers.map(|x| (f64::from(x) * scale) as f32);
+        [Vec3::new(n[0], n[1], n[2]), Vec3::new(n[3], n[4], n[5])]
+    }
+}
+
+/// Blocks of samples at the points of one band: a block is the band's share of so many points of the lattice.
+pub(super) fn blocks(lattice: &Lattice) -> usize {
+    lattice.len().div_ceil(BLOCK)
+}
 
 impl<'a> GridPoints<'a> {
-    /// Positions for the points of `lattice` whose mask `wanted` picks.
-    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-    pub(super) fn new(
-        field: &'a Field,
-        lattice: &'a Lattice,
-        masks: &'a [Mask],
-        seed: u64,
-        wanted: impl Fn(Mask) -> bool,
-    ) -> Self {
-        let points = (0..lattice.len()).filter(|&o| wanted(masks[o]));
-        let (positions, owners) = points
-            .flat_map(|o| {
-                stand_ins::<STAND_INS>(field, lattice, o, seed).into_iter().flatten().map(move |p| (p.as_vec3(), o))
-            })
-            .unzip();
-        Self { field, lattice, masks, positions, owners }
+    pub(super) fn new(field: &'a Field, lattice: &'a Lattice, masks: &[Mask]) -> Self {
+        Self { field, lattice, set: NodeSet::new(masks.len(), |o| masks[o] == Mask::Valid) }
     }
 
-    /// Positions, local frame.
-    pub(super) fn positions(&self) -> &[Vec3] {
-        &self.positions
+    /// Points.
+    pub(super) fn len(&self) -> usize {
+        self.set.len()
     }
 
-    /// The mean of the samples of each point. Points of which no sample was found stay empty, which viewers and
-    /// [`IlluminationGrid::interpolate`] leave out.
-    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-    pub(super) fn collect(&self, samples: &[Option<RadianceSample>]) -> IlluminationGrid {
-        let n = self.masks.len();
-        let mut grid =
+    /// Darkness on one side; `smoothing`: whether what is gathered will be smoothed.
+    pub(super) fn dark(&self, smoothing: bool) -> PointLight {
+        let n = self.lattice.len();
+        let grid =
             IlluminationGrid { radiance: vec![[0.0; 3]; n], std_error: vec![0.0; n], mask: vec![Mask::Empty; n] };
-        for run in self.owners.chunk_by(|a, b| a == b).scan(0, |end, run| {
-            *end += run.len();
-            Some(*end - run.len()..*end)
-        }) {
-            let owner = self.owners[run.start];
-            let (mut sum, mut variance, mut count) = (Vec3::ZERO, 0.0, 0.0);
-            for s in samples[run].iter().flatten() {
-                (sum, variance, count) = (sum + s.radiance, variance + s.variance, count + 1.0);
-            }
-            if count > 0.0 {
-                grid.radiance[owner] = (sum / count).to_array();
-                grid.std_error[owner] = variance.sqrt() / count;
-                grid.mask[owner] = self.masks[owner];
-            }
-        }
-        grid
+        PointLight { grid, halves: smoothing.then(|| vec![Packed::NONE; self.set.len()]) }
     }
 
-    /// Puts gathered light smoothed over the points in the place of each point's own ([`smooth`]); points without a level
-    /// set of their own keep theirs.
+    /// The isovalue of a point.
+    #[inline]
+    #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
+    fn isovalue(&self, o: usize) -> f32 {
+        if self.lattice == self.field.lattice() {
+            self.field.samples()[o]
+        } else {
+            self.field.value(local_position(self.field, self.lattice, o)) as f32
+        }
+    }
+
+    /// Samples the points of a band.
+    #[allow(clippy::cast_possible_truncation, reason = "positions are f32")]
+    pub(super) fn sample<T: Tracer>(
+        &self,
+        sampler: &Sampler<'_, T>,
+        band: Band,
+        light: &mut PointLight,
+        saved: checkpoint::Stage<'_>,
+        tick: &(dyn Fn(u64) -> bool + Sync),
+    ) -> Counts {
+        let PointLight { grid, halves } = light;
+        let smoothing = halves.is_some();
+        let halves = match halves {
+            Some(halves) => self.set.split(halves, BLOCK),
+            None => (0..blocks(self.lattice)).map(|_| &mut [][..]).collect(),
+        };
+        let first = band.number * blocks(self.lattice);
+        let rows = grid.radiance.par_chunks_mut(BLOCK).zip(grid.std_error.par_chunks_mut(BLOCK));
+        let rows = rows.zip(grid.mask.par_chunks_mut(BLOCK)).zip(halves);
+        let counts = rows.enumerate().map(|(block, (((radiance, std_error), mask), halves))| {
+            let start = block * BLOCK;
+            let range = start..start + radiance.len();
+            let own: Vec<usize> = self.set.members(range).filter(|&o| band.holds(self.isovalue(o))).collect();
+            if own.is_empty() || !tick(0) {
+                return Counts::default();
+            }
+            let place = |&o: &usize| {
+                let position = local_position(self.field, self.lattice, o).as_vec3();
+                ((STAND_INS * o) as u64, position)
+            };
+            let places: Vec<(u64, Vec3)> = own.iter().map(place).collect();
+            let mut samples = vec![None; own.len()];
+            let [rays, misses] = sampler.block(&places, &mut samples, saved, first + block);
+            let before = self.set.before(start);
+            for (&o, s) in own.iter().zip(&samples) {
+                let Some(s) = s else { continue };
+                radiance[o - start] = s.radiance.to_array();
+                mask[o - start] = Mask::Valid;
+                std_error[o - start] = match smoothing {
+                    true => s.variance - s.indirect_variance,
+                    false => s.variance.sqrt(),
+                };
+                if smoothing {
+                    halves[self.set.before(o) - before] = Packed::new(s.indirect);
+                }
+            }
+            let without_gradient = samples.iter().filter(|s| s.is_none()).count() as u64;
+            tick(own.len() as u64);
+            Counts { rays, misses, samples: own.len() as u64 - without_gradient, without_gradient }
+        });
+        counts.reduce(Counts::default, |mut a, b| {
+            a += b;
+            a
+        })
+    }
+
+    /// The grid, with gathered light smoothed over the points if it was kept for that ([`smooth`]).
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-    pub(super) fn smooth(
+    pub(super) fn finish(
         &self,
         scene: &Scene,
         side: Side,
         tau: f64,
-        grid: &mut IlluminationGrid,
-        samples: &[Option<RadianceSample>],
-    ) {
-        let mut halves = vec![[Vec3::NAN; 2]; self.masks.len()];
-        let valid = || self.owners.iter().zip(samples).filter(|(o, s)| self.masks[**o] == Mask::Valid && s.is_some());
-        for (&o, s) in valid() {
-            halves[o] = s.unwrap_or_default().indirect;
+        PointLight { mut grid, halves }: PointLight,
+        tick: &(dyn Fn(u64) -> bool + Sync),
+    ) -> IlluminationGrid {
+        let Some(packed) = halves else { return grid };
+        let halves = |o: usize| self.set.slot(o).map_or([Vec3::NAN; 2], |slot| packed[slot].unpack());
+        smooth(scene, self.lattice, side, tau, &halves, &mut |z, smoothed| {
+            if !tick(0) {
+                return;
+            }
+            let area = smoothed.len();
+            let slice = z * area..(z + 1) * area;
+            let (radiance, std_error) = (&mut grid.radiance[slice.clone()], &mut grid.std_error[slice]);
+            let points = radiance.par_iter_mut().zip(std_error).zip(smoothed).enumerate().with_min_len(1024);
+            points.for_each(|(n, ((radiance, std_error), smoothed))| {
+                let o = z * area + n;
+                let [a, b] = halves(o);
+                if a.is_nan() {
+                    return;
+                }
+                let p = local_position(self.field, self.lattice, o).as_vec3().as_dvec3();
+                let albedo = scene.surface.albedo.at(f64::from(scene.field.value(p) as f32));
+                let change = reflected(albedo, (smoothed.mean - 0.5 * (a + b)).as_dvec3());
+                *radiance = (Vec3::from_array(*radiance) + change.as_vec3()).max(Vec3::ZERO).to_array();
+                let scale = (luminance(albedo) / PI) as f32;
+                *std_error = (*std_error + smoothed.variance * scale * scale).max(0.0).sqrt();
+            });
+            tick(area as u64);
+        });
+        grid
+    }
+}
+
+/// Places beside the points of a grid that hold no level set of the sweep, while surfaces beside them do.
+pub(super) struct Beside<'a> {
+    field: &'a Field,
+    lattice: &'a Lattice,
+    positions: Vec<Vec3>,
+    /// Of each position, the point it stands for, in rising order.
+    owners: Vec<u64>,
+}
+
+/// Light at a place beside.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct BesideLight {
+    radiance: Vec3,
+    /// Of its luminance; negative where there is no light.
+    variance: f32,
+}
+
+impl BesideLight {
+    const NONE: Self = Self { radiance: Vec3::ZERO, variance: -1.0 };
+}
+
+impl<'a> Beside<'a> {
+    /// Places around the points whose mask says [`Mask::Filled`].
+    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+    pub(super) fn new(field: &'a Field, lattice: &'a Lattice, masks: &[Mask], seed: u64) -> Self {
+        let set = NodeSet::new(masks.len(), |o| masks[o] == Mask::Filled);
+        let mut found = vec![[None; STAND_INS]; set.len()];
+        const ROW: usize = 4096;
+        set.split(&mut found, ROW).into_par_iter().enumerate().for_each(|(row, found)| {
+            for (found, o) in found.iter_mut().zip(set.members(row * ROW..masks.len().min((row + 1) * ROW))) {
+                *found = stand_ins::<STAND_INS>(field, lattice, o, seed).map(|p| p.map(|p: DVec3| p.as_vec3()));
+            }
+        });
+        let count = found.iter().flatten().flatten().count();
+        let (mut positions, mut owners) = (Vec::with_capacity(count), Vec::with_capacity(count));
+        for (o, found) in set.members(0..masks.len()).zip(&found) {
+            positions.extend(found.iter().flatten());
+            owners.resize(positions.len(), o as u64);
         }
-        let smoothed = smooth(scene, self.lattice, side, tau, &halves);
-        for (&o, s) in valid() {
-            let s = s.unwrap_or_default();
-            let change = (smoothed[o].mean - 0.5 * (s.indirect[0] + s.indirect[1])).as_dvec3();
-            let albedo = scene.surface.albedo.at(f64::from(scene.field.value(s.position.as_dvec3()) as f32));
-            grid.radiance[o] = (s.radiance + reflected(albedo, change).as_vec3()).max(Vec3::ZERO).to_array();
-            let scale = (luminance(albedo) / std::f64::consts::PI) as f32;
-            let variance = s.variance - s.indirect_variance + smoothed[o].variance * scale * scale;
-            grid.std_error[o] = variance.max(0.0).sqrt();
-        }
+        Self { field, lattice, positions, owners }
     }
 
-    /// Gives the points without a level set of their own what makes interpolation come nearest to the samples in the cells
-    /// around them: between the points of a steep edge there may be none with one.
-    pub(super) fn fit_beside(&self, grid: IlluminationGrid, samples: &[Option<RadianceSample>]) -> IlluminationGrid {
-        let beside = self.owners.iter().zip(samples).filter(|(o, _)| self.masks[**o] == Mask::Filled);
-        let beside: Vec<RadianceSample> = beside.filter_map(|(_, s)| *s).collect();
-        fit(self.field, self.lattice, &beside, grid, |m| m == Mask::Filled, &|_| true)
+    /// Places.
+    pub(super) fn len(&self) -> usize {
+        self.positions.len()
+    }
+
+    /// Darkness at all of them.
+    pub(super) fn dark(&self) -> Vec<BesideLight> {
+        vec![BesideLight::NONE; self.len()]
+    }
+
+    /// Samples the places of a band; `first` is the number of its first block.
+    #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32; places below 2³²")]
+    pub(super) fn sample<T: Tracer>(
+        &self,
+        sampler: &Sampler<'_, T>,
+        band: Band,
+        light: &mut [BesideLight],
+        saved: checkpoint::Stage<'_>,
+        tick: &(dyn Fn(u64) -> bool + Sync),
+    ) -> Counts {
+        let isovalue = |n: usize| (self.field.value(self.positions[n].as_dvec3()) as f32).clamp(0.0, 1.0);
+        let own: Vec<u32> =
+            (0..self.len()).into_par_iter().filter(|&n| band.holds(isovalue(n))).map(|n| n as u32).collect();
+        // Its number among its owner's tells them apart.
+        let place = |n: usize| {
+            let n = own[n] as usize;
+            let owner = self.owners[n];
+            let number = (1..STAND_INS).take_while(|&k| n >= k && self.owners[n - k] == owner).count();
+            (STAND_INS as u64 * owner + number as u64, self.positions[n])
+        };
+        let first = band.number * self.len().div_ceil(BLOCK);
+        let sampled = sample_places(sampler, own.len(), &place, saved, first, tick);
+        for (&n, s) in own.iter().zip(&sampled.samples) {
+            if let Some(RadianceSample { radiance, variance, .. }) = *s {
+                light[n as usize] = BesideLight { radiance, variance };
+            }
+        }
+        let (rays, misses, without_gradient) = (sampled.rays, sampled.misses, sampled.without_gradient);
+        Counts { rays, misses, samples: own.len() as u64 - without_gradient, without_gradient }
+    }
+
+    /// Gives the points without a level set of their own what makes interpolation come nearest to the light in the cells
+    /// around them: between the points of a steep edge there may be none with one. Points around which no light was found
+    /// stay empty, which viewers and [`IlluminationGrid::interpolate`] leave out.
+    pub(super) fn fit(&self, mut grid: IlluminationGrid, light: &[BesideLight]) -> IlluminationGrid {
+        let mut start = 0;
+        for run in self.owners.chunk_by(|a, b| a == b) {
+            let (mut sum, mut variance, mut count) = (Vec3::ZERO, 0.0, 0.0);
+            for l in light[start..start + run.len()].iter().filter(|l| l.variance >= 0.0) {
+                (sum, variance, count) = (sum + l.radiance, variance + l.variance, count + 1.0);
+            }
+            let owner = usize::try_from(run[0]).expect("a point's number");
+            if count > 0.0 {
+                grid.radiance[owner] = (sum / count).to_array();
+                grid.std_error[owner] = variance.sqrt() / count;
+                grid.mask[owner] = Mask::Filled;
+            }
+            start += run.len();
+        }
+        let wishes: Vec<Wish> = self
+            .positions
+            .par_iter()
+            .zip(light)
+            .filter(|(_, l)| l.variance >= 0.0)
+            .map(|(&position, l)| Wish { position, radiance: l.radiance })
+            .collect();
+        fit(self.field, self.lattice, &wishes, grid, |m| m == Mask::Filled, &|_| true)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rng::{Rng, Stage};
+
+    #[test]
+    fn packing_keeps_what_matters() {
+        let mut rng = Rng::stream(1, Stage::Test, 0);
+        for scale in [1e-44f32, 1e-30, 1e-3, 0.7, 1.0, 2.0, 1e9, 3e38] {
+            for _ in 0..100 {
+                let v: Halves = std::array::from_fn(|_| {
+                    Vec3::from_array(std::array::from_fn(|_| scale * (2.0 * rng.unit() as f32 - 1.0)))
+                });
+                let (back, most) =
+                    (Packed::new(v).unpack(), v.iter().map(|v| v.abs().max_element()).fold(0.0, f32::max));
+                for (a, b) in v.iter().zip(back) {
+                    assert!((*a - b).abs().max_element() <= most / 32767.0 + 2e-45, "{v:?} {back:?}");
+                }
+            }
+        }
+        assert_eq!(Packed::new([Vec3::ZERO; 2]).unpack(), [Vec3::ZERO; 2]);
+        assert!(Packed::new([Vec3::ZERO, Vec3::new(0.0, f32::NAN, 0.0)]).unpack()[0].is_nan());
+        assert_eq!(size_of::<Packed>(), 14);
     }
 }

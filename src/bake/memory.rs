@@ -1,17 +1,21 @@
 //! How much memory a bake takes, before it takes it.
 
+use super::bands::{Band, Levels};
 use super::grid_points::STAND_INS;
-use super::{BakeSettings, Engine, StrategyName};
+use super::{BakeSettings, Engine, MOST_BANDS, StrategyName};
+use crate::checkpoint;
 use crate::embree::{Device, GraphTracer};
 use crate::error::{Error, Result};
 use crate::flat;
 use crate::flattened::Side;
 use crate::mask::{Mask, masks};
+use crate::node_set::NodeSet;
 use crate::photon::{FlatPhoton, PhotonSettings, SurfacePhoton, trace_photons};
 use crate::radiance::RadianceSample;
 use crate::scene::Scene;
 use crate::sweep;
 use crate::volume::Volume;
+use rayon::prelude::*;
 
 /// The program, its libraries and threads.
 const PROGRAM: u64 = 24 << 20;
@@ -19,9 +23,22 @@ const PROGRAM: u64 = 24 << 20;
 /// Photons traced to learn how often they land.
 const PILOTS: u64 = 1 << 12;
 
-/// Bytes per mapped photon while its map is built, and when it stands.
-const MAPPING: f64 = 76.0;
+/// Bytes per mapped photon: a bin, or a photon in its cell.
 const MAP: f64 = 50.0;
+
+/// Bytes per point of gathers kept for smoothing; and per point of a slice while they are smoothed.
+const PACKED: u64 = 14;
+const SLICES: u64 = 770;
+
+/// Bytes per sample that stands in a list: position, key, result.
+const SAMPLE: u64 = 12 + 8 + size_of::<Option<RadianceSample>>() as u64;
+
+/// Bytes per scattered sample while Shepard blends them, besides the samples.
+const SHEPARD: u64 = 12 + 16 + 12 + size_of::<RadianceSample>() as u64;
+
+/// Bytes per place beside the grid's points while they are fitted: the wish, and sorted by cells with what cells say.
+const WISH: u64 = 24;
+const SORTED: u64 = 40 + 40 + 12;
 
 /// Bytes of the sweep engine per grid point (normals, h in two orders, what direct light sees), per point and swept side
 /// (direct, indirect and incoming light, what lines read), and per point and stored side (sums over replicates and their
@@ -33,9 +50,8 @@ const SUMMED_SIDE: u64 = 32;
 /// Bytes per point and side that its checkpoint holds while a replicate is under way, besides the sums.
 const KEPT_SIDE: u64 = 24;
 
-/// Bytes per grid point while points beside edges are fitted: seven vectors of conjugate gradients (84), the cells' first
-/// samples, and what the heap keeps of stages before. Measured at 64³ and 101³.
-const FITTED: u64 = 140;
+/// Bytes per fitted point: seven vectors of conjugate gradients.
+const FITTED: u64 = 84;
 
 /// Bytes that writing holds at most: batches of raw and packed blocks.
 const WRITER: u64 = 128 << 20;
@@ -53,70 +69,39 @@ impl MemoryEstimate {
     ///
     /// # Errors
     /// `Invalid` if the grid has too many points; `Embree`.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "an estimate of positive numbers")]
     pub fn new(scene: &Scene, volumes: &[&Volume], settings: &BakeSettings, device: &Device) -> Result<Self> {
-        let mut base = PROGRAM;
-        // Of all fields; sides stored of any.
-        let (mut voxels, mut points, mut filled, mut samples, mut grids, mut stored) = (0, 0, 0, 0, 0, 0);
-        for (member, volume) in scene.members().iter().zip(volumes) {
-            let lattice = settings.grid.lattice(member.field.lattice())?;
-            let (own_voxels, own_points) = (member.field.lattice().len() as u64, lattice.len() as u64);
-            // On the volume's own lattice: a finer one needs about the same share of its points.
-            let masks = masks(&member.field, member.field.lattice());
-            let needed = masks.iter().filter(|&&m| m != Mask::Empty).count() as u64;
-            let own_filled = masks.iter().filter(|&&m| m == Mask::Filled).count() as u64;
-            let sides = member.surface.stored_sides().len() as u64;
-            let element = volume.samples().element_type().size() as u64;
-            // Volume, field, the pyramid of min and max, and a mask.
-            base += own_voxels * (element + 4) + own_voxels * 33 / 8 + own_points;
-            samples += match (settings.strategy, settings.samples) {
-                (StrategyName::Nodes, _) => {
-                    needed * own_points / own_voxels + (STAND_INS as u64 - 1) * own_filled * own_points / own_voxels
-                }
-                (_, Some(n)) => n,
-                (_, None) => (needed as f64 * settings.samples_per_point) as u64,
-            };
-            (voxels, points) = (voxels + own_voxels, points + own_points);
-            (filled, grids, stored) = (filled + own_filled, grids + own_points * 17 * sides, sides.max(stored));
-        }
-        let texels = flat::texels(scene, settings.wall_resolution, settings.wall_isovalues) as u64;
-        // As gathers and as pictures see them.
-        let flats = 24 * texels;
-        let sample = size_of::<Option<RadianceSample>>() as u64;
-        // A sample: position, owner, result, checkpoint.
-        let per_sample = 12 + 8 + sample + RadianceSample::SAVED as u64;
-        let export = grids + flats + points * (4 + 13 * stored) + WRITER.min(points * (5 + 29 * stored) * 2);
-        let sides = sweep::swept_sides(scene).len() as u64;
-        let swept = SWEPT + sides * (SWEPT_SIDE + KEPT_SIDE) + 2 * stored * SUMMED_SIDE;
-        let fitting = points * FITTED + STAND_INS as u64 * filled * (32 + 36);
-        let stages = match settings.engine {
-            Engine::Photon => {
-                let [landings, mapped] = landings(scene, settings, device)?;
-                let photon = size_of::<SurfacePhoton>().max(size_of::<FlatPhoton>()) as f64;
-                let photons = (landings * photon) as u64;
-                let gather = settings.gather_rays > 0;
-                // Nodes of both sides, and the same in the checkpoint.
-                let nodes = if gather { 4 * 12 * voxels } else { 0 };
-                // Both halves, as gathered, fitted twice and blended; normal and isovalue.
-                let smoothing = if gather && settings.smoothing { points * (3 * 24 + 16) } else { 0 }.max(fitting);
-                let map = if gather { 0 } else { (mapped * MAP) as u64 };
-                vec![
-                    ("photons", base + photons * 9 / 8),
-                    ("cache", base + photons + (mapped * MAPPING) as u64 + nodes + flats * 3),
-                    ("samples", base + photons + map + nodes + flats + samples * per_sample + smoothing + grids),
-                    ("export", base + export),
-                ]
-            }
-            Engine::Sweep => vec![
-                ("sweep", base + points * swept + flats * 4),
-                (
-                    "samples",
-                    base + flats + points * (12 * 4 + 16) + STAND_INS as u64 * filled * per_sample + fitting + grids,
-                ),
-                ("export", base + export),
-            ],
+        Ok(Parts::new(scene, volumes, settings, device)?.estimate(settings.bands))
+    }
+
+    /// The least number of bands whose estimate is at most `most` bytes, and that estimate; as many bands as `settings` ask
+    /// for at least.
+    ///
+    /// # Errors
+    /// `Invalid` with the least estimate there is if none fits; as [`MemoryEstimate::new`].
+    pub fn within(
+        most: u64,
+        scene: &Scene,
+        volumes: &[&Volume],
+        settings: &BakeSettings,
+        device: &Device,
+    ) -> Result<(usize, Self)> {
+        let parts = Parts::new(scene, volumes, settings, device)?;
+        // A sweep's lines serve all isovalues at once.
+        let counts = match settings.engine {
+            Engine::Photon => settings.bands..=MOST_BANDS.max(settings.bands),
+            Engine::Sweep => 1..=1,
         };
-        Ok(Self { stages })
+        let (mut bands, mut least) = (settings.bands, parts.estimate(settings.bands));
+        for count in counts {
+            let estimate = parts.estimate(count);
+            if estimate.peak() <= most {
+                return Ok((count, estimate));
+            }
+            if estimate.peak() < least.peak() {
+                (bands, least) = (count, estimate);
+            }
+        }
+        least.check(most, bands).map(|()| (bands, least))
     }
 
     /// The largest stage.
@@ -125,23 +110,171 @@ impl MemoryEstimate {
     }
 
     /// Refuses a bake that needs more than `most` bytes.
-    ///
-    /// # Errors
-    /// `Invalid` with the estimate.
-    pub fn check(&self, most: u64) -> Result<()> {
+    fn check(&self, most: u64, bands: usize) -> Result<()> {
         if self.peak() <= most {
             return Ok(());
         }
+        let cut = if bands > 1 { format!(", cut into {bands} bands,") } else { String::new() };
         Err(Error::Invalid(format!(
-            "--max-memory {}: the bake is estimated at {self}; lower --photons or --grid, or allow more",
+            "--max-memory {}: the bake{cut} is estimated at {self}; lower --photons or --grid, or allow more",
             size(most)
         )))
     }
 }
 
-/// Landings to be expected of all photons, and those in the largest photon map: one side of the level sets, first landings
-/// left out.
-fn landings(scene: &Scene, settings: &BakeSettings, device: &Device) -> Result<[f64; 2]> {
+/// What an estimate is made of: bytes, but where it says counts.
+struct Parts {
+    engine: Engine,
+    /// The program, volumes, fields, pyramids and masks.
+    base: u64,
+    flats: u64,
+    /// Photons as traced; maps of both sides.
+    photons: u64,
+    maps: u64,
+    /// Sides that the radiance cache holds; 0 without gather.
+    cached: u64,
+    levels: Levels,
+    /// Counts: nodes of the volumes, of them those of the cache; points of the grids.
+    voxels: u64,
+    points: u64,
+    /// Grids of all stored sides, and what is kept of gathers to be smoothed.
+    grids: u64,
+    halves: u64,
+    /// Smoothing's slices.
+    slices: u64,
+    /// Counts: places beside points, and points with such.
+    beside: u64,
+    filled: u64,
+    /// Samples of all sides.
+    samples: u64,
+    /// Scattered samples and their interpolation.
+    scattered: u64,
+    scattering: u64,
+    /// The sweep engine's own.
+    swept: u64,
+    export: u64,
+}
+
+impl Parts {
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "an estimate of positive numbers")]
+    fn new(scene: &Scene, volumes: &[&Volume], settings: &BakeSettings, device: &Device) -> Result<Self> {
+        let mut base = PROGRAM;
+        // Of all fields; sides stored of any.
+        let (mut voxels, mut points, mut filled, mut samples, mut grids, mut stored) = (0, 0, 0, 0, 0, 0);
+        let (mut halves, mut slices) = (0, 0);
+        let smoothing = settings.smoothing && settings.gather_rays > 1 && settings.strategy == StrategyName::Nodes;
+        let mut all_masks = Vec::new();
+        let members = scene.members();
+        for (member, volume) in members.iter().zip(volumes) {
+            let lattice = settings.grid.lattice(member.field.lattice())?;
+            let (own_voxels, own_points) = (member.field.lattice().len() as u64, lattice.len() as u64);
+            // On the volume's own lattice: a finer one needs about the same share of its points.
+            let masks = masks(&member.field, member.field.lattice());
+            let count = |m: Mask| masks.par_iter().filter(|&&x| x == m).count() as u64 * own_points / own_voxels;
+            let (valid, own_filled) = (count(Mask::Valid), count(Mask::Filled));
+            let sides = member.surface.stored_sides().len() as u64;
+            let element = volume.samples().element_type().size() as u64;
+            // Volume, field, the pyramid of min and max, the masks of volume and grid.
+            base += own_voxels * (element + 4 + 1) + own_voxels * 33 / 8 + own_points;
+            let spread = own_filled * STAND_INS as u64;
+            samples += match (settings.strategy, settings.samples) {
+                (StrategyName::Nodes, _) => valid + spread,
+                (_, Some(n)) => n,
+                (_, None) => ((valid + own_filled) as f64 * settings.samples_per_point) as u64,
+            };
+            grids += own_points * 17 * sides;
+            if smoothing {
+                halves += valid * PACKED * sides;
+                let [nx, ny, nz] = lattice.dims().map(|n| n as u64);
+                slices = slices.max(nx * ny * SLICES.min(nz * 112));
+            }
+            (voxels, points) = (voxels + own_voxels, points + own_points);
+            (filled, stored) = (filled + own_filled, sides.max(stored));
+            all_masks.push(masks);
+        }
+        let levels = Levels::new(members.iter().zip(&all_masks).map(|(m, masks)| (&*m.field, &masks[..])));
+        let texels = flat::texels(scene, settings.wall_resolution, settings.wall_isovalues) as u64;
+        let sides = sweep::swept_sides(scene).len() as u64;
+        let swept = points * (SWEPT + sides * (SWEPT_SIDE + KEPT_SIDE) + 2 * stored * SUMMED_SIDE);
+        let ([landings, lower, higher], gather) = match settings.engine {
+            Engine::Photon => (landings(scene, settings, device)?, settings.gather_rays > 0),
+            Engine::Sweep => ([0.0; 3], false),
+        };
+        let photon = size_of::<SurfacePhoton>().max(size_of::<FlatPhoton>()) as f64;
+        let nodes = settings.strategy == StrategyName::Nodes || settings.engine == Engine::Sweep;
+        let (scattered, scattering) = match nodes {
+            true => (0, 0),
+            false => (samples * stored * SAMPLE, samples * (SAMPLE + SHEPARD) + points * (FITTED + 17)),
+        };
+        Ok(Self {
+            engine: settings.engine,
+            base,
+            // As gathers and as pictures see them.
+            flats: 24 * texels,
+            photons: (landings * photon) as u64,
+            maps: ((lower + higher) * MAP) as u64,
+            cached: if gather { 2 } else { 0 },
+            levels,
+            voxels,
+            points,
+            grids,
+            halves,
+            slices,
+            beside: if nodes { STAND_INS as u64 * filled } else { 0 },
+            filled,
+            samples: samples * stored,
+            scattered,
+            scattering,
+            swept,
+            export: WRITER.min(points * (5 + 29 * stored) * 2),
+        })
+    }
+
+    fn estimate(&self, count: usize) -> MemoryEstimate {
+        let bands = self.levels.bands(count);
+        let needed: Vec<u64> = bands.iter().map(|&b| self.levels.needed(b)).collect();
+        // Of a whole sweep most nodes are stored as a rule. Where bands meet, a side of either is there.
+        let cache = match needed[..] {
+            [one] => self.cached * 12 * if 2 * one > self.voxels { self.voxels } else { one },
+            _ => needed.windows(2).map(|n| 12 * (self.cached * n[0].max(n[1]) + n[0].min(n[1]))).max().unwrap_or(0),
+        };
+        let sets = 2 * NodeSet::bytes(self.voxels) + NodeSet::bytes(2 * self.points);
+        let Self { base, flats, photons, maps, grids, halves, beside, .. } = *self;
+        let fitting = beside * (WISH + SORTED) + self.filled * FITTED;
+        let light = base + flats + grids + beside * (20 + 16);
+        let bands = bands.len() as u64;
+        let waiting = checkpoint::MOST_WAITING as u64;
+        let written = self.samples * RadianceSample::SAVED as u64 + self.cached * 12 * self.levels.needed(Band::WHOLE);
+        let stages = match self.engine {
+            Engine::Photon => vec![
+                ("photons", base + photons * 9 / 8),
+                ("walls", base + photons + maps + (maps / 50 * 8) + flats * 3),
+                (
+                    "light",
+                    light
+                        + maps
+                        + halves
+                        + cache
+                        + sets
+                        + beside / bands * SAMPLE
+                        + self.scattered
+                        + waiting.min(written),
+                ),
+                ("interpolate", light + (halves + self.slices).max(fitting).max(self.scattered + self.scattering)),
+            ],
+            Engine::Sweep => vec![
+                ("sweep", base + self.swept + flats * 4),
+                ("samples", light + self.points * (12 * 4 + 16) + beside * SAMPLE + fitting),
+            ],
+        };
+        let export = ("export", base + grids + flats + self.export);
+        MemoryEstimate { stages: stages.into_iter().chain([export]).collect() }
+    }
+}
+
+/// Landings to be expected of all photons, and those in the photon maps of the lower and the higher side: on level sets, first
+/// landings left out.
+fn landings(scene: &Scene, settings: &BakeSettings, device: &Device) -> Result<[f64; 3]> {
     let tracer = GraphTracer::new(device, scene)?;
     let pilot = PhotonSettings {
         count: PILOTS.min(settings.photons),
@@ -151,8 +284,8 @@ fn landings(scene: &Scene, settings: &BakeSettings, device: &Device) -> Result<[
     };
     let pilots = trace_photons(scene, &tracer, &pilot, &|_| true);
     let each = settings.photons as f64 / pilots.emitted.max(1) as f64;
-    let of = |side: Side| pilots.surface.iter().filter(|p| p.side == side && p.bounces > 0).count();
-    Ok([pilots.stored() as f64 * each, of(Side::Lower).max(of(Side::Higher)) as f64 * each])
+    let of = |side: Side| pilots.surface.iter().filter(|p| p.side == side && p.bounces > 0).count() as f64 * each;
+    Ok([pilots.stored() as f64 * each, of(Side::Lower), of(Side::Higher)])
 }
 
 /// Bytes for people.

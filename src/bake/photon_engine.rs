@@ -1,19 +1,19 @@
 //! BB09's engine: photons, a radiance cache, samples by exact rays, interpolation.
 
-use super::grid_points::GridPoints;
+use super::bands::{Band, Levels};
+use super::grid_points::{Beside, BesideLight, Counts, GridPoints, PointLight};
 use super::{BakeSettings, Interpolation, Lit, PhotonCounts, stages};
 use crate::checkpoint::{self, Checkpoint};
 use crate::embree::{Device, GraphTracer, pyramids};
 use crate::error::{Error, Result};
-use crate::fitted_grid::fit;
+use crate::fitted_grid::{Wish, fit};
 use crate::flattened::Side;
 use crate::illumination_grid::{IlluminationGrid, shepard};
 use crate::mask::Mask;
 use crate::photon::{PhotonSettings, trace_photons};
-use crate::photon_map::PhotonMap;
-use crate::progress::Progress;
-use crate::radiance::{Indirect, RadianceSample, sample_radiance};
-use crate::radiance_cache::{CacheSettings, RadianceCache};
+use crate::progress::{Clock, Progress, interrupted};
+use crate::radiance::{BLOCK, Indirect, RadianceSample, Sampler, sample_places};
+use crate::radiance_cache::{CacheSettings, NodePhotons, RadianceCache};
 use crate::sampling::{Strategy, positions};
 use crate::scene::Scene;
 use crate::volume::Lattice;
@@ -22,7 +22,7 @@ use std::time::Instant;
 
 /// A field to light: the scene seen from it, its grid, and what the grid's points hold.
 pub(super) struct Job {
-    /// The field's number: it has four stages of a checkpoint, the cache's sides and the samples'.
+    /// The field's number.
     pub(super) number: u32,
     pub(super) scene: Scene,
     pub(super) lattice: Lattice,
@@ -38,13 +38,14 @@ pub(super) fn light(
     checkpoint: Option<&Checkpoint>,
 ) -> Result<Lit> {
     let mut lit = Lit::default();
-    let begun = Instant::now();
+    let clock = Clock::start();
     let first = &jobs[0].scene;
     let pyramids = pyramids(first);
     let tracers =
         jobs.iter().map(|job| GraphTracer::with_pyramids(device, &job.scene, &pyramids)).collect::<Result<Vec<_>>>()?;
-    lit.seconds.build = begun.elapsed().as_secs_f64();
+    lit.spend(clock, |s| &mut s.build);
 
+    let clock = Clock::start();
     let stage = progress.stage("photons", settings.photons);
     let photon_settings = PhotonSettings {
         count: settings.photons,
@@ -53,7 +54,8 @@ pub(super) fn light(
         fixed_isovalue: None,
     };
     let photons = trace_photons(first, &tracers[0], &photon_settings, &|n| stage.tick(n));
-    lit.seconds.photons = stage.end()?;
+    stage.end()?;
+    lit.spend(clock, |s| &mut s.photons);
     lit.rays = photons.rays;
     lit.photons = PhotonCounts {
         emitted: photons.emitted,
@@ -62,7 +64,9 @@ pub(super) fn light(
         energy_imbalance: photons.energy.iter().map(|e| e.imbalance()).fold(0.0, f64::max),
     };
 
-    let stage = progress.stage("cache", jobs.iter().map(|job| RadianceCache::work(&job.scene)).sum());
+    // The walls' light of all isovalues; what the nodes take from photons.
+    let clock = Clock::start();
+    let stage = progress.stage("walls", 0);
     let cache_settings = CacheSettings {
         node_shadow_rays: settings.cache_shadow_rays,
         flat_shadow_rays: settings.wall_shadow_rays,
@@ -72,87 +76,194 @@ pub(super) fn light(
     };
     let estimate = settings.estimate();
     let gather = settings.gather_rays > 0;
-    let saved = |job: &Job| stages(checkpoint, 4 * job.number);
+    let unsaved = [checkpoint::Stage::UNSAVED; 2];
     let tick = |n| stage.tick(n);
-    let mut cache =
-        RadianceCache::new(first, &tracers[0], &photons, estimate, &cache_settings, gather, saved(&jobs[0]), &tick);
-    for (job, tracer) in jobs.iter().zip(&tracers).skip(1).filter(|_| gather) {
-        cache.fill(&job.scene, tracer, &photons, estimate, &cache_settings, saved(job), &tick);
-    }
-    lit.seconds.cache = stage.end()?;
-    lit.rays += cache.rays;
+    let mut cache = RadianceCache::new(first, &tracers[0], &photons, estimate, &cache_settings, false, unsaved, &tick);
+    let sources: Vec<NodePhotons> = jobs.iter().map(|job| NodePhotons::new(&job.scene, &photons, estimate)).collect();
+    drop(photons);
+    stage.end()?;
+    lit.spend(clock, |s| &mut s.cache);
 
-    for (job, tracer) in jobs.iter().zip(&tracers) {
-        let mut sides = Vec::new();
-        for side in job.scene.surface.stored_sides() {
-            let map;
-            let indirect = if gather {
-                Indirect::Gather(&cache, settings.gather_rays)
-            } else {
-                map = PhotonMap::new(&job.scene, &photons.surface, side, |p| p.bounces > 0, estimate);
-                Indirect::Map(&map)
-            };
-            let saved = stages(checkpoint, 4 * job.number + 2)[side.index()];
-            sides.push((side, light_side(job, tracer, &indirect, side, settings, progress, saved, &mut lit)?));
+    let clock = Clock::start();
+    let levels = Levels::new(jobs.iter().zip(&sources).map(|(job, source)| (&*job.scene.field, source.masks())));
+    let bands = levels.bands(settings.bands);
+    lit.bands = bands.len();
+    let mut fields = jobs.iter().map(|job| FieldLight::new(job, settings)).collect::<Result<Vec<_>>>()?;
+    lit.spend(clock, |s| &mut s.samples);
+    // In rays.
+    let [node, sample] = [2 + settings.cache_shadow_rays, 2 + settings.shadow_rays / 2 + settings.gather_rays];
+    let nodes = if gather { sources.iter().map(NodePhotons::work).sum() } else { 0 };
+    let samples: u64 = fields.iter().map(FieldLight::work).sum();
+    let stage = progress.stage("light", nodes * u64::from(node) + samples * u64::from(sample));
+    for &band in &bands {
+        let begun = Instant::now();
+        let clock = Clock::start();
+        for ((job, tracer), source) in jobs.iter().zip(&tracers).zip(&sources).filter(|_| gather) {
+            let saved = stages(checkpoint, STAGES * job.number);
+            let block = band.number * RadianceCache::blocks(&job.scene);
+            let tick = |n| stage.tick(n * u64::from(node));
+            cache.fill_band(&job.scene, tracer, source, band.range(), &cache_settings, saved, block, &tick);
         }
+        lit.spend(clock, |s| &mut s.cache);
+        let clock = Clock::start();
+        for ((field, tracer), source) in fields.iter_mut().zip(&tracers).zip(&sources) {
+            let tick = |n| stage.tick(n * u64::from(sample));
+            let counts = field.sample(band, tracer, (&cache, source), settings, checkpoint, &tick);
+            lit.count(counts);
+        }
+        lit.spend(clock, |s| &mut s.samples);
+        if bands.len() > 1 && !interrupted() {
+            let name = format!("band {} of {}", band.number + 1, bands.len());
+            stage.note(&name, &format!("{:.2} s", begun.elapsed().as_secs_f64()));
+        }
+    }
+    stage.end()?;
+    progress.line("cache", lit.seconds.cache);
+    progress.line("samples", lit.seconds.samples);
+    lit.rays += cache.rays;
+    cache.forget_nodes();
+    drop(sources);
+
+    let clock = Clock::start();
+    let stage = progress.stage("interpolate", fields.iter().map(FieldLight::interpolation).sum());
+    for field in fields {
+        let sides = field.finish(settings, &|n| stage.tick(n));
         lit.fields.push(sides);
     }
+    stage.end()?;
+    lit.spend(clock, |s| &mut s.interpolate);
     lit.flats = cache.into_shown_flats();
     Ok(lit)
 }
 
-/// Samples one side of a field and brings the samples onto its grid.
-#[allow(clippy::too_many_arguments, reason = "one call")]
-fn light_side(
-    job: &Job,
-    tracer: &GraphTracer<'_>,
-    indirect: &Indirect<'_>,
-    side: Side,
-    settings: &BakeSettings,
-    progress: Progress,
-    saved: checkpoint::Stage<'_>,
-    lit: &mut Lit,
-) -> Result<IlluminationGrid> {
-    let Job { scene, lattice, masks, .. } = job;
-    let begun = Instant::now();
-    let strategy = settings.strategy.placed();
-    let points =
-        strategy.is_none().then(|| GridPoints::new(&scene.field, lattice, masks, settings.seed, |m| m != Mask::Empty));
-    let scattered = strategy.map(|s| scatter(scene, settings, masks, &s)).transpose()?;
-    let at = points.as_ref().map_or(scattered.as_deref().unwrap_or_default(), GridPoints::positions);
-    let stage = progress.stage("samples", at.len() as u64);
-    let (shadow_rays, seed) = (settings.shadow_rays, settings.seed);
-    let sampled = sample_radiance(scene, tracer, indirect, at, side, shadow_rays, seed, saved, &|n| stage.tick(n));
-    stage.end()?;
-    lit.seconds.samples += begun.elapsed().as_secs_f64();
-    lit.rays += sampled.rays;
-    lit.misses += sampled.misses;
-    lit.without_gradient += sampled.without_gradient;
-    lit.samples += at.len() as u64 - sampled.without_gradient;
+/// Stages of a checkpoint that a field has: per side the cache's, the points', and the places' beside them.
+pub(super) const STAGES: u32 = 6;
 
-    let passes = 1 + u64::from(settings.interpolation == Interpolation::Fit);
-    let stage = progress.stage("interpolate", passes * lattice.len() as u64);
-    let grid = match points {
-        Some(points) => {
-            let mut grid = points.collect(&sampled.samples);
-            if settings.smoothing && settings.gather_rays > 1 {
-                points.smooth(scene, side, settings.tau, &mut grid, &sampled.samples);
+/// The light of one field while it is gathered.
+struct FieldLight<'a> {
+    job: &'a Job,
+    places: Places<'a>,
+    sides: Vec<SideLight>,
+}
+
+/// Where a field is sampled.
+enum Places<'a> {
+    /// At its grid's points and beside them.
+    Grid(GridPoints<'a>, Beside<'a>),
+    /// Anywhere.
+    Scattered(Vec<Vec3>),
+}
+
+struct SideLight {
+    side: Side,
+    /// At the grid's points and beside them.
+    points: Option<(PointLight, Vec<BesideLight>)>,
+    scattered: Vec<Option<RadianceSample>>,
+}
+
+impl<'a> FieldLight<'a> {
+    fn new(job: &'a Job, settings: &BakeSettings) -> Result<Self> {
+        let Job { scene, lattice, masks, .. } = job;
+        let places = match settings.strategy.placed() {
+            Some(strategy) => Places::Scattered(scatter(scene, settings, masks, &strategy)?),
+            None => {
+                let beside = Beside::new(&scene.field, lattice, masks, settings.seed);
+                Places::Grid(GridPoints::new(&scene.field, lattice, masks), beside)
             }
-            points.fit_beside(grid, &sampled.samples)
-        }
-        None => {
-            let samples: Vec<RadianceSample> = sampled.samples.into_iter().flatten().collect();
-            let grid = shepard(&scene.field, lattice, masks, &samples, settings.neighbours, &|n| stage.tick(n));
-            match settings.interpolation {
-                Interpolation::Shepard => grid,
-                Interpolation::Fit => {
-                    fit(&scene.field, lattice, &samples, grid, |m| m != Mask::Empty, &|n| stage.tick(n))
+        };
+        let smoothing = settings.smoothing && settings.gather_rays > 1;
+        let sides = scene.surface.stored_sides().into_iter().map(|side| match &places {
+            Places::Grid(points, beside) => {
+                SideLight { side, points: Some((points.dark(smoothing), beside.dark())), scattered: Vec::new() }
+            }
+            Places::Scattered(at) => SideLight { side, points: None, scattered: vec![None; at.len()] },
+        });
+        let sides = sides.collect();
+        Ok(Self { job, places, sides })
+    }
+
+    /// Samples of all sides.
+    fn work(&self) -> u64 {
+        let each = match &self.places {
+            Places::Grid(points, beside) => points.len() + beside.len(),
+            Places::Scattered(at) => at.len(),
+        };
+        (each * self.sides.len()) as u64
+    }
+
+    /// Ticks of [`FieldLight::finish`].
+    fn interpolation(&self) -> u64 {
+        2 * (self.job.lattice.len() * self.sides.len()) as u64
+    }
+
+    /// Samples the isovalues of a band, on all sides.
+    #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
+    fn sample(
+        &mut self,
+        band: Band,
+        tracer: &GraphTracer<'_>,
+        (cache, source): (&RadianceCache, &NodePhotons<'_>),
+        settings: &BakeSettings,
+        checkpoint: Option<&Checkpoint>,
+        tick: &(dyn Fn(u64) -> bool + Sync),
+    ) -> Counts {
+        let Job { scene, number, .. } = self.job;
+        let mut counts = Counts::default();
+        for SideLight { side, points, scattered } in &mut self.sides {
+            let indirect = match (settings.gather_rays, source.map(*side)) {
+                (0, Some(map)) => Indirect::Map(map),
+                (rays, _) => Indirect::Gather(cache, rays),
+            };
+            let (shadow_rays, seed) = (settings.shadow_rays, settings.seed);
+            let sampler = Sampler { scene, tracer, indirect: &indirect, side: *side, shadow_rays, seed };
+            let saved = |kind: u32| stages(checkpoint, STAGES * number + kind)[side.index()];
+            match (&self.places, points) {
+                (Places::Grid(grid, beside), Some((at_points, at_beside))) => {
+                    counts += grid.sample(&sampler, band, at_points, saved(2), tick);
+                    counts += beside.sample(&sampler, band, at_beside, saved(4), tick);
                 }
+                (Places::Scattered(at), _) => {
+                    let isovalue = |p: Vec3| (scene.field.value(p.as_dvec3()) as f32).clamp(0.0, 1.0);
+                    let own: Vec<usize> = (0..at.len()).filter(|&n| band.holds(isovalue(at[n]))).collect();
+                    let first = band.number * at.len().div_ceil(BLOCK);
+                    let place = |n: usize| (own[n] as u64, at[own[n]]);
+                    let got = sample_places(&sampler, own.len(), &place, saved(2), first, tick);
+                    own.iter().zip(got.samples).for_each(|(&n, s)| scattered[n] = s);
+                    let (rays, misses, without_gradient) = (got.rays, got.misses, got.without_gradient);
+                    let samples = own.len() as u64 - without_gradient;
+                    counts += Counts { rays, misses, samples, without_gradient };
+                }
+                (Places::Grid(..), None) => {}
             }
         }
-    };
-    lit.seconds.interpolate += stage.end()?;
-    Ok(grid)
+        counts
+    }
+
+    /// The grids of all sides.
+    fn finish(self, settings: &BakeSettings, tick: &(dyn Fn(u64) -> bool + Sync)) -> Vec<(Side, IlluminationGrid)> {
+        let Self { job: Job { scene, lattice, masks, .. }, places, sides } = self;
+        let each = |SideLight { side, points, scattered }: SideLight| {
+            let grid = match (&places, points) {
+                (Places::Grid(grid, beside), Some((at_points, at_beside))) => {
+                    beside.fit(grid.finish(scene, side, settings.tau, at_points, tick), &at_beside)
+                }
+                _ => {
+                    let samples: Vec<RadianceSample> = scattered.into_iter().flatten().collect();
+                    let grid = shepard(&scene.field, lattice, masks, &samples, settings.neighbours, tick);
+                    match settings.interpolation {
+                        Interpolation::Shepard => grid,
+                        Interpolation::Fit => {
+                            let wishes: Vec<Wish> = samples.iter().map(Wish::from).collect();
+                            drop(samples);
+                            fit(&scene.field, lattice, &wishes, grid, |m| m != Mask::Empty, tick)
+                        }
+                    }
+                }
+            };
+            (side, grid)
+        };
+        sides.into_iter().map(each).collect()
+    }
 }
 
 /// Positions of scattered samples.

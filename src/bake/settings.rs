@@ -7,6 +7,9 @@ use crate::sampling::Strategy;
 use crate::sweep::SweepSettings;
 use serde::{Deserialize, Serialize};
 
+/// More bands than this save nothing.
+pub const MOST_BANDS: usize = 256;
+
 /// How much work a bake is worth.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
@@ -135,6 +138,9 @@ pub struct BakeOptions {
     /// Seed of all random numbers
     #[arg(long)]
     pub seed: Option<u64>,
+    /// Bands of isovalues baked one after another, which takes less memory (default: 1, or what --max-memory asks for)
+    #[arg(long, value_name = "N")]
+    pub bands: Option<usize>,
 }
 
 /// `grid` as text in files.
@@ -178,6 +184,7 @@ impl BakeOptions {
             grid: self.grid.or(other.grid),
             wall_resolution: self.wall_resolution.or(other.wall_resolution),
             seed: self.seed.or(other.seed),
+            bands: self.bands.or(other.bands),
         }
     }
 }
@@ -235,6 +242,8 @@ pub struct BakeSettings {
     pub normalisation: Normalisation,
     /// Seed.
     pub seed: u64,
+    /// Bands of isovalues baked one after another, at most. The light does not depend on it.
+    pub bands: usize,
 }
 
 fn grid_size_text<S: serde::Serializer>(grid: &GridSize, s: S) -> std::result::Result<S::Ok, S::Error> {
@@ -293,6 +302,7 @@ impl BakeSettings {
             wall_shadow_rays: wall_shadow,
             normalisation: Normalisation::Accepted,
             seed: o.seed.unwrap_or(1),
+            bands: o.bands.unwrap_or(1),
         };
         let checks = [
             (
@@ -306,9 +316,17 @@ impl BakeSettings {
             ("neighbours", (1..=1024).contains(&settings.neighbours), "1 to 1024"),
             ("shadow-rays", (1..=1 << 20).contains(&settings.shadow_rays), "1 to 1048576"),
             ("gather", settings.gather_rays <= 1 << 20, "0 to 1048576"),
+            ("bands", (1..=MOST_BANDS).contains(&settings.bands), "1 to 256"),
             ("tau", settings.tau > 0.0 && settings.tau.is_finite(), "above 0"),
             ("wall-resolution", (2..=2048).contains(&settings.wall_resolution), "2 to 2048"),
         ];
+        if settings.engine == Engine::Sweep && settings.bands > 1 {
+            return Err(Error::Invalid(
+                "bands: the lines of the sweep engine serve all isovalues at once; leave --bands out, or use the photon \
+                 engine"
+                    .into(),
+            ));
+        }
         match checks.into_iter().find(|(_, ok, _)| !ok) {
             Some((name, _, range)) => Err(Error::Invalid(format!("{name}: must be {range}"))),
             None => Ok(settings),

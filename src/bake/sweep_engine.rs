@@ -1,7 +1,8 @@
 //! The fast engine: line sweeps light every node; exact rays fill the points beside the sweep's ends.
 
-use super::grid_points::GridPoints;
-use super::photon_engine::Job;
+use super::bands::Band;
+use super::grid_points::Beside;
+use super::photon_engine::{Job, STAGES};
 use super::{BakeSettings, Lit, stages};
 use crate::brdf::reflected;
 use crate::checkpoint::Checkpoint;
@@ -10,15 +11,14 @@ use crate::error::Result;
 use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
 use crate::mask::Mask;
-use crate::progress::Progress;
-use crate::radiance::{Indirect, sample_radiance};
+use crate::progress::{Clock, Progress};
+use crate::radiance::{Indirect, Sampler};
 use crate::radiance_cache::RadianceCache;
 use crate::scene::{Scene, Surface};
 use crate::sweep::{SweptSide, sweep_resumable};
 use crate::volume::Lattice;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
-use std::time::Instant;
 
 /// Resolution of the progress bar, since a sweep knows only fractions.
 const STEPS: f64 = 1000.0;
@@ -39,16 +39,18 @@ pub(super) fn light(
         fine = scene.resampled(lattice);
         &fine
     };
+    let clock = Clock::start();
     let stage = progress.stage("sweep", STEPS as u64);
     let done = std::sync::atomic::AtomicU64::new(0);
-    let [saved, _] = stages(checkpoint, 4 * number);
+    let [saved, _] = stages(checkpoint, STAGES * number);
     let swept = sweep_resumable(scene, &settings.sweep(), saved, &|fraction| {
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 … 1000")]
         let now = (fraction * STEPS) as u64;
         let before = done.fetch_max(now, std::sync::atomic::Ordering::Relaxed);
         stage.tick(now.saturating_sub(before))
     })?;
-    lit.seconds.sweep = stage.end()?;
+    stage.end()?;
+    lit.spend(clock, |s| &mut s.sweep);
     lit.sweep_queries = swept.counts.gather_rays + swept.counts.shadow_rays;
 
     // What the sweep knows is also what rays from the other points gather.
@@ -59,31 +61,28 @@ pub(super) fn light(
     });
     let cache = RadianceCache::from_parts(nodes, swept.flats);
 
-    let begun = Instant::now();
+    let clock = Clock::start();
     let tracer = GraphTracer::new(device, scene)?;
-    lit.seconds.build = begun.elapsed().as_secs_f64();
-    let begun = Instant::now();
-    let points = GridPoints::new(&scene.field, lattice, masks, settings.seed, |m| m == Mask::Filled);
-    let at = points.positions();
+    lit.spend(clock, |s| &mut s.build);
+    let clock = Clock::start();
+    let beside = Beside::new(&scene.field, lattice, masks, settings.seed);
     let mut sides = Vec::new();
     for (s, white) in swept.sides.iter().zip(white) {
-        let stage = progress.stage("samples", at.len() as u64);
+        let stage = progress.stage("samples", beside.len() as u64);
         let indirect = Indirect::Gather(&cache, settings.gather_rays.max(1));
         let (shadow_rays, seed) = (settings.shadow_rays, settings.seed);
-        let saved = stages(checkpoint, 4 * number + 2)[s.side.index()];
-        let sampled =
-            sample_radiance(scene, &tracer, &indirect, at, s.side, shadow_rays, seed, saved, &|n| stage.tick(n));
+        let sampler = Sampler { scene, tracer: &tracer, indirect: &indirect, side: s.side, shadow_rays, seed };
+        let saved = stages(checkpoint, STAGES * number + 4)[s.side.index()];
+        let mut light = beside.dark();
+        let counts = beside.sample(&sampler, Band::WHOLE, &mut light, saved, &|n| stage.tick(n));
         stage.end()?;
-        lit.rays += sampled.rays;
-        lit.misses += sampled.misses;
-        lit.samples += at.len() as u64 - sampled.without_gradient;
-        lit.without_gradient += sampled.without_gradient;
-        let mut grid = points.collect(&sampled.samples);
-        merge(&mut grid, masks, &outgoing(scene, white), &s.std_error);
-        sides.push((s.side, points.fit_beside(grid, &sampled.samples)));
+        lit.count(counts);
+        let grid = swept_grid(masks, outgoing(scene, white), &s.std_error);
+        sides.push((s.side, beside.fit(grid, &light)));
     }
     lit.fields.push(sides);
-    lit.seconds.samples = begun.elapsed().as_secs_f64();
+    lit.spend(clock, |s| &mut s.samples);
+    lit.bands = 1;
     lit.flats = cache.into_shown_flats();
     Ok(lit)
 }
@@ -139,11 +138,15 @@ fn widened(lattice: &Lattice, masks: &[Mask], nodes: &[[f32; 3]]) -> Vec<[f32; 3
         .collect()
 }
 
-/// Puts what the sweep knows over what rays filled.
-fn merge(grid: &mut IlluminationGrid, masks: &[Mask], swept: &[[f32; 3]], std_error: &[f32]) {
-    for (o, &radiance) in swept.iter().enumerate().filter(|(o, _)| masks[*o] == Mask::Valid) {
-        grid.radiance[o] = radiance;
-        grid.std_error[o] = std_error.get(o).copied().unwrap_or(0.0);
-        grid.mask[o] = Mask::Valid;
-    }
+/// A grid of what the sweep knows.
+fn swept_grid(masks: &[Mask], mut radiance: Vec<[f32; 3]>, std_error: &[f32]) -> IlluminationGrid {
+    let known = |&m: &Mask| if m == Mask::Valid { m } else { Mask::Empty };
+    let mask: Vec<Mask> = masks.par_iter().map(known).collect();
+    radiance.par_iter_mut().zip(&mask).filter(|(_, m)| **m == Mask::Empty).for_each(|(r, _)| *r = [0.0; 3]);
+    let std_error = mask
+        .par_iter()
+        .enumerate()
+        .map(|(o, &m)| if m == Mask::Valid { std_error.get(o).copied().unwrap_or(0.0) } else { 0.0 })
+        .collect();
+    IlluminationGrid { radiance, std_error, mask }
 }

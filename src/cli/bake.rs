@@ -53,7 +53,8 @@ pub(super) struct Bake {
     /// Go on where an interrupted bake of the same settings stopped; from the beginning if there is no checkpoint
     #[arg(long)]
     resume: bool,
-    /// Refuse a bake whose estimated memory exceeds this, such as 8G or 500M
+    /// Cut the sweep into bands until the estimated memory is at most this, such as 8G or 500M; refuse a bake that still
+    /// needs more
     #[arg(long, value_name = "BYTES", value_parser = bytes)]
     max_memory: Option<u64>,
     /// Print what memory and time it would take, check everything, and stop before the work
@@ -146,7 +147,7 @@ impl Bake {
             _ => {}
         }
         let volumes: Vec<&Volume> = [&loaded.volume].into_iter().chain(&loaded.companions).collect();
-        let settings = BakeSettings::new(&self.bake.clone().or(&loaded.bake))?;
+        let mut settings = BakeSettings::new(&self.bake.clone().or(&loaded.bake))?;
         let sweep = loaded.scene.field.sweep();
         supported(&loaded.scene, &settings).map_err(|e| e.in_file(&self.input))?;
         let members = loaded.scene.members();
@@ -169,12 +170,19 @@ impl Bake {
             }
         }
         let device = device()?;
-        let memory = MemoryEstimate::new(&loaded.scene, &volumes, &settings, &device)?;
+        let memory = match self.max_memory {
+            Some(most) => {
+                let (bands, estimate) = MemoryEstimate::within(most, &loaded.scene, &volumes, &settings, &device)?;
+                settings.bands = bands;
+                estimate
+            }
+            None => MemoryEstimate::new(&loaded.scene, &volumes, &settings, &device)?,
+        };
         if progress == Progress::Shown || self.dry_run {
             eprintln!("{:>14}  {memory}", "memory");
-        }
-        if let Some(most) = self.max_memory {
-            memory.check(most)?;
+            if settings.bands > 1 {
+                eprintln!("{:>14}  {} of isovalues, one after another", "bands", settings.bands);
+            }
         }
         if self.dry_run {
             match TimeEstimate::new(&loaded.scene, &settings, &device)? {

@@ -16,7 +16,6 @@ use crate::scene::{Boundary, Member, Policy, Scene, Surface};
 use crate::volume::vti::{VtiArray, VtiFile, VtiWriter};
 use crate::volume::{Lattice, Samples, Volume};
 use glam::DVec3;
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
@@ -118,23 +117,13 @@ pub fn write(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
     let lattice = &bake.lattice;
     let own = lattice == &volume.lattice;
     let sweep = scene.field.sweep();
-    let values: Vec<f32> = (0..lattice.len())
-        .into_par_iter()
-        .map(|o| {
-            let p = local_position(&scene.field, lattice, o);
-            if own { volume.value(o) as f32 } else { sweep.from_unit(scene.field.value(p)) as f32 }
-        })
-        .collect();
+    let value = |o: usize| {
+        if own {
+            return volume.value(o) as f32;
+        }
+        sweep.from_unit(scene.field.value(local_position(&scene.field, lattice, o))) as f32
+    };
     let exposure = bake.exposure as f32;
-    let sides: Vec<(Vec<f32>, Samples)> = bake
-        .sides
-        .iter()
-        .map(|(_, grid)| {
-            let radiance = grid.radiance.as_flattened().par_iter();
-            let rgb = radiance.map(|&x| srgb_encode((x * exposure).clamp(0.0, 1.0))).collect();
-            (rgb, Samples::U8(grid.mask.iter().map(|&m| m as u8).collect()))
-        })
-        .collect();
     let mut textures = Vec::new();
     let mut texels: Vec<(String, Cow<'_, [f32]>)> = Vec::new();
     // Much context geometry would be as many arrays.
@@ -187,31 +176,27 @@ pub fn write(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
     let range = [sweep.lo(), sweep.hi()];
     let mut numbers = Vec::new();
     flatten("", &report, &mut numbers);
-    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-    let shared: Vec<f32> = match scene.fields() {
-        1 => Vec::new(),
-        _ => values.iter().map(|&v| sweep.isovalue(f64::from(v))).collect(),
-    };
-    let mut writer = VtiWriter::new(lattice).point_data("value", 1, &values[..]).active_scalars("value");
-    if !shared.is_empty() {
-        writer = writer.point_data("s", 1, &shared[..]);
-    }
-    for (i, ((_, grid), (rgb, mask))) in bake.sides.iter().zip(&sides).enumerate() {
-        let s = suffix(i);
-        writer = writer
-            .point_data(&format!("radiance{s}"), 3, grid.radiance.as_flattened())
-            .point_data(&format!("rgb{s}"), 3, &rgb[..])
-            .point_data(&format!("std_error{s}"), 1, &grid.std_error[..])
-            .point_data(&format!("mask{s}"), 1, mask);
-    }
-    for (name, data) in &texels {
-        writer = writer.field_data(name, 3, &data[..]);
-    }
     let constants: Vec<(String, Samples)> = numbers
         .into_iter()
         .chain([("exposure".to_owned(), vec![bake.exposure]), ("isovalues".to_owned(), range.to_vec())])
         .map(|(name, v)| (name, Samples::F64(v)))
         .collect();
+    let mut writer = VtiWriter::new(lattice).computed("value", 1, value).active_scalars("value");
+    if scene.fields() > 1 {
+        writer = writer.computed("s", 1, |o| sweep.isovalue(f64::from(value(o))));
+    }
+    for (i, (_, grid)) in bake.sides.iter().enumerate() {
+        let s = suffix(i);
+        let radiance = grid.radiance.as_flattened();
+        writer = writer
+            .point_data(&format!("radiance{s}"), 3, radiance)
+            .computed(&format!("rgb{s}"), 3, move |i| srgb_encode((radiance[i] * exposure).clamp(0.0, 1.0)))
+            .point_data(&format!("std_error{s}"), 1, &grid.std_error[..])
+            .computed_bytes(&format!("mask{s}"), 1, |o| grid.mask[o] as u8);
+    }
+    for (name, data) in &texels {
+        writer = writer.field_data(name, 3, &data[..]);
+    }
     for (name, samples) in &constants {
         writer = writer.field_data(name, 1, samples);
     }

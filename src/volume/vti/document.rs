@@ -2,6 +2,7 @@
 //! whole. \[VTK\]
 
 use super::SamplesRef;
+use super::writer::Values;
 use crate::error::Result;
 use crate::files;
 use crate::volume::ElementType;
@@ -12,15 +13,15 @@ use std::path::Path;
 /// Unpacked bytes of a block.
 pub(super) const BLOCK: usize = 1 << 20;
 
-/// Blocks packed at once: the memory a writer needs.
-const BATCH: usize = 64;
+/// Blocks packed at once: a writer holds two batches, one raw and packed, one packed.
+const BATCH: usize = 32;
 
 /// Text and arrays of a document, in order. The same content gives the same bytes, for every number of threads.
 pub(crate) struct Document<'a> {
     text: String,
     /// Where in the text each array's offset is to be filled in.
     slots: Vec<usize>,
-    arrays: Vec<SamplesRef<'a>>,
+    arrays: Vec<Values<'a>>,
 }
 
 impl<'a> Document<'a> {
@@ -40,6 +41,11 @@ impl<'a> Document<'a> {
 
     /// Adds a `<DataArray>`, with further attributes after a space each.
     pub(crate) fn array(&mut self, name: &str, components: usize, samples: SamplesRef<'a>, attributes: &str) {
+        self.values(name, components, Values::Stored(samples), attributes);
+    }
+
+    /// As [`Document::array`], of values that may be computed when they are written.
+    pub(super) fn values(&mut self, name: &str, components: usize, samples: Values<'a>, attributes: &str) {
         let (kind, name) = (vtk_type(samples.element_type()), escape(name));
         self.text += &format!(
             "      <DataArray type=\"{kind}\" Name=\"{name}\"{attributes} NumberOfComponents=\"{components}\" \
@@ -72,14 +78,20 @@ impl<'a> Document<'a> {
                 let start = end;
                 end += 8 * (header.len() + blocks) as u64;
                 out.seek(SeekFrom::Start(end))?;
-                for first in (0..blocks).step_by(BATCH) {
-                    let packed: std::io::Result<Vec<_>> =
-                        (first..blocks.min(first + BATCH)).into_par_iter().map(|b| samples.pack(b)).collect();
-                    for block in packed? {
-                        out.write_all(&block)?;
+                let pack = |first: usize| -> std::io::Result<Vec<Vec<u8>>> {
+                    (first.min(blocks)..blocks.min(first + BATCH)).into_par_iter().map(|b| samples.pack(b)).collect()
+                };
+                let mut packed = pack(0)?;
+                for next in (BATCH..blocks + BATCH).step_by(BATCH) {
+                    for block in &packed {
                         header.push(block.len() as u64);
                         end += block.len() as u64;
                     }
+                    // The next batch is packed while this one is written.
+                    let write = || packed.iter().try_for_each(|block| out.write_all(block));
+                    let (written, behind) = rayon::join(write, || pack(next));
+                    written?;
+                    packed = behind?;
                 }
                 out.seek(SeekFrom::Start(start))?;
                 out.write_all(&header.iter().flat_map(|w| w.to_le_bytes()).collect::<Vec<_>>())?;

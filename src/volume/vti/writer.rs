@@ -5,7 +5,9 @@ use crate::error::{Error, Result};
 use crate::volume::{ElementType, Lattice, Samples};
 use flate2::{Compression, write::ZlibEncoder};
 use std::io::Write;
+use std::ops::Range;
 use std::path::Path;
+use std::sync::Arc;
 
 /// Borrowed values of one of the types VTK knows.
 #[derive(Clone, Copy, Debug)]
@@ -103,12 +105,45 @@ impl SamplesRef<'_> {
         each_type!(self, v => v.iter().try_for_each(|s| out.write_all(&s.to_le_bytes())))
     }
 
+    /// Values of a range, little-endian.
+    fn raw(&self, range: Range<usize>) -> Vec<u8> {
+        each_type!(self, v => v[range].iter().flat_map(|s| s.to_le_bytes()).collect())
+    }
+}
+
+/// Values that are there, or computed when they are written, so that nobody holds them all.
+#[derive(Clone)]
+pub(super) enum Values<'a> {
+    Stored(SamplesRef<'a>),
+    F32(usize, Arc<dyn Fn(usize) -> f32 + Send + Sync + 'a>),
+    U8(usize, Arc<dyn Fn(usize) -> u8 + Send + Sync + 'a>),
+}
+
+impl Values<'_> {
+    pub(super) fn element_type(&self) -> ElementType {
+        match self {
+            Values::Stored(v) => v.element_type(),
+            Values::F32(..) => ElementType::F32,
+            Values::U8(..) => ElementType::U8,
+        }
+    }
+
+    pub(super) fn len(&self) -> usize {
+        match self {
+            Values::Stored(v) => v.len(),
+            Values::F32(n, _) | Values::U8(n, _) => *n,
+        }
+    }
+
     /// Block `b`, little-endian and packed.
     pub(super) fn pack(&self, b: usize) -> std::io::Result<Vec<u8>> {
         let per = BLOCK / self.element_type().size();
-        let raw: Vec<u8> = each_type!(self, v => {
-            v[b * per..v.len().min((b + 1) * per)].iter().flat_map(|s| s.to_le_bytes()).collect()
-        });
+        let range = b * per..self.len().min((b + 1) * per);
+        let raw: Vec<u8> = match self {
+            Values::Stored(v) => v.raw(range),
+            Values::F32(_, of) => range.flat_map(|i| of(i).to_le_bytes()).collect(),
+            Values::U8(_, of) => range.map(|i| of(i)).collect(),
+        };
         let mut encoder = ZlibEncoder::new(Vec::new(), Compression::fast());
         encoder.write_all(&raw)?;
         encoder.finish()
@@ -118,7 +153,7 @@ impl SamplesRef<'_> {
 struct Array<'a> {
     name: String,
     components: usize,
-    samples: SamplesRef<'a>,
+    samples: Values<'a>,
 }
 
 /// Collects what a `.vti` file is to hold, and writes it.
@@ -142,7 +177,28 @@ impl<'a> VtiWriter<'a> {
     /// Adds an array with `components` values per lattice sample, components fastest.
     #[must_use]
     pub fn point_data(mut self, name: &str, components: usize, samples: impl Into<SamplesRef<'a>>) -> Self {
-        self.point_data.push(Array { name: name.into(), components, samples: samples.into() });
+        self.point_data.push(Array { name: name.into(), components, samples: Values::Stored(samples.into()) });
+        self
+    }
+
+    /// As [`VtiWriter::point_data`] of 32-bit floats, computed from their numbers when they are written.
+    #[must_use]
+    pub fn computed(mut self, name: &str, components: usize, of: impl Fn(usize) -> f32 + Send + Sync + 'a) -> Self {
+        let samples = Values::F32(components * self.lattice.len(), Arc::new(of));
+        self.point_data.push(Array { name: name.into(), components, samples });
+        self
+    }
+
+    /// As [`VtiWriter::computed`], of bytes.
+    #[must_use]
+    pub fn computed_bytes(
+        mut self,
+        name: &str,
+        components: usize,
+        of: impl Fn(usize) -> u8 + Send + Sync + 'a,
+    ) -> Self {
+        let samples = Values::U8(components * self.lattice.len(), Arc::new(of));
+        self.point_data.push(Array { name: name.into(), components, samples });
         self
     }
 
@@ -156,7 +212,7 @@ impl<'a> VtiWriter<'a> {
     /// Adds a numeric array about the whole file, `components` values per tuple.
     #[must_use]
     pub fn field_data(mut self, name: &str, components: usize, samples: impl Into<SamplesRef<'a>>) -> Self {
-        self.field_data.push(Array { name: name.into(), components, samples: samples.into() });
+        self.field_data.push(Array { name: name.into(), components, samples: Values::Stored(samples.into()) });
         self
     }
 
@@ -181,7 +237,7 @@ impl<'a> VtiWriter<'a> {
 
     fn check(&self) -> Result<(), String> {
         // VTK 9.7's reader was seen to crash on an array without values.
-        if let Some(a) = self.field_data.iter().chain(&self.point_data).find(|a| a.samples.is_empty()) {
+        if let Some(a) = self.field_data.iter().chain(&self.point_data).find(|a| a.samples.len() == 0) {
             return Err(format!("array `{}` has no values, which VTK cannot read; leave it out", a.name));
         }
         for a in &self.point_data {
@@ -233,7 +289,7 @@ impl<'a> VtiWriter<'a> {
         ));
         for a in &self.field_data {
             let tuples = format!(" NumberOfTuples=\"{}\"", a.samples.len() / a.components);
-            d.array(&a.name, a.components, a.samples, &tuples);
+            d.values(&a.name, a.components, a.samples.clone(), &tuples);
         }
         for (name, text) in &self.field_strings {
             // As VTK writes them: signed character codes.
@@ -248,7 +304,7 @@ impl<'a> VtiWriter<'a> {
         let scalars = self.active_scalars.as_ref().map(|s| format!(" Scalars=\"{}\"", escape(s))).unwrap_or_default();
         d.text(&format!("    </FieldData>\n    <Piece Extent=\"{extent}\">\n      <PointData{scalars}>\n"));
         for a in &self.point_data {
-            d.array(&a.name, a.components, a.samples, "");
+            d.values(&a.name, a.components, a.samples.clone(), "");
         }
         d.text("      </PointData>\n      <CellData/>\n    </Piece>\n  </ImageData>\n");
         d
