@@ -20,6 +20,9 @@ pub struct SurfacePhoton {
     pub isovalue: f32,
     /// Power × isovalue per channel, before reflection.
     pub power: Vec3,
+    /// Cosine of its arrival to the receiver normal over that to the level set's own, at most 4: times `power` it is what
+    /// the receiver normal would have taken up. \[Veach96\]
+    pub foreshortening: f32,
     /// The number of the field whose level set it is.
     pub field: u8,
     /// Reflections before this landing: 0 is direct light of a luminaire. Light of emitting level sets starts at 1,
@@ -254,28 +257,34 @@ fn trace_photon<T: Tracer>(
         };
         let (albedo, normal, departure) = match hit.target {
             Target::Surface(side) => {
+                let normal = scene.normal(position.as_dvec3(), side);
+                let gradient = scene.field.gradient(position.as_dvec3());
                 out.surface.push(SurfacePhoton {
                     position,
                     isovalue: photon.isovalue,
                     power: photon.power.as_vec3(),
+                    foreshortening: foreshortening(normal, gradient, photon.direction),
                     field: scene.number() as u8,
                     bounces,
                     side,
                 });
                 let albedo = scene.surface.albedo.at(f64::from(photon.isovalue));
-                (albedo, scene.normal(position.as_dvec3(), side), Departure::Surface(side))
+                (albedo, normal, Departure::Surface(side))
             }
             Target::Companion(n, side) => {
                 let companion = &scene.companions()[usize::from(n)];
+                let normal = companion.normal(position.as_dvec3(), side);
+                let place = companion.to_index(position.as_dvec3()).as_vec3();
+                let gradient = companion.member.field.gradient(place.as_dvec3());
                 out.surface.push(SurfacePhoton {
-                    position: companion.to_index(position.as_dvec3()).as_vec3(),
+                    position: place,
                     isovalue: photon.isovalue,
                     power: photon.power.as_vec3(),
+                    foreshortening: foreshortening(normal, gradient, photon.direction),
                     field: companion.number as u8,
                     bounces,
                     side,
                 });
-                let normal = companion.normal(position.as_dvec3(), side);
                 let albedo = companion.member.surface.albedo.at(f64::from(photon.isovalue));
                 (albedo, normal, Departure::Companion(n, side))
             }
@@ -318,6 +327,14 @@ fn trace_photon<T: Tracer>(
         let direction = Frame::new(normal).to_world(cosine_hemisphere(rng.unit2()));
         photon = Flight { origin: position, direction, departure, power: next, ..photon };
     }
+}
+
+/// See [`SurfacePhoton::foreshortening`]; 1 where there is no normal.
+#[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+fn foreshortening(receiver: Option<DVec3>, gradient: DVec3, direction: DVec3) -> f32 {
+    let own = gradient.normalize_or_zero().dot(direction).abs();
+    // Unbounded it is unbiased, but a grazing photon may weigh as much as all others.
+    receiver.map_or(1.0, |n| ((-direction.dot(n)).max(0.0) / own.max(1e-6)).min(4.0) as f32)
 }
 
 /// Photon `index`: source by power, point uniform over the area, direction by the cosine, isovalue uniform over the

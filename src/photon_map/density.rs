@@ -1,10 +1,11 @@
 //! Photons counted in bins, and irradiance as a local linear fit to the bins' densities.
 //!
-//! What a bin needs beside its photons' power, the measure ∫|∇h| dV of level sets in it with their mean isovalue, normal
-//! and place, does not depend on the photons: it is integrated once. The estimate at x minimises
-//! Σ K A D (P/D − a − b·(y − x))² over the bins (power P, measure D, centroid y) that it accepts (A) and takes a: at a
-//! border or a crease, where bins lie on one side only, the slope b keeps their mean from standing for x. The kernel is a
-//! ball in coordinates of the bins, so that coarse slices of a volume blur no further than they must. \[Loader99\]
+//! What a bin needs beside its photons' power, the measure ∫|∇h| dV of level sets in it with their mean isovalue, receiver
+//! normal and place, does not depend on the photons: it is integrated once. Level sets that face different octants have bins of
+//! their own, so that the sides of a thin sheet do not mix. The estimate at x minimises Σ K A D (P/D − a − b·(y − x))²
+//! over the bins (power P, measure D, centroid y) that it accepts (A) and takes a: at a border or a crease, where bins
+//! lie on one side only, the slope b keeps their mean from standing for x. The kernel is a ball in coordinates of the
+//! bins, so that coarse slices of a volume blur no further than they must; its radius is found once per bin. \[Loader99\]
 
 use super::{EstimateSettings, Irradiance};
 use crate::direct::luminance;
@@ -14,33 +15,46 @@ use crate::photon::SurfacePhoton;
 use crate::scene::Scene;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
+use std::ops::Range;
 
-/// One bin: 12 floats.
+/// The level sets in a cell of the bins that face one octant: a cache line.
 #[derive(Clone, Copy, Debug, Default)]
+#[repr(align(64))]
 struct Bin {
-    /// Σ w.
-    power: Vec3,
-    /// Σ luminance(w)².
-    squares: f32,
-    /// ∫ |∇h| dV over what of the bin lies in Ω and in the sweep; 0: no level set.
+    /// Centroid by `measure`, in coordinates of the bins.
+    centroid: Vec3,
+    /// ∫ |∇h| dV over what lies in Ω and in the sweep.
     measure: f32,
+    /// Mean unit receiver normal by that measure, towards falling h, normalised.
+    normal: Vec3,
     /// Mean isovalue by that measure.
     isovalue: f32,
-    /// Mean unit gradient by that measure, normalised.
-    normal: Vec3,
-    /// Centroid by that measure, in coordinates of the bins.
-    centroid: Vec3,
+    /// Σ w.
+    power: Vec3,
+    /// How far another isovalue may be to share light: τ, or half of what the bin spans. A steep edge spans the sweep
+    /// within a voxel, where c hardly moves its level set.
+    reach: f32,
+    /// Σ luminance(w)².
+    squares: f32,
+    /// Radius of estimates here, in bins.
+    radius: f32,
+    /// Signs of the normal.
+    octant: u8,
 }
 
 /// The photons of one side in bins.
 pub(super) struct PhotonDensity<'a> {
     field: &'a Field,
     settings: EstimateSettings,
-    /// Lattice steps per bin along each axis.
+    /// Cells of the bins per lattice step along each axis.
+    scale: DVec3,
+    /// Lattice steps per cell along each axis.
     factor: [usize; 3],
     dims: [usize; 3],
+    /// First bin of each cell, x fastest; one more entry than cells.
+    starts: Vec<u32>,
     bins: Vec<Bin>,
-    /// World edge of a cube of a bin's volume.
+    /// World edge of a cube of a cell's volume.
     edge: f64,
 }
 
@@ -48,9 +62,19 @@ pub(super) struct PhotonDensity<'a> {
 const LEAST: f32 = 1.3;
 const FIRST: f32 = 2.0;
 const MOST: f32 = 5.0;
+/// Photons of an estimate per photon of a bin, and the most photons that bins are meant to hold on average.
+const SHARE: f64 = 8.0;
+const FULL: f64 = 8.0;
+
+/// The octant of a normal: a bit per negative coordinate.
+#[inline]
+fn octant(n: DVec3) -> u8 {
+    (n.cmplt(DVec3::ZERO)).bitmask() as u8
+}
 
 impl<'a> PhotonDensity<'a> {
-    /// Counts the photons that `keep` accepts. Bins hold whole voxels, as many as make for a photon in each on average.
+    /// Counts the photons that `keep` accepts. Cells hold whole voxels, as many as make for a few photons in each that
+    /// level sets pass.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "storage is f32; sizes are small")]
     pub(super) fn new(
         scene: &'a Scene,
@@ -63,74 +87,124 @@ impl<'a> PhotonDensity<'a> {
         let axes = lattice.axes();
         let spacing = DVec3::from_array(std::array::from_fn(|a| axes.col(a).length()));
         let volume = axes.determinant().abs();
-        let per_bin = (lattice.len() as f64 / kept.len().max(1) as f64).max(1.0);
-        let wanted = (volume * per_bin).cbrt();
+        let passed = field.samples().par_iter().filter(|h| (0.0..=1.0).contains(*h)).count();
+        let per_bin = (settings.photons as f64 / SHARE).clamp(1.0, FULL);
+        let voxels = (per_bin * passed as f64 / kept.len().max(1) as f64).max(1.0);
+        let wanted = (volume * voxels).cbrt();
         let dims = lattice.dims();
         let factor: [usize; 3] = std::array::from_fn(|a| ((wanted / spacing[a]).round() as usize).clamp(1, dims[a]));
-        let bins: [usize; 3] = std::array::from_fn(|a| dims[a].div_ceil(factor[a]));
         let mut density = Self {
             field,
             settings,
+            scale: 1.0 / DVec3::from_array(factor.map(|f| f as f64)),
             factor,
-            dims: bins,
-            bins: vec![Bin::default(); bins.iter().product()],
+            dims: std::array::from_fn(|a| dims[a].div_ceil(factor[a])),
+            starts: vec![0],
+            bins: Vec::new(),
             edge: (volume * factor.iter().product::<usize>() as f64).cbrt(),
         };
-        let measured: Vec<Bin> = (0..density.bins.len())
+        let [nx, ny, nz] = density.dims;
+        let rows: Vec<(Vec<u32>, Vec<Bin>)> = (0..ny * nz)
             .into_par_iter()
-            .with_min_len(1024)
-            .map(|n| density.measured([n % bins[0], n / bins[0] % bins[1], n / (bins[0] * bins[1])]))
+            .map(|row| {
+                let mut bins = Vec::new();
+                let end = |i| {
+                    density.measured([i, row % ny, row / ny], &mut bins);
+                    bins.len() as u32
+                };
+                ((0..nx).map(end).collect(), bins)
+            })
             .collect();
-        density.bins = measured;
-        let places: Vec<u32> = kept
-            .par_iter()
-            .map(|p| density.offset(density.bin(density.place(p.position.as_dvec3()).as_vec3())) as u32)
-            .collect();
-        for (p, &place) in kept.iter().zip(&places) {
-            let bin = &mut density.bins[place as usize];
-            bin.power += p.power;
-            bin.squares += luminance(p.power.as_dvec3()).powi(2) as f32;
+        for (ends, bins) in rows {
+            let before = density.bins.len() as u32;
+            density.starts.extend(ends.iter().map(|e| before + e));
+            density.bins.extend(bins);
         }
+        let places: Vec<Option<usize>> = kept.par_iter().map(|p| density.own(p.position.as_dvec3()).1).collect();
+        for (p, place) in kept.iter().zip(places) {
+            let Some(bin) = place.map(|n| &mut density.bins[n]) else { continue };
+            let power = p.power * p.foreshortening;
+            bin.power += power;
+            bin.squares += luminance(power.as_dvec3()).powi(2) as f32;
+        }
+        let radii: Vec<f32> = density.bins.par_iter().with_min_len(256).map(|b| density.radius(b)).collect();
+        density.bins.iter_mut().zip(radii).for_each(|(b, r)| b.radius = r);
         density
     }
 
-    /// Coordinates of the bins of a local position: bin n spans [n, n + 1].
+    /// Coordinates of the bins of a local position: cell n spans [n, n + 1].
     #[inline]
     fn place(&self, p: DVec3) -> DVec3 {
-        (p + 0.5) / DVec3::from_array(self.factor.map(|f| f as f64))
+        (p + 0.5) * self.scale
     }
 
-    /// The bin of such coordinates, or the nearest.
+    /// The cell of one such coordinate, or the nearest.
     #[inline]
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the bins")]
-    fn bin(&self, place: Vec3) -> [usize; 3] {
-        std::array::from_fn(|a| (place[a] as usize).min(self.dims[a] - 1))
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the cells")]
+    fn cell(&self, axis: usize, at: f32) -> usize {
+        (at as usize).min(self.dims[axis] - 1)
     }
 
+    /// The bins of cells `from` to `to` of row (j, k).
     #[inline]
-    fn offset(&self, [i, j, k]: [usize; 3]) -> usize {
-        (k * self.dims[1] + j) * self.dims[0] + i
+    fn row(&self, from: usize, to: usize, j: usize, k: usize) -> Range<usize> {
+        let row = (k * self.dims[1] + j) * self.dims[0];
+        self.starts[row + from] as usize..self.starts[row + to + 1] as usize
     }
 
-    /// A bin without its photons: ∫ over the octants of its voxels, one point in each, eight where the sweep ends.
+    /// The normal at a local position, and the bin it belongs to: of its octant, or the one that faces most alike.
+    #[inline]
+    fn own(&self, position: DVec3) -> (Vec3, Option<usize>) {
+        let normal = self.field.falling_normal(position).unwrap_or_default();
+        let place = self.place(position).as_vec3();
+        let [i, j, k] = [0, 1, 2].map(|a| self.cell(a, place[a]));
+        let (octant, normal) = (octant(normal), normal.as_vec3());
+        let mut best = (f32::NEG_INFINITY, None);
+        for n in self.row(i, i, j, k) {
+            let bin = &self.bins[n];
+            let alike = if bin.octant == octant { 2.0 } else { bin.normal.dot(normal) };
+            if alike > best.0 {
+                best = (alike, Some(n));
+            }
+        }
+        (normal, best.1)
+    }
+
+    /// Adds the bins of a cell, without their photons: ∫ over the octants of its voxels, one point in each, eight where
+    /// the sweep ends.
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-    fn measured(&self, bin: [usize; 3]) -> Bin {
+    fn measured(&self, cell: [usize; 3], out: &mut Vec<Bin>) {
         let lattice = self.field.lattice();
+        let dims = lattice.dims();
+        // The samples that the cell interpolates.
+        let range =
+            |a: usize| (cell[a] * self.factor[a]).saturating_sub(1)..=((cell[a] + 1) * self.factor[a]).min(dims[a] - 1);
+        let (mut lo, mut hi) = (f32::INFINITY, f32::NEG_INFINITY);
+        for k in range(2) {
+            for j in range(1) {
+                let row = lattice.offset(*range(0).start(), j, k)..=lattice.offset(*range(0).end(), j, k);
+                for &h in &self.field.samples()[row] {
+                    (lo, hi) = (lo.min(h), hi.max(h));
+                }
+            }
+        }
+        if !(lo <= 1.0 && hi >= 0.0 && lo < hi) {
+            return;
+        }
         let far = lattice.far();
         // Points per lattice step: a bin of many voxels needs fewer.
         let fine = |a: usize| if self.factor[a] < 3 { 2.0 } else { 1.0 };
         let step = DVec3::new(1.0 / fine(0), 1.0 / fine(1), 1.0 / fine(2));
-        let cell = step.element_product() * lattice.axes().determinant().abs();
-        let from = DVec3::from_array(std::array::from_fn(|a| (bin[a] * self.factor[a]) as f64 - 0.5));
+        let volume = step.element_product() * lattice.axes().determinant().abs();
+        let from = DVec3::from_array(std::array::from_fn(|a| (cell[a] * self.factor[a]) as f64 - 0.5));
         let count: [usize; 3] = std::array::from_fn(|a| self.factor[a] * fine(a) as usize);
-        let (mut measure, mut isovalue, mut normal, mut centroid) = (0.0, 0.0, DVec3::ZERO, DVec3::ZERO);
+        let mut parts = [Part::default(); 8];
         let mut add = |p: DVec3, h: f64, g: DVec3, weight: f64| {
             let w = g.length() * weight;
-            if w > 0.0 {
-                measure += w;
-                isovalue += w * h;
-                normal += g * weight;
-                centroid += w * p;
+            if w > 0.0
+                && let Some(normal) = self.field.falling_normal(p)
+            {
+                parts[usize::from(octant(normal))].add(w, h, normal, p);
             }
         };
         let to_steps = lattice.axes().transpose();
@@ -145,7 +219,7 @@ impl<'a> PhotonDensity<'a> {
                     // How far h goes within the octant.
                     let spread = 0.5 * (to_steps * g).abs().dot(step);
                     if h - spread >= 0.0 && h + spread <= 1.0 {
-                        add(p, h, g, cell);
+                        add(p, h, g, volume);
                     } else if h + spread >= 0.0 && h - spread <= 1.0 {
                         for corner in 0..8u32 {
                             let o =
@@ -153,35 +227,44 @@ impl<'a> PhotonDensity<'a> {
                             let q = p + o * step;
                             let h = self.field.value(q);
                             if (0.0..=1.0).contains(&h) {
-                                add(q, h, self.field.gradient(q), cell / 8.0);
+                                add(q, h, self.field.gradient(q), volume / 8.0);
                             }
                         }
                     }
                 }
             }
         }
-        if !(measure > 0.0) {
-            return Bin::default();
-        }
-        Bin {
-            measure: measure as f32,
-            isovalue: (isovalue / measure) as f32,
-            normal: normal.normalize_or_zero().as_vec3(),
-            centroid: self.place(centroid / measure).as_vec3(),
+        let tau = self.settings.tau;
+        out.extend((0..8).zip(parts).filter(|(_, p)| p.measure > 0.0).map(|(octant, p)| Bin {
+            centroid: self.place(p.centroid / p.measure).as_vec3(),
+            measure: p.measure as f32,
+            normal: p.normal.normalize_or_zero().as_vec3(),
+            isovalue: (p.isovalue / p.measure) as f32,
+            reach: tau.max(0.5 * (p.highest - p.lowest)) as f32,
+            octant,
             ..Bin::default()
-        }
+        }));
     }
 
-    /// Calls `visit(bin, d², d)` for the bins with level sets within `radius` of `place`, at offset d; all in bins.
+    /// Calls `visit(bin, d², d)` for the bins within `radius` of `place`, at offset d; all in bins.
     #[inline]
     fn around(&self, place: Vec3, radius: f32, mut visit: impl FnMut(&Bin, f32, Vec3)) {
-        let (lo, hi) = (self.bin(place - radius), self.bin(place + radius));
-        for k in lo[2]..=hi[2] {
-            for j in lo[1]..=hi[1] {
-                for bin in &self.bins[self.offset([lo[0], j, k])..=self.offset([hi[0], j, k])] {
+        // How far a coordinate is from a cell's span.
+        let beyond = |at: f32, cell: usize| (cell as f32 - at).max(at - cell as f32 - 1.0).max(0.0);
+        let r2 = radius * radius;
+        for k in self.cell(2, place.z - radius)..=self.cell(2, place.z + radius) {
+            let left = r2 - beyond(place.z, k).powi(2);
+            for j in self.cell(1, place.y - radius)..=self.cell(1, place.y + radius) {
+                let left = left - beyond(place.y, j).powi(2);
+                if left <= 0.0 {
+                    continue;
+                }
+                let half = left.sqrt();
+                let row = self.row(self.cell(0, place.x - half), self.cell(0, place.x + half), j, k);
+                for bin in &self.bins[row] {
                     let d = bin.centroid - place;
                     let d2 = d.length_squared();
-                    if d2 < radius * radius && bin.measure > 0.0 {
+                    if d2 < r2 {
                         visit(bin, d2, d);
                     }
                 }
@@ -189,19 +272,21 @@ impl<'a> PhotonDensity<'a> {
         }
     }
 
-    /// See [`super::PhotonMap::irradiance`].
-    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-    pub(super) fn irradiance(&self, position: DVec3, isovalue: f64) -> Irradiance {
-        let place = self.place(position).as_vec3();
-        let normal = self.field.gradient(position).normalize_or_zero().as_vec3();
-        let (c, tau, cone) = (isovalue as f32, self.settings.tau as f32, self.settings.cone as f32);
-        let accepts = |b: &Bin| (b.isovalue - c).abs() <= tau && b.normal.dot(normal) >= cone;
+    /// Whether light at `isovalue` and `normal` is `bin`'s.
+    #[inline]
+    fn accepts(&self, bin: &Bin, isovalue: f32, normal: Vec3) -> bool {
+        (bin.isovalue - isovalue).abs() <= bin.reach && bin.normal.dot(normal) >= self.settings.cone as f32
+    }
+
+    /// The radius around a bin that holds the photons asked for, so far as bins allow.
+    #[allow(clippy::cast_possible_truncation, reason = "f32 does")]
+    fn radius(&self, at: &Bin) -> f32 {
         let wanted = self.settings.photons as f32;
         // Photons of equal power that would be as noisy as those within a radius.
         let count = |radius: f32| {
             let (mut sum, mut squares) = (0.0f32, 0.0f32);
-            self.around(place, radius, |b, _, _| {
-                if accepts(b) {
+            self.around(at.centroid, radius, |b, _, _| {
+                if self.accepts(b, at.isovalue, at.normal) {
                     sum += luminance(b.power.as_dvec3()) as f32;
                     squares += b.squares;
                 }
@@ -215,23 +300,59 @@ impl<'a> PhotonDensity<'a> {
             radius = MOST;
             n = count(MOST);
         }
-        let radius = (radius * (wanted / n.max(1.0)).cbrt()).clamp(LEAST, MOST);
+        (radius * (wanted / n.max(1.0)).cbrt()).clamp(LEAST, MOST)
+    }
+
+    /// See [`super::PhotonMap::irradiance`].
+    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+    pub(super) fn irradiance(&self, position: DVec3, isovalue: f64) -> Irradiance {
+        let (normal, own) = self.own(position);
+        let own = own.map(|n| &self.bins[n]);
+        let (place, radius) = (self.place(position).as_vec3(), own.map_or(MOST, |b| b.radius));
         let scale = 1.0 / radius;
         let mut fit = Fit::default();
         self.around(place, radius, |b, d2, d| {
-            if accepts(b) {
+            if self.accepts(b, isovalue as f32, normal) {
                 fit.add(b, 1.0 - d2 * scale * scale, d * scale);
             }
         });
-        if !fit.any() {
+        if !fit.any()
+            && let Some(bin) = own
+        {
             // A tip or a crease, whose bin has another mean normal than the place itself.
-            let bin = &self.bins[self.offset(self.bin(place))];
-            if bin.measure > 0.0 {
-                fit.add(bin, 1.0, Vec3::ZERO);
-            }
+            fit.add(bin, 1.0, Vec3::ZERO);
         }
         let (mean, variance) = fit.solve();
         Irradiance { mean, variance, radius: f64::from(radius) * self.edge }
+    }
+}
+
+/// Sums over the points of a cell that face one octant, weighted by |∇h| dV.
+#[derive(Clone, Copy)]
+struct Part {
+    measure: f64,
+    isovalue: f64,
+    normal: DVec3,
+    centroid: DVec3,
+    lowest: f64,
+    highest: f64,
+}
+
+impl Default for Part {
+    fn default() -> Self {
+        let (lowest, highest) = (f64::INFINITY, f64::NEG_INFINITY);
+        Self { measure: 0.0, isovalue: 0.0, normal: DVec3::ZERO, centroid: DVec3::ZERO, lowest, highest }
+    }
+}
+
+impl Part {
+    #[inline]
+    fn add(&mut self, w: f64, h: f64, normal: DVec3, p: DVec3) {
+        self.measure += w;
+        self.isovalue += w * h;
+        self.normal += w * normal;
+        self.centroid += w * p;
+        (self.lowest, self.highest) = (self.lowest.min(h), self.highest.max(h));
     }
 }
 

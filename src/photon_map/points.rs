@@ -61,7 +61,7 @@ impl<'a> PhotonPoints<'a> {
                 let p = kept[n as usize];
                 let g = scene.field.gradient(p.position.as_dvec3());
                 MappedPhoton {
-                    power: p.power,
+                    power: p.power * p.foreshortening,
                     isovalue: p.isovalue,
                     normal: g.normalize_or_zero().as_vec3(),
                     slope: g.length() as f32,

@@ -40,8 +40,8 @@ const COLUMNS: [&str; 25] = [
     "picture_s",
 ];
 
-/// Each data set at its main isovalue: uniform samples straight from the map (BB09's mode), samples at the nodes with final
-/// gather, and the sweep engine; the interpolation floor at grid factors 1, 2, 3; the reference on triangles against the one on the trilinear surface.
+/// Each data set at its main isovalue: straight from the map, with uniform samples as BB09 and with samples at the nodes;
+/// samples at the nodes with final gather, and the sweep engine; the interpolation floor at grid factors 1, 2, 3; the reference on triangles against the one on the trilinear surface.
 ///
 /// # Errors
 /// As bakes, references and tables.
@@ -53,8 +53,9 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
         gather_rays,
         ..BakeOptions::default()
     };
-    let modes: [(&str, BakeOptions); 3] = [
-        ("map", exact(StrategyName::Uniform, Some(0))),
+    let modes: [(&str, BakeOptions); 4] = [
+        ("map, uniform", exact(StrategyName::Uniform, Some(0))),
+        ("map", exact(StrategyName::Nodes, Some(0))),
         ("nodes", exact(StrategyName::Nodes, None)),
         ("sweep", BakeOptions { engine: Some(Engine::Sweep), ..BakeOptions::default() }),
     ];
