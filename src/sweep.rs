@@ -126,11 +126,12 @@ pub struct SweepCounts {
 pub const MOST_POLYGONS: usize = 256;
 
 /// Passes with few directions take this share of the full number.
-const COARSE: usize = 4;
-/// Full passes after the light has settled.
-const FULL_PASSES: usize = 2;
+const COARSE: usize = 8;
 /// Fewest directions of a coarse pass.
-const LEAST: usize = 32;
+const LEAST: usize = 16;
+/// Passes after the light has settled, each with twice the directions of the one before. The last one counts: one set of
+/// twice the directions errs less than the mean of two.
+const LATE: usize = 2;
 
 /// Whether sweeps can light a scene.
 ///
@@ -273,17 +274,17 @@ impl Run<'_> {
         );
         let indirect = self.sides.iter().map(|_| grid::black(self.geometry.h.len())).collect();
         let nothing = flats.open();
-        flats.close(nothing);
+        flats.close(&nothing);
         flats.reflect([1.0; 3], false);
         let light = Replicate { direct, indirect };
         if !complete {
             return Err(light);
         }
         state.counts.shadow_rays += state.counts.valid * lights as u64;
-        Ok(Passes { light, monitor: Monitor::default(), averaged: 0, bounce: 0, scale: [1.0; 3] })
+        Ok(Passes { light, monitor: Monitor::default(), late: 0, bounce: 0, scale: [1.0; 3] })
     }
 
-    /// Direct light, then bounces: coarse passes until the tail is predictable and small, full passes, whose mean counts.
+    /// Direct light, then bounces: coarse passes until the tail is predictable and small, then finer ones.
     /// Goes on behind the passes of `from`, whose light the flats hold. False if `progress` stopped it.
     fn replicate(
         &self,
@@ -319,12 +320,15 @@ impl Run<'_> {
             }
             let indirect = (now.bounce > 0).then_some(&now.light.indirect[..]);
             let (b, unit) = self.reflect(flats, &now.light.direct, indirect, now.scale);
-            let settled =
-                fixed || now.averaged > 0 || now.monitor.missing(FULL_PASSES as i32).is_some_and(|m| m < s.target);
+            let settled = now.late > 0 || now.monitor.missing(LATE as i32).is_some_and(|m| m < s.target);
             let bounce = now.bounce + 1;
-            let last_coarse = settled || bounce + FULL_PASSES > s.max_bounces;
-            let directions =
-                if last_coarse { s.directions } else { (s.directions / COARSE).max(LEAST).min(s.directions) };
+            let late = settled || bounce + LATE > s.max_bounces;
+            let directions = match () {
+                () if fixed => s.directions,
+                () if late => s.directions >> (LATE - 1 - now.late),
+                () => (s.directions / COARSE).max(LEAST),
+            };
+            let directions = directions.max(LEAST).min(s.directions);
             let lines = directions::lines(self.scene.lattice(), s.seed, number << 32 | bounce as u64, directions);
             let mut incoming = flats.open();
             let mut family = 0;
@@ -340,7 +344,7 @@ impl Run<'_> {
                 stopped |= !complete;
                 fresh.push(e);
             }
-            flats.close(incoming);
+            flats.close(&incoming);
             if stopped {
                 self.saved.save(0, || state.bytes(Some((&now, flats))));
                 state.see(&now);
@@ -350,19 +354,11 @@ impl Run<'_> {
             state.counts.families += total as u64;
             state.counts.gather_rays += state.counts.valid * total as u64;
             let mean = self.mean(&fresh);
-            if now.averaged > 0 {
-                // Full passes are averaged: each saw the light that the one before left.
-                let w = 1.0 / (now.averaged + 1) as f32;
-                for (old, new) in now.light.indirect.iter_mut().flatten().zip(fresh.iter().flatten()) {
-                    old.par_iter_mut().zip(new).with_min_len(1 << 12).for_each(|(o, n)| *o += w * (n - *o));
-                }
-            } else {
-                now.light.indirect = fresh;
-            }
-            now.averaged += usize::from(last_coarse && !fixed);
+            now.light.indirect = fresh;
+            now.late += usize::from(late && !fixed);
             now.scale = if fixed { [1.0; 3] } else { now.monitor.push(mean) };
             flats.reflect(now.scale, true);
-            if !fixed && now.averaged == FULL_PASSES {
+            if now.late == LATE {
                 break;
             }
         }

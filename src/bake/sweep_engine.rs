@@ -23,6 +23,10 @@ use std::time::Instant;
 /// Resolution of the progress bar, since a sweep knows only fractions.
 const STEPS: f64 = 1000.0;
 
+/// The share of the photon engine's rays that a sample beside the sweep's ends takes: each point there is fitted to samples
+/// of its own and its neighbours'.
+const SHARE: u32 = 8;
+
 pub(super) fn light(
     Job { number, scene, lattice, masks }: &Job,
     settings: &BakeSettings,
@@ -68,8 +72,8 @@ pub(super) fn light(
     let mut sides = Vec::new();
     for (s, white) in swept.sides.iter().zip(white) {
         let stage = progress.stage("samples", at.len() as u64);
-        let indirect = Indirect::Gather(&cache, settings.gather_rays.max(1));
-        let (shadow_rays, seed) = (settings.shadow_rays, settings.seed);
+        let indirect = Indirect::Gather(&cache, (settings.gather_rays / SHARE).max(2));
+        let (shadow_rays, seed) = ((settings.shadow_rays / SHARE).max(2), settings.seed);
         let saved = stages(checkpoint, 4 * number + 2)[s.side.index()];
         let sampled =
             sample_radiance(scene, &tracer, &indirect, at, s.side, shadow_rays, seed, saved, &|n| stage.tick(n));

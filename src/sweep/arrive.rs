@@ -59,7 +59,7 @@ impl<'a> Walls<'a> {
             let offset = shear.offset[a];
             ((lo[axes[a]] - most - offset).floor() as isize, (hi[axes[a]] - least - offset).ceil() as isize)
         };
-        let side_of_texel = flats.textures.iter().flatten().map(|t| t.texel_area.sqrt()).fold(f64::INFINITY, f64::min);
+        let side_of_texel = flats.textures.iter().flatten().map(|t| t.sink_area.sqrt()).fold(f64::INFINITY, f64::min);
         let spacing = pass.scene.lattice().spacing().max_element();
         let stride = (side_of_texel / (LINES_PER_TEXEL * spacing)).floor().clamp(1.0, 8.0) as isize;
         let mut rng =

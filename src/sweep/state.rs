@@ -26,8 +26,8 @@ pub(super) struct State {
 pub(super) struct Passes {
     pub light: Replicate,
     pub monitor: Monitor,
-    /// Full passes that `light.indirect` is the mean of.
-    pub averaged: usize,
+    /// Passes since the light has settled.
+    pub late: usize,
     /// Passes behind us.
     pub bounce: usize,
     /// What stands for the bounces that are left, per channel.
@@ -92,7 +92,7 @@ impl State {
         out.count(usize::from(passes.is_some()));
         if let Some((p, flats)) = passes {
             out.count(p.bounce);
-            out.count(p.averaged);
+            out.count(p.late);
             out.numbers(&p.scale);
             out.count(p.monitor.since.unsigned_abs() as usize);
             out.count(p.monitor.means.len());
@@ -160,7 +160,7 @@ impl State {
         }
         let mut passes = None;
         if from.count()? == 1 {
-            let (bounce, averaged) = (from.count()?, from.count()?);
+            let (bounce, late) = (from.count()?, from.count()?);
             let scale = from.numbers(3)?.try_into().ok()?;
             let mut monitor = Monitor { since: i32::try_from(from.count()?).ok()?, ..Monitor::default() };
             for _ in 0..from.count()? {
@@ -172,7 +172,7 @@ impl State {
             for t in flats.textures.iter().flatten() {
                 textures.push([from.numbers(t.direct.len())?, from.numbers(t.radiance.len())?]);
             }
-            passes = Some((Passes { light, monitor, averaged, bounce, scale }, textures));
+            passes = Some((Passes { light, monitor, late, bounce, scale }, textures));
         }
         from.bytes.is_empty().then_some((state, passes))
     }
