@@ -23,15 +23,15 @@ const PILOTS: u64 = 1 << 12;
 const MAPPING: f64 = 76.0;
 const MAP: f64 = 50.0;
 
-/// Bytes of the sweep engine per grid point (normals, h in two orders, what direct light sees), per point and swept side
-/// (direct, indirect and incoming light, what lines read), and per point and stored side (sums over replicates and their
-/// spread). Measured at 101³ and 128³: 108 with one point per luminaire, 131 with sixteen, 63 more for a second side.
-const SWEPT: u64 = 55;
-const SWEPT_SIDE: u64 = 44;
-const SUMMED_SIDE: u64 = 32;
+/// Bytes of the sweep engine per grid point (normals in two orders, h in the second, what direct light sees), per point and
+/// swept side (direct and incoming light, one plane of it turned over, what lines read), and per point and stored side (sums
+/// over replicates and their spread).
+const SWEPT: u64 = 24;
+const SWEPT_SIDE: u64 = 36;
+const SUMMED_SIDE: u64 = 16;
 
 /// Bytes per point and side that its checkpoint holds while a replicate is under way, besides the sums.
-const KEPT_SIDE: u64 = 24;
+const KEPT_SIDE: u64 = 20;
 
 /// Bytes per grid point while points beside edges are fitted: seven vectors of conjugate gradients (84), the cells' first
 /// samples, and what the heap keeps of stages before. Measured at 64³ and 101³.
@@ -111,7 +111,7 @@ impl MemoryEstimate {
                 ("sweep", base + points * swept + flats * 4),
                 (
                     "samples",
-                    base + flats + points * (12 * 4 + 16) + STAND_INS as u64 * filled * per_sample + fitting + grids,
+                    base + flats + points * (12 * 3 + 16) + STAND_INS as u64 * filled * per_sample + fitting + grids,
                 ),
                 ("export", base + export),
             ],

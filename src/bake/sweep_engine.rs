@@ -111,8 +111,7 @@ fn white(masks: &[Mask], s: &SweptSide) -> Vec<[f32; 3]> {
             if masks[o] != Mask::Valid {
                 return [f32::NAN; 3];
             }
-            let e = vector(s.direct[o]) + vector(s.indirect[o]);
-            reflected(DVec3::ONE, e).as_vec3().to_array()
+            reflected(DVec3::ONE, vector(s.irradiance[o])).as_vec3().to_array()
         })
         .collect()
 }
