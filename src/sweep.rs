@@ -67,7 +67,7 @@ impl Default for SweepSettings {
             directions: 64,
             light_points: 16,
             max_bounces: 64,
-            target: 1e-3,
+            target: 4e-3,
             replicates: 4,
             flat_resolution: (32, 32),
             seed: 1,
@@ -81,10 +81,8 @@ impl Default for SweepSettings {
 pub struct SweptSide {
     /// Which side.
     pub side: Side,
-    /// Irradiance E straight from luminaires (world, not divided by π).
-    pub direct: Vec<[f32; 3]>,
-    /// Irradiance from everything else, emission of the level sets included.
-    pub indirect: Vec<[f32; 3]>,
+    /// Irradiance E (world, not divided by π), straight from luminaires and from everything else.
+    pub irradiance: Vec<[f32; 3]>,
     /// Standard error of the luminance of the reflected radiance ρE/π, from the spread of the replicates. Empty with
     /// fewer than 2. What the grid cannot hold between its nodes is not part of it.
     pub std_error: Vec<f32>,
@@ -126,11 +124,12 @@ pub struct SweepCounts {
 pub const MOST_POLYGONS: usize = 256;
 
 /// Passes with few directions take this share of the full number.
-const COARSE: usize = 4;
-/// Full passes after the light has settled.
-const FULL_PASSES: usize = 2;
+const COARSE: usize = 8;
 /// Fewest directions of a coarse pass.
-const LEAST: usize = 32;
+const LEAST: usize = 16;
+/// Passes after the light has settled, each with twice the directions of the one before. The last one counts: one set of
+/// twice the directions errs less than the mean of two.
+const LATE: usize = 2;
 
 /// Whether sweeps can light a scene.
 ///
@@ -199,10 +198,10 @@ pub fn sweep_resumable(
     while state.done < replicates && !stopped {
         let r = state.done;
         let progress = |x: f64| tick((r as f64 + x) / replicates as f64);
-        let (replicate, complete) = run.replicate(&mut state, passes.take(), &mut flats, &progress);
+        let (light, complete) = run.replicate(&mut state, passes.take(), &mut flats, &progress);
         stopped = !complete;
         if complete || r == 0 {
-            state.add(&replicate, &flats, scene);
+            state.add(light, &flats, scene);
         }
     }
     if !stopped {
@@ -245,15 +244,18 @@ struct Run<'a> {
     saved: Stage<'a>,
 }
 
-/// Direct and indirect irradiance of one replicate, per side.
-struct Replicate {
-    direct: Vec<Planes>,
-    indirect: Vec<Planes>,
-}
+/// Direct and indirect irradiance of one replicate, per side; the latter is missing if it was stopped.
+type Light = [Vec<Planes>; 2];
 
 impl Run<'_> {
-    /// Direct light of one replicate, on the flats too, and black indirect light; `None` if `progress` stopped it.
-    fn begin(&self, state: &mut State, flats: &mut Flats, progress: &dyn Fn(f64) -> bool) -> Result<Passes, Replicate> {
+    /// Direct light of one replicate, on the flats too, and what it makes nodes reflect; the direct light if `progress`
+    /// stopped it.
+    fn begin(
+        &self,
+        state: &mut State,
+        flats: &mut Flats,
+        progress: &dyn Fn(f64) -> bool,
+    ) -> Result<Passes, Vec<Planes>> {
         let s = self.settings;
         let points = s.light_points.max(1);
         let lights = points * self.scene.luminaires().len();
@@ -271,19 +273,18 @@ impl Run<'_> {
             (s.seed, number, points),
             &mut ask,
         );
-        let indirect = self.sides.iter().map(|_| grid::black(self.geometry.h.len())).collect();
         let nothing = flats.open();
-        flats.close(nothing);
+        flats.close(&nothing);
         flats.reflect([1.0; 3], false);
-        let light = Replicate { direct, indirect };
         if !complete {
-            return Err(light);
+            return Err(direct);
         }
         state.counts.shadow_rays += state.counts.valid * lights as u64;
-        Ok(Passes { light, monitor: Monitor::default(), averaged: 0, bounce: 0, scale: [1.0; 3] })
+        let (b, unit) = self.reflect(flats, &direct, None, [1.0; 3]);
+        Ok(Passes { direct, b, unit, monitor: Monitor::default(), late: 0, bounce: 0 })
     }
 
-    /// Direct light, then bounces: coarse passes until the tail is predictable and small, full passes, whose mean counts.
+    /// Direct light, then bounces: coarse passes until the tail is predictable and small, then finer ones.
     /// Goes on behind the passes of `from`, whose light the flats hold. False if `progress` stopped it.
     fn replicate(
         &self,
@@ -291,19 +292,23 @@ impl Run<'_> {
         from: Option<Passes>,
         flats: &mut Flats,
         progress: &dyn Fn(f64) -> bool,
-    ) -> (Replicate, bool) {
+    ) -> (Light, bool) {
         let s = self.settings;
         let number = state.done as u64;
         if from.is_none() && self.saved.due() {
             self.saved.save(0, || state.bytes(None));
         }
+        if let Some(passes) = &from {
+            flats.pack(passes.unit);
+        }
         let mut now = match from.map_or_else(|| self.begin(state, flats, progress), Ok) {
             Ok(passes) => passes,
-            Err(light) => {
+            Err(direct) => {
                 self.saved.save(0, || state.bytes(None));
-                return (light, false);
+                return ([direct, Vec::new()], false);
             }
         };
+        let mut indirect = Vec::new();
         let pass = Pass {
             scene: self.scene,
             geometry: self.geometry,
@@ -317,15 +322,18 @@ impl Run<'_> {
             if self.saved.due() {
                 self.saved.save(0, || state.bytes(Some((&now, flats))));
             }
-            let indirect = (now.bounce > 0).then_some(&now.light.indirect[..]);
-            let (b, unit) = self.reflect(flats, &now.light.direct, indirect, now.scale);
-            let settled =
-                fixed || now.averaged > 0 || now.monitor.missing(FULL_PASSES as i32).is_some_and(|m| m < s.target);
+            let settled = now.late > 0 || now.monitor.missing(LATE as i32).is_some_and(|m| m < s.target);
             let bounce = now.bounce + 1;
-            let last_coarse = settled || bounce + FULL_PASSES > s.max_bounces;
-            let directions =
-                if last_coarse { s.directions } else { (s.directions / COARSE).max(LEAST).min(s.directions) };
-            let lines = directions::lines(self.scene.lattice(), s.seed, number << 32 | bounce as u64, directions);
+            let late = settled || bounce + LATE > s.max_bounces;
+            let directions = match () {
+                () if fixed => s.directions,
+                () if late => s.directions >> (LATE - 1 - now.late),
+                () => (s.directions / COARSE).max(LEAST),
+            };
+            let directions = directions.max(LEAST).min(s.directions);
+            // Coarse passes share their directions: then nothing but bounces changes the mean from one to the next.
+            let set = number << 32 | if fixed || late { bounce as u64 } else { 0 };
+            let lines = directions::lines(self.scene.lattice(), s.seed, set, directions);
             let mut incoming = flats.open();
             let mut family = 0;
             let total = lines.len() * self.sides.len();
@@ -333,41 +341,33 @@ impl Run<'_> {
                 family += 1;
                 progress(0.2 + 0.8 * (bounce as f64 - 1.0 + f64::from(family) / total as f64) / (bounce as f64 + 3.0))
             };
-            let mut fresh = Vec::new();
             let mut stopped = false;
-            for (&side, b) in self.sides.iter().zip(&b) {
-                let (e, complete) = pass.gather(side, &lines, b, unit, flats, &mut incoming, &mut ask);
+            for (&side, b) in self.sides.iter().zip(&now.b) {
+                let (e, complete) = pass.gather(side, &lines, b, now.unit, flats, &mut incoming, &mut ask);
                 stopped |= !complete;
-                fresh.push(e);
+                indirect.push(e);
             }
-            flats.close(incoming);
             if stopped {
                 self.saved.save(0, || state.bytes(Some((&now, flats))));
                 state.see(&now);
-                return (now.light, false);
+                return ([now.direct, Vec::new()], false);
             }
+            flats.close(&incoming);
             now.bounce = bounce;
             state.counts.families += total as u64;
             state.counts.gather_rays += state.counts.valid * total as u64;
-            let mean = self.mean(&fresh);
-            if now.averaged > 0 {
-                // Full passes are averaged: each saw the light that the one before left.
-                let w = 1.0 / (now.averaged + 1) as f32;
-                for (old, new) in now.light.indirect.iter_mut().flatten().zip(fresh.iter().flatten()) {
-                    old.par_iter_mut().zip(new).with_min_len(1 << 12).for_each(|(o, n)| *o += w * (n - *o));
-                }
-            } else {
-                now.light.indirect = fresh;
-            }
-            now.averaged += usize::from(last_coarse && !fixed);
-            now.scale = if fixed { [1.0; 3] } else { now.monitor.push(mean) };
-            flats.reflect(now.scale, true);
-            if !fixed && now.averaged == FULL_PASSES {
+            now.late += usize::from(late && !fixed);
+            let scale = if fixed { [1.0; 3] } else { now.monitor.push(self.mean(&indirect)) };
+            flats.reflect(scale, true);
+            now.b.clear();
+            if now.late == LATE || bounce == s.max_bounces {
                 break;
             }
+            (now.b, now.unit) = self.reflect(flats, &now.direct, Some(&indirect), scale);
+            indirect.clear();
         }
         state.see(&now);
-        (now.light, true)
+        ([now.direct, indirect], true)
     }
 
     /// B = Le + ρ/π (direct + scale · indirect) of the sides, filled where no surface is, as lines read it; packs the flats

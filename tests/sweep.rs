@@ -105,7 +105,7 @@ fn swept_occlusion_agrees_with_exact_rays() {
     for (directions, limit) in [(64, 0.014), (256, 0.0045), (1024, 0.0018)] {
         let start = std::time::Instant::now();
         let got = run(&scene, SweepSettings { directions, ..ONE_BOUNCE });
-        let error = || some.iter().zip(&exact).map(|(&o, x)| f64::from(got.sides[0].indirect[o][1]) / PI - x);
+        let error = || some.iter().zip(&exact).map(|(&o, x)| f64::from(got.sides[0].irradiance[o][1]) / PI - x);
         let bias = error().sum::<f64>() / some.len() as f64;
         let seconds = start.elapsed().as_secs_f64();
         println!(
@@ -132,6 +132,9 @@ fn integrating_sphere() {
     let got =
         run(&scene, SweepSettings { directions: 128, light_points: 16, target: 1e-4, ..SweepSettings::default() });
     println!("bounces {} residual {}", got.bounces, got.residual);
+    // The same points of the luminaire.
+    let direct = run(&scene, SweepSettings { max_bounces: 0, light_points: 16, ..SweepSettings::default() });
+    let indirect = |o: usize, c: usize| f64::from(got.sides[0].irradiance[o][c] - direct.sides[0].irradiance[o][c]);
     let all = nodes(&scene, 0);
     for (c, rho) in [0.5, 0.8, 0.2].into_iter().enumerate() {
         let errors: Vec<f64> = all
@@ -139,7 +142,7 @@ fn integrating_sphere() {
             .map(|&o| {
                 let r2 = scene.field.sweep().from_unit(f64::from(scene.field.samples()[o]));
                 let expected = rho * flux / (4.0 * PI * r2 * (1.0 - rho));
-                f64::from(got.sides[0].indirect[o][c]) / expected - 1.0
+                indirect(o, c) / expected - 1.0
             })
             .collect();
         let mean = errors.iter().sum::<f64>() / errors.len() as f64;
@@ -185,10 +188,8 @@ fn furnaces() {
         run(&scene, SweepSettings { directions: 128, light_points: 64, replicates: 1, ..SweepSettings::default() });
     println!("bounces {} residual {}", got.bounces, got.residual);
     for skin in [0, 1, 3] {
-        let errors: Vec<f64> = nodes(&scene, skin)
-            .iter()
-            .map(|&o| f64::from(got.sides[0].direct[o][0] + got.sides[0].indirect[o][0]) / PI - 1.0)
-            .collect();
+        let errors: Vec<f64> =
+            nodes(&scene, skin).iter().map(|&o| f64::from(got.sides[0].irradiance[o][0]) / PI - 1.0).collect();
         let mean = errors.iter().sum::<f64>() / errors.len() as f64;
         println!("nodes {skin} from the faces: mean {mean:.5} RMS {:.5}", rms(errors.iter().copied()));
         assert!(mean.abs() < 0.01);
@@ -223,20 +224,11 @@ fn any_number_of_threads_gives_the_same_bits() {
     for margin in [0.0, 0.1] {
         let one = everything(25, margin, 1);
         assert_eq!((one.sides.len(), one.sides[0].std_error.len()), (2, 25 * 25 * 25));
-        assert!(
-            one.sides
-                .iter()
-                .flat_map(|s| s.direct.iter().chain(&s.indirect))
-                .flatten()
-                .all(|x| x.is_finite() && *x >= 0.0)
-        );
+        assert!(one.sides.iter().flat_map(|s| &s.irradiance).flatten().all(|x| x.is_finite() && *x >= 0.0));
         for threads in [2, 7, 16] {
             let other = everything(25, margin, threads);
             for (a, b) in one.sides.iter().zip(&other.sides) {
-                assert!(
-                    a.direct == b.direct && a.indirect == b.indirect && a.std_error == b.std_error,
-                    "{threads} threads"
-                );
+                assert!(a.irradiance == b.irradiance && a.std_error == b.std_error, "{threads} threads");
             }
             assert!(one.flats == other.flats, "{threads} threads: walls");
         }
@@ -270,7 +262,7 @@ fn a_long_wall_occludes_as_it_should() {
             // At c the wall stands at x = 40 + c and ends at z = 46 − c.
             let k = (46.0 - c - x.z) / (40.0 + c - x.x);
             let expected = 0.5 * (1.0 - 1.0 / (1.0 + k * k).sqrt());
-            errors.push(f64::from(got.sides[0].indirect[o][0]) / PI - expected);
+            errors.push(f64::from(got.sides[0].irradiance[o][0]) / PI - expected);
         }
         let mean = errors.iter().sum::<f64>() / errors.len() as f64;
         println!("{} nodes, mean error {mean:.5}, RMS {:.5}", errors.len(), rms(errors.iter().copied()));
@@ -309,7 +301,7 @@ fn direct_light_agrees_with_exact_shadow_rays() {
             }
             let e = isolume::luminaire::unoccluded(light, x, n);
             let expected = if all > 0.0 { e * lit / all } else { 0.0 };
-            (f64::from(got.sides[0].direct[o][1]) - expected) / 0.53
+            (f64::from(got.sides[0].irradiance[o][1]) - expected) / 0.53
         })
         .collect();
     let mean = errors.iter().sum::<f64>() / errors.len() as f64;
@@ -345,8 +337,7 @@ fn an_interrupted_sweep_goes_on_with_the_same_bits() {
         let scene = Scene::new(field, surface, Boundary::Open, walls).unwrap();
         let bits = |result: &SweepResult| -> Vec<u32> {
             let nodes = result.sides.iter().flat_map(|s| {
-                let light = s.direct.iter().chain(&s.indirect).flatten();
-                light.chain(&s.std_error).map(|x| x.to_bits()).collect::<Vec<_>>()
+                s.irradiance.iter().flatten().chain(&s.std_error).map(|x| x.to_bits()).collect::<Vec<_>>()
             });
             let walls = result.flats.iter().flatten().flat_map(|f| f.texels.iter().flatten().map(|x| x.to_bits()));
             nodes.chain(walls).collect()

@@ -92,7 +92,7 @@ fn mean_rms(x: &[f64]) -> (f64, f64) {
 
 /// E/π of the first stored side, green.
 fn radiosity(got: &SweepResult, o: usize) -> f64 {
-    f64::from(got.sides[0].direct[o][1] + got.sides[0].indirect[o][1]) / PI
+    f64::from(got.sides[0].irradiance[o][1]) / PI
 }
 
 #[test]
@@ -172,13 +172,15 @@ fn far_isovalues_do_not_light_each_other() {
     };
     let light_it = |f: Field| {
         let scene = Scene::new(f, Surface::default(), Boundary::Open, vec![light.clone()]).unwrap();
-        let got = run(&scene, SweepSettings { directions: 64, light_points: 4, ..ONE_BOUNCE });
-        (scene, got)
+        let settings = SweepSettings { directions: 64, light_points: 4, ..ONE_BOUNCE };
+        let direct = run(&scene, SweepSettings { max_bounces: 0, ..settings });
+        let got = run(&scene, settings);
+        (scene, [direct, got])
     };
     let (scene, one) = light_it(field(lattice.clone(), (0.0, 1.0), h));
     let (_, two) = light_it(field(lattice, (0.0, 1.0), squeezed));
     let differs = |o: usize| {
-        let bits = |x: &SweepResult| [x.sides[0].direct[o], x.sides[0].indirect[o]].map(|c| c.map(f32::to_bits));
+        let bits = |x: &[SweepResult; 2]| x.each_ref().map(|x| x.sides[0].irradiance[o].map(f32::to_bits));
         bits(&one) != bits(&two)
     };
     let (mut near, mut lit, mut far) = (0, 0, 0);
@@ -186,7 +188,7 @@ fn far_isovalues_do_not_light_each_other() {
         let d = (f64::from(scene.field.samples()[o]) - c).abs();
         if d < 0.05 {
             near += 1;
-            lit += usize::from(one.sides[0].indirect[o][1] > 0.0);
+            lit += usize::from(one[1].sides[0].irradiance[o][1] > one[0].sides[0].irradiance[o][1]);
             assert!(!differs(o), "node {o} at {}", scene.field.samples()[o]);
         } else if d > w {
             far += usize::from(differs(o));
@@ -270,7 +272,7 @@ fn standard_errors_are_what_they_say() {
     let luminance = |got: &SweepResult, o: usize| -> f64 {
         (0..3)
             .map(|c| {
-                let e = f64::from(got.sides[0].direct[o][c] + got.sides[0].indirect[o][c]);
+                let e = f64::from(got.sides[0].irradiance[o][c]);
                 [0.2126, 0.7152, 0.0722][c] * 0.75 * e / PI
             })
             .sum()
@@ -331,7 +333,7 @@ fn holes_in_the_data_hold_no_surface_and_hide_nothing() {
         (scene, got)
     };
     let ((whole, one), (holed, two)) = (light_it(f(false)), light_it(f(true)));
-    assert!(two.sides[0].direct.iter().chain(&two.sides[0].indirect).flatten().all(|x| x.is_finite()));
+    assert!(two.sides[0].irradiance.iter().flatten().all(|x| x.is_finite()));
     assert!(two.flats.iter().flatten().flat_map(|t| &t.texels).flatten().all(|x| x.is_finite()));
     let holes = (0..holed.lattice().len()).filter(|&o| holed.field.samples()[o].is_nan()).count();
     assert!(holes > 50);

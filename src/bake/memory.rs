@@ -40,15 +40,15 @@ const SHEPARD: u64 = 12 + 16 + 12 + size_of::<RadianceSample>() as u64;
 const WISH: u64 = 24;
 const SORTED: u64 = 40 + 40 + 12;
 
-/// Bytes of the sweep engine per grid point (normals, h in two orders, what direct light sees), per point and swept side
-/// (direct, indirect and incoming light, what lines read), and per point and stored side (sums over replicates and their
-/// spread). Measured at 101³ and 128³: 108 with one point per luminaire, 131 with sixteen, 63 more for a second side.
-const SWEPT: u64 = 55;
-const SWEPT_SIDE: u64 = 44;
-const SUMMED_SIDE: u64 = 32;
+/// Bytes of the sweep engine per grid point (normals in two orders, h in the second, what direct light sees), per point and
+/// swept side (direct and incoming light, one plane of it turned over, what lines read), and per point and stored side (sums
+/// over replicates and their spread).
+const SWEPT: u64 = 24;
+const SWEPT_SIDE: u64 = 36;
+const SUMMED_SIDE: u64 = 16;
 
 /// Bytes per point and side that its checkpoint holds while a replicate is under way, besides the sums.
-const KEPT_SIDE: u64 = 24;
+const KEPT_SIDE: u64 = 20;
 
 /// Bytes per fitted point: seven vectors of conjugate gradients.
 const FITTED: u64 = 84;
@@ -264,7 +264,7 @@ impl Parts {
             ],
             Engine::Sweep => vec![
                 ("sweep", base + self.swept + flats * 4),
-                ("samples", light + self.points * (12 * 4 + 16) + beside * SAMPLE + fitting),
+                ("samples", light + self.points * (12 * 3 + 16) + beside * SAMPLE + fitting),
             ],
         };
         let export = ("export", base + grids + flats + self.export);

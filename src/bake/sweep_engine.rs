@@ -23,6 +23,10 @@ use rayon::prelude::*;
 /// Resolution of the progress bar, since a sweep knows only fractions.
 const STEPS: f64 = 1000.0;
 
+/// The share of the photon engine's rays that a sample beside the sweep's ends takes: each point there is fitted to samples
+/// of its own and its neighbours'.
+const SHARE: u32 = 8;
+
 pub(super) fn light(
     Job { number, scene, lattice, masks }: &Job,
     settings: &BakeSettings,
@@ -69,8 +73,8 @@ pub(super) fn light(
     let mut sides = Vec::new();
     for (s, white) in swept.sides.iter().zip(white) {
         let stage = progress.stage("samples", beside.len() as u64);
-        let indirect = Indirect::Gather(&cache, settings.gather_rays.max(1));
-        let (shadow_rays, seed) = (settings.shadow_rays, settings.seed);
+        let indirect = Indirect::Gather(&cache, (settings.gather_rays / SHARE).max(2));
+        let (shadow_rays, seed) = ((settings.shadow_rays / SHARE).max(2), settings.seed);
         let sampler = Sampler { scene, tracer: &tracer, indirect: &indirect, side: s.side, shadow_rays, seed };
         let saved = stages(checkpoint, STAGES * number + 4)[s.side.index()];
         let mut light = beside.dark();
@@ -106,8 +110,7 @@ fn white(masks: &[Mask], s: &SweptSide) -> Vec<[f32; 3]> {
             if masks[o] != Mask::Valid {
                 return [f32::NAN; 3];
             }
-            let e = vector(s.direct[o]) + vector(s.indirect[o]);
-            reflected(DVec3::ONE, e).as_vec3().to_array()
+            reflected(DVec3::ONE, vector(s.irradiance[o])).as_vec3().to_array()
         })
         .collect()
 }

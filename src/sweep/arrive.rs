@@ -59,7 +59,7 @@ impl<'a> Walls<'a> {
             let offset = shear.offset[a];
             ((lo[axes[a]] - most - offset).floor() as isize, (hi[axes[a]] - least - offset).ceil() as isize)
         };
-        let side_of_texel = flats.textures.iter().flatten().map(|t| t.texel_area.sqrt()).fold(f64::INFINITY, f64::min);
+        let side_of_texel = flats.textures.iter().flatten().map(|t| t.sink_area.sqrt()).fold(f64::INFINITY, f64::min);
         let spacing = pass.scene.lattice().spacing().max_element();
         let stride = (side_of_texel / (LINES_PER_TEXEL * spacing)).floor().clamp(1.0, 8.0) as isize;
         let mut rng =
@@ -95,10 +95,11 @@ impl<'a> Walls<'a> {
             let p = first + lane as isize;
             if self.reports(p, q) {
                 let span = self.plan.span(p as f64, q as f64);
-                if span[0] <= span[1] && pack.h.iter().any(|h| h[lane] != OUTSIDE) {
+                // Lines through a corner of Ω that no slice cuts have no samples.
+                if span[0].ceil() <= span[1].floor() {
                     self.line(Some((pack, b, lane, span)), p, q, out);
                     if self.capped && self.plan.sign > 0.0 {
-                        self.caps(pack, lane, span, (p as f64, q as f64), out);
+                        self.caps(pack, lane, span, (p, q), out);
                     }
                 } else if self.margin {
                     self.line(None, p, q, out);
@@ -267,11 +268,11 @@ impl<'a> Walls<'a> {
 
     /// What the caps at a line's entry and exit see outside Ω.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the isovalues")]
-    fn caps(&self, pack: &Pack, lane: usize, span: [f64; 2], pq: (f64, f64), out: &mut Arrivals) {
+    fn caps(&self, pack: &Pack, lane: usize, span: [f64; 2], (p, q): (isize, isize), out: &mut Arrivals) {
         let nc = self.flats.isovalues;
         let mut values = vec![0f32; 3 * nc];
-        let samples = || pack.h.iter().map(|h| h[lane]).filter(|&h| h != OUTSIDE && !h.is_nan());
-        for (end, h) in [samples().next(), samples().next_back()].into_iter().enumerate() {
+        let pq = (p as f64, q as f64);
+        for (end, h) in pack.border(self.plan, lane, p, q).into_iter().enumerate() {
             let Some(h) = h else { continue };
             let covered = ((h * nc as f32 + 0.5).floor().max(0.0) as usize).min(nc);
             if covered > 0 {

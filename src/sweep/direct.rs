@@ -294,8 +294,10 @@ pub(super) fn direct(
         let light = &scene.polygons()[number as usize];
         let points = points(light, seed, index, number, count);
         let blockers = Blockers::new(scene, number, &corners);
-        // Per side Σ V g and Σ g of every node.
-        let mut sums: Vec<[f32; 4]> = vec![[0.0; 4]; n];
+        // Σ V g and Σ g of every node and side.
+        let per = sides.len();
+        let mut sums: Vec<[f32; 2]> = vec![[0.0; 2]; per * n];
+        let place = [Side::Lower, Side::Higher].map(|s| sides.iter().position(|x| *x == s).unwrap_or(0));
         for &world in &points {
             if !tick() {
                 return (planes, false);
@@ -310,7 +312,7 @@ pub(super) fn direct(
             let step = axes.x_axis.as_vec3();
             let facing = light.normal().as_vec3();
             let fans = &fans;
-            sums.par_chunks_mut(nx).enumerate().for_each(|(row, sums)| {
+            sums.par_chunks_mut(per * nx).enumerate().for_each(|(row, sums)| {
                 let (j, k) = (row % ny, row / ny);
                 let begin = DVec3::new(0.0, j as f64, k as f64);
                 let start = (world - lattice.to_world(begin)).as_vec3();
@@ -332,22 +334,22 @@ pub(super) fn direct(
                     let Some(v) = fan.visibility(x) else { return };
                     let s = usize::from(cos_x < 0.0);
                     let open = blockers.polygons.is_empty() || !blockers.block(number, None, y, DVec3::from_array(x));
-                    sums[i][s] += if open { g * v[s] } else { 0.0 };
-                    sums[i][s + 2] += g;
+                    let [seen, all] = &mut sums[i * per + place[s]];
+                    *seen += if open { g * v[s] } else { 0.0 };
+                    *all += g;
                 });
             });
         }
-        for (side, planes) in sides.iter().zip(&mut planes) {
+        for (s, (side, planes)) in sides.iter().zip(&mut planes).enumerate() {
             let [r, g, b] = planes;
-            let s = side.index();
             (r, g, b).into_par_iter().with_min_len(1 << 10).enumerate().for_each(|(at, (r, g, b))| {
-                let sum = sums[at];
-                if sum[s] > 0.0 {
+                let [seen, all] = sums[at * per + s];
+                if seen > 0.0 {
                     let normal = geometry.normal(at).expect("only nodes with a normal were lit");
                     let normal = if *side == Side::Lower { normal } else { -normal };
                     let [i, j, k] = lattice.ijk(at).map(|x| x as f64);
                     let e = unoccluded(light, lattice.to_world(DVec3::new(i, j, k)), normal);
-                    let e = (light.emission * (e * f64::from(sum[s] / sum[s + 2]))).as_vec3();
+                    let e = (light.emission * (e * f64::from(seen / all))).as_vec3();
                     (*r, *g, *b) = (*r + e.x, *g + e.y, *b + e.z);
                 }
             });

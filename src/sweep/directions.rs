@@ -15,6 +15,8 @@ pub(super) struct Layout {
     pub dims: [usize; 3],
     /// Memory strides of v and the slices; that of u is 1.
     pub stride: [usize; 2],
+    /// Strides of u, v and the slices in x, y, z order, in which nodes are numbered.
+    pub node: [usize; 3],
     /// Whether memory runs y, z, x instead of x, y, z.
     pub transposed: bool,
 }
@@ -22,11 +24,13 @@ pub(super) struct Layout {
 impl Layout {
     pub(super) fn new(dims: [usize; 3], axis: usize) -> Self {
         let [nx, ny, nz] = dims;
-        match axis {
-            0 => Self { axes: [1, 2, 0], dims: [ny, nz, nx], stride: [ny, ny * nz], transposed: true },
-            1 => Self { axes: [0, 2, 1], dims: [nx, nz, ny], stride: [nx * ny, nx], transposed: false },
-            _ => Self { axes: [0, 1, 2], dims: [nx, ny, nz], stride: [nx, nx * ny], transposed: false },
-        }
+        let (axes, stride, transposed) = match axis {
+            0 => ([1, 2, 0], [ny, ny * nz], true),
+            1 => ([0, 2, 1], [nx * ny, nx], false),
+            _ => ([0, 1, 2], [nx, nx * ny], false),
+        };
+        let node = axes.map(|a| [1, nx, nx * ny][a]);
+        Self { axes, dims: axes.map(|a| [nx, ny, nz][a]), stride, node, transposed }
     }
 
     /// Whether the slowest axis of memory is that of the slices.

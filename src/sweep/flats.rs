@@ -18,8 +18,10 @@ pub(super) struct Texture {
     pub dims: [usize; 3],
     /// Diffuse reflectance at every isovalue.
     pub albedo: Vec<[f32; 3]>,
-    /// World area of a texel.
-    pub texel_area: f64,
+    /// Texels along u and v that lines report to: half as many, since light that comes from everywhere has no edges.
+    sink: [usize; 2],
+    /// World area of one of these.
+    pub sink_area: f64,
     /// Direct irradiance; where a texel lies inside the solid at an isovalue, that of its part outside.
     pub direct: Vec<f32>,
     /// Indirect irradiance of the last pass.
@@ -127,12 +129,14 @@ impl Flats {
                 let texels = dims[0] * dims[1];
                 let n = 3 * texels * isovalues;
                 next += texels * isovalues;
+                let sink = [dims[0].div_ceil(2), dims[1].div_ceil(2)];
                 Some(Texture {
                     dims,
+                    sink,
                     albedo: (0..isovalues)
                         .map(|i| flat.albedo.at((i as f64 + 0.5) / isovalues as f64).as_vec3().to_array())
                         .collect(),
-                    texel_area: flat.area() / texels as f64,
+                    sink_area: flat.area() / (sink[0] * sink[1]) as f64,
                     direct: vec![0.0; n],
                     indirect: vec![0.0; n],
                     radiance: vec![0.0; n],
@@ -189,29 +193,35 @@ impl Flats {
         (texture.start + texel * self.isovalues) as u32
     }
 
-    /// Takes the sums of a pass out, empty, so that lines can read while walls receive.
-    pub(super) fn open(&mut self) -> Incoming {
-        Incoming {
-            sinks: self
-                .textures
-                .iter_mut()
-                .map(|t| {
-                    let t = t.as_mut()?;
-                    let (mut indirect, mut weight) = (std::mem::take(&mut t.indirect), std::mem::take(&mut t.weight));
-                    indirect.fill(0.0);
-                    weight.fill(0.0);
-                    Some(Sink { dims: t.dims, indirect, weight })
-                })
-                .collect(),
-        }
+    /// Empty sums for a pass.
+    pub(super) fn open(&self) -> Incoming {
+        let sink = |t: &Texture| {
+            let [u, v] = t.sink;
+            let n = u * v * t.isovalues();
+            Sink { dims: [u, v, t.isovalues()], indirect: vec![0.0; 3 * n], weight: vec![0.0; n] }
+        };
+        Incoming { sinks: self.textures.iter().map(|t| t.as_ref().map(sink)).collect() }
     }
 
-    /// Gives the sums of a pass back and ends it.
-    pub(super) fn close(&mut self, incoming: Incoming) {
-        for (t, sink) in self.textures.iter_mut().zip(incoming.sinks) {
-            if let (Some(t), Some(sink)) = (t, sink) {
-                (t.indirect, t.weight) = (sink.indirect, sink.weight);
-            }
+    /// Ends a pass with its sums, interpolated between the centres of what received them.
+    pub(super) fn close(&mut self, incoming: &Incoming) {
+        for (t, sink) in self.textures.iter_mut().zip(&incoming.sinks) {
+            let (Some(t), Some(sink)) = (t, sink) else { continue };
+            let [nu, nv, nc] = t.dims;
+            let sums = t.indirect.par_chunks_mut(3 * nc).zip(t.weight.par_chunks_mut(nc));
+            sums.enumerate().for_each(|(texel, (indirect, weight))| {
+                let at = |i: usize, n: usize| (i as f32 + 0.5) / n as f32;
+                let around = around(sink.dims, [at(texel % nu, nu), at(texel / nu, nv)]);
+                let spread = |out: &mut [f32], from: &[f32]| {
+                    let n = out.len();
+                    let [a, b, c, d] = around.map(|(t, w)| (&from[t * n..][..n], w));
+                    for i in 0..n {
+                        out[i] = (a.1 * a.0[i] + b.1 * b.0[i]) + (c.1 * c.0[i] + d.1 * d.0[i]);
+                    }
+                };
+                spread(indirect, &sink.indirect);
+                spread(weight, &sink.weight);
+            });
         }
         self.normalise();
     }
@@ -235,14 +245,18 @@ impl Flats {
     pub(super) fn reflect(&mut self, scale: [f32; 3], seen: bool) {
         for t in self.textures.iter_mut().flatten() {
             let nc = t.isovalues();
-            for texel in 0..t.dims[0] * t.dims[1] {
+            let (direct, indirect, albedo) = (&t.direct, &t.indirect, &t.albedo);
+            t.radiance.par_chunks_mut(3 * nc).enumerate().for_each(|(texel, out)| {
+                let light = 3 * texel * nc..3 * (texel + 1) * nc;
+                let (direct, indirect) = (&direct[light.clone()], &indirect[light]);
                 for c in 0..3 {
-                    let row = (3 * texel + c) * nc..(3 * texel + c + 1) * nc;
-                    for (i, albedo) in row.zip(&t.albedo) {
-                        t.radiance[i] = albedo[c] / PI * (t.direct[i] + scale[c] * t.indirect[i]);
+                    let channel = c * nc..(c + 1) * nc;
+                    let light = direct[channel.clone()].iter().zip(&indirect[channel.clone()]);
+                    for ((out, (d, e)), albedo) in out[channel].iter_mut().zip(light).zip(albedo) {
+                        *out = albedo[c] / PI * (d + scale[c] * e);
                     }
                 }
-            }
+            });
             if seen {
                 t.fill();
             }
@@ -290,6 +304,9 @@ impl Texture {
     /// Copies B into texels that no line reached at an isovalue from those around them that some did.
     fn fill(&mut self) {
         let [nu, nv, nc] = self.dims;
+        if self.weight.iter().all(|w| *w > 0.0) {
+            return;
+        }
         let old = std::mem::take(&mut self.radiance);
         let mut new = old.clone();
         let weight = &self.weight;

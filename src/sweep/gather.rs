@@ -77,14 +77,9 @@ impl Pass<'_> {
             if some.is_empty() {
                 continue;
             }
-            let turned;
-            let b = if transpose {
-                turned = transposed(b, dims);
+            if transpose {
                 e.iter_mut().for_each(|e| *e = transposed(e, dims));
-                &turned
-            } else {
-                b
-            };
+            }
             for shear in some {
                 complete = complete && tick();
                 if complete {
@@ -219,6 +214,9 @@ impl Pass<'_> {
         let plan = family.plan;
         let pack = &mut work.pack;
         let within = q >= plan.first[1] && q < plan.first[1] + plan.count[1] as isize;
+        if within {
+            pack.begin(plan, &family.source, q);
+        }
         for start in (0..plan.width).step_by(LANES).filter(|_| within) {
             let p = plan.first[0] + start as isize;
             if self.isa.read(pack, plan, &family.source, p, q) {

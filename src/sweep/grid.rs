@@ -51,8 +51,7 @@ pub(super) struct Blocks {
 
 impl Blocks {
     /// The blocks of nodes that `is` holds, in rows of `nu`; with `reach` neighbours along the row count too.
-    fn new(nu: usize, rows: usize, reach: usize, is: impl Fn(usize) -> bool + Sync) -> Self {
-        let size = nu.div_ceil(64).next_multiple_of(16);
+    fn new(nu: usize, rows: usize, (size, reach): (usize, usize), is: impl Fn(usize) -> bool + Sync) -> Self {
         let rows = (0..rows)
             .into_par_iter()
             .with_min_len(64)
@@ -102,7 +101,7 @@ impl Blocks {
     }
 }
 
-/// What lines read: h and B in one memory order.
+/// What lines read: h in one memory order, and B.
 pub(super) struct Source<'a> {
     pub h: &'a [f32],
     pub b: &'a [Half4],
@@ -112,11 +111,17 @@ pub(super) struct Source<'a> {
 }
 
 impl Source<'_> {
-    /// Whether nodes from..to of rows j and j + 1 in slice k may reach the sweep.
+    /// The blocks of rows j and j + 1 in slice k that may reach the sweep.
     #[inline(always)]
-    pub(super) fn awake(&self, k: usize, j: usize, from: usize, to: usize) -> bool {
+    pub(super) fn awake(&self, k: usize, j: usize) -> u64 {
         let row = j * self.step[0] + k * self.step[1];
-        self.awake.meets(self.awake.rows[row] | self.awake.rows[row + self.step[0]], from, to)
+        self.awake.rows[row] | self.awake.rows[row + self.step[0]]
+    }
+
+    /// Whether a block of `bits` holds one of nodes from..to.
+    #[inline(always)]
+    pub(super) fn meets(&self, bits: u64, from: usize, to: usize) -> bool {
+        self.awake.meets(bits, from, to)
     }
 }
 
@@ -137,12 +142,14 @@ impl<'a> Geometry<'a> {
             })
             .collect();
         let valid: Vec<bool> = h.iter().zip(&encoded).map(|(h, n)| (0.0..=1.0).contains(h) && *n != [0; 3]).collect();
-        let normals: [Vec<i16>; 3] = std::array::from_fn(|a| encoded.iter().map(|n| n[a]).collect());
-        let normals_transposed = std::array::from_fn(|a| transposed(&normals[a], dims));
-        drop(encoded);
-        let near = |at: usize| (-OVERSHOOT..=1.0 + OVERSHOOT).contains(&h[at]) && (0..3).any(|a| normals[a][at] != 0);
+        let near = |at: usize| (-OVERSHOOT..=1.0 + OVERSHOOT).contains(&h[at]) && encoded[at] != [0; 3];
         let mut lit = valid.clone();
         ring(dims, &valid).into_iter().filter(|at| near(*at as usize)).for_each(|at| lit[at as usize] = true);
+        // Nodes that are not lit take no light whatever lines bring.
+        let normals: [Vec<i16>; 3] =
+            std::array::from_fn(|a| encoded.iter().zip(&lit).map(|(n, lit)| if *lit { n[a] } else { 0 }).collect());
+        drop(encoded);
+        let normals_transposed = std::array::from_fn(|a| transposed(&normals[a], dims));
         let rings = rings(dims, &lit);
         let h_transposed = transposed(h, dims);
         let [nx, ny, nz] = dims;
@@ -151,18 +158,24 @@ impl<'a> Geometry<'a> {
             let (row, y) = (at / ny, at % ny);
             (row % nz * ny + y) * nx + row / nz
         };
-        let lit_blocks = [Blocks::new(nx, ny * nz, 0, |at| lit[at]), Blocks::new(ny, nz * nx, 0, |at| lit[place(at)])];
+        // Whole vectors are accumulated; packs of lines start anywhere.
+        let whole = |n: usize| (n.div_ceil(64).next_multiple_of(16), 0);
+        let lit_blocks = [
+            Blocks::new(nx, ny * nz, whole(nx), |at| lit[at]),
+            Blocks::new(ny, nz * nx, whole(ny), |at| lit[place(at)]),
+        ];
+        let fine = |n: usize| (n.div_ceil(64), 1);
         let awake = [Side::Lower, Side::Higher].map(|side| {
             let reaches = |h: f32| if side == Side::Lower { !(h < 0.0) } else { !(h > 1.0) };
             [
-                Blocks::new(nx, ny * nz, 1, |at| reaches(h[at])).joined(ny),
-                Blocks::new(ny, nz * nx, 1, |at| reaches(h_transposed[at])).joined(nz),
+                Blocks::new(nx, ny * nz, fine(nx), |at| reaches(h[at])).joined(ny),
+                Blocks::new(ny, nz * nx, fine(ny), |at| reaches(h_transposed[at])).joined(nz),
             ]
         });
         Self { dims, h, h_transposed, normals, normals_transposed, valid, lit, rings, lit_blocks, awake }
     }
 
-    /// What lines of `side` read, with B in the memory order of `layout`.
+    /// What lines of `side` read.
     pub(super) fn source<'s>(&'s self, layout: &Layout, side: Side, b: &'s [Half4]) -> Source<'s> {
         let nu = layout.dims[0];
         Source { h: self.h(layout), b, awake: self.awake(layout, side), step: layout.stride.map(|s| s / nu) }

@@ -61,6 +61,20 @@ impl Plan {
         ((family ^ pack).wrapping_mul(0xff51_afd7_ed55_8ccd) >> 32) as u32
     }
 
+    /// The lanes of lines (first + lane, q) whose cell in slice `k` lies in Ω.
+    #[inline(always)]
+    pub(super) fn within(&self, k: usize, (first, q): (isize, isize)) -> (usize, usize) {
+        let [nu, nv, _] = self.shear.layout.dims;
+        let j = q + self.shift[1][k].0;
+        if j < 0 || j > nv as isize - 2 {
+            return (0, 0);
+        }
+        match lanes(first + self.shift[0][k].0, nu) {
+            (lo, hi) if lo < hi => (lo, hi),
+            _ => (0, 0),
+        }
+    }
+
     /// τ at which line (p, q) enters and leaves Ω; empty if it misses.
     pub(super) fn span(&self, p: f64, q: f64) -> [f64; 2] {
         let [nu, nv, na] = self.shear.layout.dims;
@@ -79,6 +93,13 @@ impl Plan {
         }
         [from, to]
     }
+}
+
+/// The lanes whose cell, from `i` on, lies in a row of `nu` nodes.
+#[inline(always)]
+#[allow(clippy::cast_sign_loss, reason = "clamped")]
+fn lanes(i: isize, nu: usize) -> (usize, usize) {
+    ((-i).clamp(0, LANES as isize) as usize, (nu as isize - 1 - i).clamp(0, LANES as isize) as usize)
 }
 
 /// Weights of the four samples around a line, at those offsets.
@@ -145,9 +166,12 @@ pub(super) struct Pack {
     /// [`Pack::ends`] on the place of an end in [`Flats::packed`], and ∞.
     pub next: [Vec<[u32; LANES]>; 2],
     pub h_next: [Vec<Lanes>; 2],
-    /// The rows that were read, ascending: all that reach the sweep.
+    /// The rows that were read, ascending: all that reach the sweep. In the others, but the first and the last, h is
+    /// [`ASLEEP`].
     pub awake: Vec<u32>,
     is_awake: Vec<bool>,
+    /// The slices where nodes beside the row of lines reach the sweep, and their blocks.
+    stripe: Vec<(usize, u64)>,
     pub cuts: Vec<Cut>,
     /// Where in [`Flats::packed`] the ends of lines are, per direction (+, −).
     pub lasts: [[u32; LANES]; 2],
@@ -159,6 +183,7 @@ impl Pack {
     pub(super) fn fit(&mut self, slices: usize) {
         if self.h.len() != slices + 2 {
             *self = Self::with_rows(slices + 2);
+            self.h[1..=slices].fill([ASLEEP; LANES]);
         }
     }
 
@@ -173,6 +198,7 @@ impl Pack {
             h_next: [h_next(), h_next()],
             awake: Vec::new(),
             is_awake: vec![false; rows],
+            stripe: Vec::new(),
             cuts: Vec::new(),
             lasts: [[0; LANES]; 2],
             scratch: Vec::new(),
@@ -184,68 +210,114 @@ impl Pack {
         self.h.len() * LANES
     }
 
+    /// Prepares for row `q` of lines.
+    pub(super) fn begin(&mut self, plan: &Plan, source: &Source, q: isize) {
+        let [_, nv, na] = plan.shear.layout.dims;
+        self.stripe.clear();
+        for (k, (whole, _)) in plan.shift[1][..na].iter().enumerate() {
+            let j = q + whole;
+            if j >= 0 && j <= nv as isize - 2 {
+                let bits = source.awake(k, j.unsigned_abs());
+                if bits != 0 {
+                    self.stripe.push((k, bits));
+                }
+            }
+        }
+    }
+
     /// Reads h and B along lines (first + lane, q), where they reach the sweep. Returns whether any does.
     #[inline(always)]
     pub(super) fn read(&mut self, plan: &Plan, source: &Source, first: isize, q: isize) -> bool {
-        let [nu, nv, na] = plan.shear.layout.dims;
+        let nu = plan.shear.layout.dims[0];
         let [sv, sa] = plan.shear.layout.stride;
-        let h = source.h;
+        let node = plan.shear.layout.node;
+        let last = source.h.len() - 1;
         let seed = plan.noise(first, q as f64);
-        self.is_awake.fill(false);
-        self.h[0] = [OUTSIDE; LANES];
-        self.h[na + 1] = [OUTSIDE; LANES];
-        let mut any = false;
-        let mut before: Option<(usize, usize, bool)> = None;
-        for k in 0..na {
+        for &row in &self.awake {
+            self.h[row as usize] = [ASLEEP; LANES];
+            self.is_awake[row as usize] = false;
+        }
+        self.awake.clear();
+        let mut inside = true;
+        for n in 0..self.stripe.len() {
+            let (k, bits) = self.stripe[n];
             let (uk, fu) = plan.shift[0][k];
             let (vk, fv) = plan.shift[1][k];
             let (i, j) = (first + uk, q + vk);
-            // Lanes whose cell lies in Ω.
-            #[allow(clippy::cast_sign_loss, reason = "clamped")]
-            let (mut lo, mut hi) = ((-i).clamp(0, 16) as usize, (nu as isize - 1 - i).clamp(0, 16) as usize);
-            if j < 0 || j > nv as isize - 2 || lo >= hi {
-                (lo, hi) = (0, 0);
+            let (lo, hi) = lanes(i, nu);
+            if lo >= hi || {
+                let from = (i + lo as isize).unsigned_abs();
+                !source.meets(bits, from, from + hi - lo + 1)
+            } {
+                continue;
             }
-            let row = k + 1;
             let at = k as isize * sa as isize + j * sv as isize + i;
-            let awake = lo < hi && {
-                let node = (i + lo as isize).unsigned_abs();
-                source.awake(k, j.unsigned_abs(), node, node + hi - lo + 1)
+            let taps = Taps {
+                at: [at, at + 1, at + sv as isize, at + sv as isize + 1],
+                weight: [(1.0 - fu) * (1.0 - fv), fu * (1.0 - fv), (1.0 - fu) * fv, fu * fv],
             };
-            if awake {
-                let taps = Taps {
-                    at: [at, at + 1, at + sv as isize, at + sv as isize + 1],
-                    weight: [(1.0 - fu) * (1.0 - fv), fu * (1.0 - fv), (1.0 - fu) * fv, fu * fv],
-                };
-                self.take(&taps, plan.sign, h, row, (lo, hi));
-                self.choose(&taps, dither(seed, 2 * LANES + k), row);
-                self.is_awake[row] = true;
-                any = true;
-            } else {
-                let line = &mut self.h[row];
-                *line = [ASLEEP; LANES];
-                if hi - lo < LANES {
-                    blank(line, lo, hi);
-                }
+            self.take(&taps, plan.sign, source.h, k + 1, (lo, hi));
+            let place = i * node[0] as isize + j * node[1] as isize + (k * node[2]) as isize;
+            self.choose(&taps.weight, place, [node[0], node[1], last], dither(seed, 2 * LANES + k), k + 1);
+            self.is_awake[k + 1] = true;
+            inside &= hi - lo == LANES && self.beside(plan, k, (first, q)) == [(0, LANES); 2];
+        }
+        // Lines that enter through a side between two slices get that point in the row before, those that leave in the
+        // row behind.
+        if !inside {
+            self.sides(plan, source, (first, q));
+        }
+        #[allow(clippy::cast_possible_truncation, reason = "rows of a pack")]
+        self.awake.extend(self.is_awake.iter().enumerate().filter(|(_, a)| **a).map(|(row, _)| row as u32));
+        !self.awake.is_empty()
+    }
+
+    /// The lanes that lie in Ω in slices k − 1 and k + 1; all where there is no such slice.
+    #[inline(always)]
+    fn beside(&self, plan: &Plan, k: usize, line: (isize, isize)) -> [(usize, usize); 2] {
+        let last = plan.shear.layout.dims[2] - 1;
+        [
+            if k > 0 { plan.within(k - 1, line) } else { (0, LANES) },
+            if k < last { plan.within(k + 1, line) } else { (0, LANES) },
+        ]
+    }
+
+    /// Adds the points where lines meet Ω's sides beside slices that were read.
+    fn sides(&mut self, plan: &Plan, source: &Source, (first, q): (isize, isize)) {
+        for n in 0..self.stripe.len() {
+            let k = self.stripe[n].0;
+            if !self.is_awake[k + 1] {
+                continue;
             }
-            // Lanes that entered through a side get their entry point in the row before, those that left theirs here.
-            let old = before.unwrap_or((0, 0, false));
-            if (lo, hi) != (old.0, old.1) && k > 0 && (awake || old.2) {
-                for lane in 0..LANES {
-                    let (was, is) = (old.0 <= lane && lane < old.1, lo <= lane && lane < hi);
-                    if is && !was && awake {
-                        self.side(plan, source, (first + lane as isize, q), lane, k, false);
-                    } else if was && !is && old.2 {
-                        self.side(plan, source, (first + lane as isize, q), lane, k - 1, true);
+            let (lo, hi) = plan.within(k, (first, q));
+            let beside = self.beside(plan, k, (first, q));
+            for lane in lo..hi {
+                let line = (first + lane as isize, q);
+                for (leaves, (lo, hi)) in [false, true].into_iter().zip(beside) {
+                    if lane < lo || lane >= hi {
+                        let row = if leaves { k + 2 } else { k };
+                        if !self.is_awake[row] {
+                            self.is_awake[row] = true;
+                            blank(&mut self.h[row], lo, hi);
+                        }
+                        self.side(plan, source, line, lane, k, leaves);
                     }
                 }
             }
-            before = Some((lo, hi, awake));
         }
-        self.awake.clear();
-        #[allow(clippy::cast_possible_truncation, reason = "rows of a pack")]
-        self.awake.extend(self.is_awake.iter().enumerate().filter(|(_, a)| **a).map(|(row, _)| row as u32));
-        any
+    }
+
+    /// h where line (p, q) in `lane` enters and leaves Ω, if it was read there.
+    pub(super) fn border(&self, plan: &Plan, lane: usize, p: isize, q: isize) -> [Option<f32>; 2] {
+        let slices = plan.shear.layout.dims[2];
+        let sample = |row: usize| {
+            let h = self.h[row][lane];
+            (self.is_awake[row] && h != OUTSIDE && !h.is_nan()).then_some(h)
+        };
+        let inside = |k: &usize| plan.within(*k, (p, q)).0 == 0 && plan.within(*k, (p, q)).1 > 0;
+        let first = (0..slices).find(inside).and_then(|k| sample(k).or(sample(k + 1)));
+        let last = (0..slices).rev().find(inside).and_then(|k| sample(k + 2).or(sample(k + 1)));
+        [first, last]
     }
 
     /// Reads one row, lanes `lo..hi` of which lie in Ω.
@@ -272,16 +344,25 @@ impl Pack {
         }
     }
 
-    /// Picks the nodes whose B the samples of a row have.
+    /// Picks the nodes whose B the samples of a row have, from node `first` on: by the strides along u and v and the
+    /// number of the last node there is.
     #[inline(always)]
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "lanes in Ω meet nodes in Ω")]
-    fn choose(&mut self, taps: &Taps, random: f32, row: usize) {
-        let [w0, w1, w2, _] = taps.weight;
-        let tap = usize::from(random >= w0) + usize::from(random >= w0 + w1) + usize::from(random >= w0 + w1 + w2);
-        let at = taps.at[tap] as i32;
+    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, reason = "lanes in Ω meet nodes in Ω")]
+    #[allow(clippy::cast_sign_loss, reason = "as above")]
+    fn choose(&mut self, weight: &[f32; 4], first: isize, node: [usize; 3], random: f32, row: usize) {
+        let [u, v, last] = node;
+        let last = last as i32;
+        let [w0, w1, w2, _] = *weight;
+        let at = match () {
+            () if random < w0 => first,
+            () if random < w0 + w1 => first + u as isize,
+            () if random < w0 + w1 + w2 => first + v as isize,
+            () => first + (u + v) as isize,
+        } as i32;
+        let u = u as i32;
         for l in 0..LANES {
-            // Lanes outside Ω, whose place may be anything, are not asked.
-            self.node[row][l] = (at + l as i32).max(0) as u32;
+            // Lanes outside Ω name any node.
+            self.node[row][l] = (at + l as i32 * u).max(0).min(last) as u32;
         }
     }
 
@@ -306,9 +387,9 @@ impl Pack {
         let face = |o: usize| lerp(f[1], edge(o), edge(o + sv));
         let nearest = |x: f32| usize::from(x >= 0.5);
         let row = if leaves { k + 2 } else { k };
-        self.is_awake[row] = true;
         self.h[row][lane] = plan.sign * lerp(f[2], face(at), face(at + sa));
-        self.node[row][lane] = (at + nearest(f[0]) + nearest(f[1]) * sv + nearest(f[2]) * sa) as u32;
+        let place = [i + nearest(f[0]), j + nearest(f[1]), l + nearest(f[2])];
+        self.node[row][lane] = (0..3).map(|a| place[a] * plan.shear.layout.node[a]).sum::<usize>() as u32;
     }
 
     /// Finds what the lines end on and reads the radiance there. `first` and `q` as in [`Pack::read`].

@@ -306,8 +306,8 @@ mod avx512 {
             if hits != 0 {
                 let near = _mm512_add_epi32(j, _mm512_mask_mov_epi32(on, forward, back));
                 // SAFETY: a hit's j is a sample in a row beyond this one in the order of the scan, so its neighbour towards
-                // this row is a sample too. The nodes of samples in Ω are nodes of the lattice, whose B is all in `b`; a hit
-                // and, if it is finite, the sample before are such; if it is not, `first` does not hold.
+                // this row is a sample too. `node` holds nodes of the lattice only, since `choose` clamps and `side` names one,
+                // and `b` has the B of all.
                 unsafe {
                     let h0 = _mm512_mask_i32gather_ps::<4>(zero, hits, near, pack.h.as_ptr().cast());
                     let (above, step) = (_mm512_sub_ps(h, h0), _mm512_sub_ps(t, h0));

@@ -1,10 +1,11 @@
 //! Where a sweep stands between two passes, and the same as bytes for a checkpoint.
 
+use super::SweepCounts;
 use super::flats::Flats;
 use super::grid::Planes;
+use super::half::Half4;
 use super::monitor::Monitor;
 use super::totals::Totals;
-use super::{Replicate, SweepCounts};
 use crate::flattened::Side;
 use crate::scene::Scene;
 
@@ -22,16 +23,18 @@ pub(super) struct State {
     pub counts: SweepCounts,
 }
 
-/// The passes of a replicate that is not finished. The flats hold the rest of it: their direct light and their radiance.
+/// A replicate between two passes. The flats hold the rest of it: their direct light and their radiance.
 pub(super) struct Passes {
-    pub light: Replicate,
+    /// Direct irradiance per side.
+    pub direct: Vec<Planes>,
+    /// Times `unit`, the B that the next pass reads.
+    pub b: Vec<Vec<Half4>>,
+    pub unit: f32,
     pub monitor: Monitor,
-    /// Full passes that `light.indirect` is the mean of.
-    pub averaged: usize,
+    /// Passes since the light has settled.
+    pub late: usize,
     /// Passes behind us.
     pub bounce: usize,
-    /// What stands for the bounces that are left, per channel.
-    pub scale: [f32; 3],
 }
 
 impl State {
@@ -47,8 +50,8 @@ impl State {
     }
 
     /// Adds a replicate and what it left on the flats.
-    pub(super) fn add(&mut self, replicate: &Replicate, flats: &Flats, scene: &Scene) {
-        self.total.add(replicate, scene);
+    pub(super) fn add(&mut self, light: [Vec<Planes>; 2], flats: &Flats, scene: &Scene) {
+        self.total.add(light, scene);
         let radiance = || flats.textures.iter().map(|t| t.as_ref().map(|t| &t.radiance));
         if self.done == 0 {
             self.flats = radiance().map(Option::<&Vec<f32>>::cloned).collect();
@@ -71,9 +74,9 @@ impl State {
     /// Everything as bytes, with the passes of a replicate that is under way.
     pub(super) fn bytes(&self, passes: Option<(&Passes, &Flats)>) -> Vec<u8> {
         let numbers = |planes: &[Planes]| planes.iter().flatten().map(Vec::len).sum::<usize>();
-        let total = numbers(&self.total.direct) + numbers(&self.total.indirect);
-        let spread = self.total.spread.iter().map(|s| 2 * s.len()).sum::<usize>();
-        let under_way = passes.map_or(0, |(p, _)| numbers(&p.light.direct) + numbers(&p.light.indirect));
+        let total = numbers(&self.total.light);
+        let spread = self.total.spread.iter().map(Vec::len).sum::<usize>();
+        let under_way = passes.map_or(0, |(p, _)| numbers(&p.direct) + p.b.iter().map(|b| 2 * b.len()).sum::<usize>());
         // The flats are small beside it.
         let mut out = Writer { bytes: Vec::with_capacity(4 * (total + spread + under_way) + (1 << 16)) };
         out.count(self.done);
@@ -84,22 +87,21 @@ impl State {
             out.bytes.extend(n.to_le_bytes());
         }
         if self.done > 0 {
-            out.planes(&self.total.direct);
-            out.planes(&self.total.indirect);
-            self.total.spread.iter().for_each(|s| out.numbers(s.as_flattened()));
+            out.planes(&self.total.light);
+            self.total.spread.iter().for_each(|s| out.numbers(s));
             self.flats.iter().flatten().for_each(|f| out.numbers(f));
         }
         out.count(usize::from(passes.is_some()));
         if let Some((p, flats)) = passes {
             out.count(p.bounce);
-            out.count(p.averaged);
-            out.numbers(&p.scale);
+            out.count(p.late);
+            out.numbers(&[p.unit]);
             out.count(p.monitor.since.unsigned_abs() as usize);
             out.count(p.monitor.means.len());
             let means = p.monitor.means.iter().flatten();
             means.chain(&p.monitor.ratio).chain(&p.monitor.tail).for_each(|&x| out.real(x));
-            out.planes(&p.light.direct);
-            out.planes(&p.light.indirect);
+            out.planes(&p.direct);
+            p.b.iter().for_each(|b| out.halves(b));
             for t in flats.textures.iter().flatten() {
                 out.numbers(&t.direct);
                 out.numbers(&t.radiance);
@@ -112,9 +114,8 @@ impl State {
     /// the flats take what belongs to them. Nothing is changed if the bytes do not fit.
     pub(super) fn restore(&mut self, bytes: &[u8], sides: usize, flats: &mut Flats) -> Option<Passes> {
         let (state, passes) = self.parse(bytes, sides, flats)?;
-        let stored = std::mem::replace(&mut self.total.direct, state.total.direct);
+        let stored = std::mem::replace(&mut self.total.light, state.total.light);
         debug_assert!(stored.is_empty(), "restored once, into a fresh state");
-        self.total.indirect = state.total.indirect;
         self.total.spread = state.total.spread;
         self.total.count = state.done as f32;
         (self.done, self.flats) = (state.done, state.flats);
@@ -146,11 +147,9 @@ impl State {
         state.total.spread.clone_from(&self.total.spread);
         state.flats = flats.textures.iter().map(|_| None).collect();
         if state.done > 0 {
-            state.total.direct = from.planes(stored.len(), nodes)?;
-            state.total.indirect = from.planes(stored.len(), nodes)?;
+            state.total.light = from.planes(stored.len(), nodes)?;
             for spread in &mut state.total.spread {
-                let numbers = from.numbers(2 * nodes)?;
-                spread.iter_mut().zip(numbers.chunks_exact(2)).for_each(|(s, n)| *s = [n[0], n[1]]);
+                *spread = from.numbers(nodes)?;
             }
             for (sum, texture) in state.flats.iter_mut().zip(&flats.textures) {
                 if let Some(t) = texture {
@@ -160,19 +159,20 @@ impl State {
         }
         let mut passes = None;
         if from.count()? == 1 {
-            let (bounce, averaged) = (from.count()?, from.count()?);
-            let scale = from.numbers(3)?.try_into().ok()?;
+            let (bounce, late) = (from.count()?, from.count()?);
+            let [unit] = from.numbers(1)?.try_into().ok()?;
             let mut monitor = Monitor { since: i32::try_from(from.count()?).ok()?, ..Monitor::default() };
             for _ in 0..from.count()? {
                 monitor.means.push(from.three()?);
             }
             (monitor.ratio, monitor.tail) = (from.three()?, from.three()?);
-            let light = Replicate { direct: from.planes(sides, nodes)?, indirect: from.planes(sides, nodes)? };
+            let direct = from.planes(sides, nodes)?;
+            let b = (0..sides).map(|_| from.halves(nodes)).collect::<Option<_>>()?;
             let mut textures = Vec::new();
             for t in flats.textures.iter().flatten() {
                 textures.push([from.numbers(t.direct.len())?, from.numbers(t.radiance.len())?]);
             }
-            passes = Some((Passes { light, monitor, averaged, bounce, scale }, textures));
+            passes = Some((Passes { direct, b, unit, monitor, late, bounce }, textures));
         }
         from.bytes.is_empty().then_some((state, passes))
     }
@@ -195,6 +195,10 @@ impl Writer {
     fn numbers(&mut self, numbers: &[f32]) {
         self.bytes.reserve(4 * numbers.len());
         self.bytes.extend(numbers.iter().flat_map(|x| x.to_le_bytes()));
+    }
+
+    fn halves(&mut self, halves: &[Half4]) {
+        self.bytes.extend(halves.as_flattened().iter().flat_map(|x| x.to_le_bytes()));
     }
 
     fn planes(&mut self, planes: &[Planes]) {
@@ -227,6 +231,13 @@ impl Reader<'_> {
         let (head, rest) = self.bytes.split_at_checked(n.checked_mul(4)?)?;
         self.bytes = rest;
         Some(head.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect())
+    }
+
+    fn halves(&mut self, n: usize) -> Option<Vec<Half4>> {
+        let (head, rest) = self.bytes.split_at_checked(n.checked_mul(8)?)?;
+        self.bytes = rest;
+        let four = |b: &[u8; 8]| std::array::from_fn(|i| u16::from_le_bytes([b[2 * i], b[2 * i + 1]]));
+        Some(head.as_chunks().0.iter().map(four).collect())
     }
 
     fn planes(&mut self, sides: usize, nodes: usize) -> Option<Vec<Planes>> {

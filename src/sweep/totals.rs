@@ -1,7 +1,7 @@
 //! Sums over the replicates of a sweep, and their spread.
 
+use super::SweptSide;
 use super::grid::{Geometry, Planes};
-use super::{Replicate, SweptSide};
 use crate::flattened::Side;
 use crate::scene::Scene;
 use glam::DVec3;
@@ -12,17 +12,17 @@ use std::f32::consts::PI;
 pub(super) struct Totals {
     sides: Vec<Side>,
     nodes: usize,
-    pub(super) direct: Vec<Planes>,
-    pub(super) indirect: Vec<Planes>,
-    /// Running mean and sum of squared deviations of the luminance of ρE/π. \[Welford62\]
-    pub(super) spread: Vec<Vec<[f32; 2]>>,
+    /// Irradiance.
+    pub(super) light: Vec<Planes>,
+    /// Squared deviations of the luminance of ρE/π from its mean. \[Welford62\]
+    pub(super) spread: Vec<Vec<f32>>,
     pub(super) count: f32,
 }
 
 impl Totals {
     pub(super) fn new(sides: &[Side], n: usize, replicates: usize) -> Self {
-        let spread = if replicates > 1 { vec![vec![[0.0; 2]; n]; sides.len()] } else { Vec::new() };
-        Self { sides: sides.to_vec(), nodes: n, direct: Vec::new(), indirect: Vec::new(), spread, count: 0.0 }
+        let spread = if replicates > 1 { vec![vec![0.0; n]; sides.len()] } else { Vec::new() };
+        Self { sides: sides.to_vec(), nodes: n, light: Vec::new(), spread, count: 0.0 }
     }
 
     pub(super) fn sides(&self) -> &[Side] {
@@ -33,34 +33,36 @@ impl Totals {
         self.nodes
     }
 
+    /// Takes the direct and indirect irradiance of a replicate, or the direct one alone.
     #[allow(clippy::cast_possible_truncation, reason = "albedo")]
-    pub(super) fn add(&mut self, r: &Replicate, scene: &Scene) {
+    pub(super) fn add(&mut self, [mut direct, indirect]: [Vec<Planes>; 2], scene: &Scene) {
+        direct.truncate(self.sides.len());
+        for (sum, new) in direct.iter_mut().flatten().zip(indirect.iter().flatten()) {
+            sum.par_iter_mut().zip(new).with_min_len(1 << 12).for_each(|(s, n)| *s += n);
+        }
+        drop(indirect);
+        let new = direct;
         self.count += 1.0;
+        if self.light.is_empty() {
+            self.light = new;
+            return;
+        }
         let luminance = |albedo: DVec3| -> [f32; 3] {
             std::array::from_fn(|c| [0.2126, 0.7152, 0.0722][c] * albedo[c] as f32 / PI)
         };
         let (albedo, h) = (&scene.surface.albedo, scene.field.samples());
         let same = (albedo.stops().len() == 1).then(|| luminance(albedo.at(0.0)));
-        for (s, spread) in self.spread.iter_mut().enumerate() {
-            let (d, e) = (&r.direct[s], &r.indirect[s]);
-            let count = self.count;
+        // (x − mean of those before)² (n − 1)/n.
+        let (before, share) = (1.0 / (self.count - 1.0), (self.count - 1.0) / self.count);
+        for (spread, (light, new)) in self.spread.iter_mut().zip(self.light.iter().zip(&new)) {
             spread.par_iter_mut().enumerate().with_min_len(1 << 12).for_each(|(i, m)| {
                 let luminance = same.unwrap_or_else(|| luminance(albedo.at(f64::from(h[i]))));
-                let x: f32 = (0..3).map(|c| luminance[c] * (d[c][i] + e[c][i])).sum();
-                let old = x - m[0];
-                m[0] += old / count;
-                m[1] += old * (x - m[0]);
+                let d: f32 = (0..3).map(|c| luminance[c] * (new[c][i] - before * light[c][i])).sum();
+                *m += share * d * d;
             });
         }
-        if self.direct.is_empty() {
-            (self.direct, self.indirect) =
-                (r.direct[..self.sides.len()].to_vec(), r.indirect[..self.sides.len()].to_vec());
-            return;
-        }
-        for (sum, new) in [(&mut self.direct, &r.direct), (&mut self.indirect, &r.indirect)] {
-            for (s, n) in sum.iter_mut().flatten().zip(new.iter().flatten()) {
-                s.par_iter_mut().zip(n).with_min_len(1 << 12).for_each(|(s, n)| *s += n);
-            }
+        for (s, n) in self.light.iter_mut().flatten().zip(new.iter().flatten()) {
+            s.par_iter_mut().zip(n).with_min_len(1 << 12).for_each(|(s, n)| *s += n);
         }
     }
 
@@ -80,13 +82,12 @@ impl Totals {
             .enumerate()
             .map(|(s, &side)| SweptSide {
                 side,
-                direct: collect(&self.direct[s]),
-                indirect: collect(&self.indirect[s]),
+                irradiance: collect(&self.light[s]),
                 std_error: match spread.next() {
                     Some(m) if done > 1 => m
                         .iter()
                         .zip(&geometry.valid)
-                        .map(|(m, v)| if *v { (m[1] * scale / (done - 1) as f32).sqrt() } else { 0.0 })
+                        .map(|(m, v)| if *v { (m * scale / (done - 1) as f32).sqrt() } else { 0.0 })
                         .collect(),
                     _ => Vec::new(),
                 },
