@@ -142,6 +142,9 @@ fn simulations_write_one_file_per_field() {
     assert!((edge - 20.0).abs() < 1e-9, "400 nucleons at 0.05 per fm³: {edge}");
     assert!(Volume::open(dir.join("f.vti")).unwrap().range().unwrap().1 > 0.0);
     assert!(text(&fs::read(dir.join("p-proton.vti")).unwrap()[..4096]).contains("generator"), "provenance");
+    // A volume's notes are not a bake's description of itself.
+    let (lo, hi) = Volume::open(dir.join("f.vti")).unwrap().range().unwrap();
+    ok(dir, &["extract", "f.vti", "--isovalue", &(0.5 * (lo + hi)).to_string(), "-o", "f.ply"]);
     refused(dir, &["generate", "pasta", "--particles", "9", "-o", "out.vti"], &["--particles 9"]);
     refused(dir, &["generate", "fluid", "--species", "proton", "-o", "out.vti"], &["--species"]);
     refused(dir, &["generate", "bumps", "--seed", "2", "-o", "out.vti"], &["bumps", "pasta"]);

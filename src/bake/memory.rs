@@ -53,8 +53,8 @@ const KEPT_SIDE: u64 = 20;
 /// Bytes per fitted point: seven vectors of conjugate gradients.
 const FITTED: u64 = 84;
 
-/// Bytes that writing holds at most: batches of raw and packed blocks.
-const WRITER: u64 = 128 << 20;
+/// Bytes that writing holds at most: two batches of packed blocks, and raw ones.
+const WRITER: u64 = 40 << 20;
 
 /// Estimated peak memory of a bake, stage by stage, everything that lives then included.
 #[derive(Clone, Debug, PartialEq)]
@@ -175,7 +175,7 @@ impl Parts {
             let sides = member.surface.stored_sides().len() as u64;
             let element = volume.samples().element_type().size() as u64;
             // Volume, field, the pyramid of min and max, the masks of volume and grid.
-            base += own_voxels * (element + 4 + 1) + own_voxels * 33 / 8 + own_points;
+            base += own_voxels * (element + 4 + 1) + own_voxels * 33 / 16 + own_points;
             let spread = own_filled * STAND_INS as u64;
             samples += match (settings.strategy, settings.samples) {
                 (StrategyName::Nodes, _) => valid + spread,

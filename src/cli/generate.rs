@@ -223,7 +223,8 @@ fn write(path: &Path, volume: &Volume, content: &str, command: &str, progress: P
     let notes = [
         ("content".to_owned(), content.to_owned()),
         ("generator".to_owned(), command.to_owned()),
-        ("isolume".to_owned(), format!("{} ({})", env!("CARGO_PKG_VERSION"), env!("ISOLUME_COMMIT"))),
+        // "isolume" is where a bake describes itself.
+        ("version".to_owned(), format!("isolume {} ({})", env!("CARGO_PKG_VERSION"), env!("ISOLUME_COMMIT"))),
     ];
     volume.write_with_notes(path, &notes)?;
     if progress == Progress::Shown

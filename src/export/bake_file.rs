@@ -271,7 +271,9 @@ impl BakedVolume {
     /// `Io`; `Invalid` if the file is damaged.
     pub fn try_read(path: &Path) -> Result<Option<Self>> {
         let file = VtiFile::read(path)?;
-        let text = file.field_strings.iter().find(|(name, _)| name == DESCRIPTION).map(|(_, text)| text.clone());
+        // Other files may use the name for something else, as generated volumes did.
+        let own = |(name, text): &&(String, String)| name == DESCRIPTION && text.starts_with('{');
+        let text = file.field_strings.iter().find(own).map(|(_, text)| text.clone());
         let Some(text) = text else { return Ok(None) };
         Self::from_parts(path, file, &text).map(Some).map_err(|e| e.in_file(path))
     }

@@ -14,7 +14,7 @@ use std::path::Path;
 pub(super) const BLOCK: usize = 1 << 20;
 
 /// Blocks packed at once: a writer holds two batches, one raw and packed, one packed.
-const BATCH: usize = 32;
+const BATCH: usize = 16;
 
 /// Text and arrays of a document, in order. The same content gives the same bytes, for every number of threads.
 pub(crate) struct Document<'a> {
