@@ -302,13 +302,22 @@ impl Field {
 #[inline]
 fn unit(v: DVec3) -> Option<DVec3> {
     let scale = v.abs().max_element();
-    if scale > 0.0 && scale.is_finite() { Some((v / scale).normalize()) } else { None }
+    // A largest component leaves NaN aside.
+    if scale > 0.0 && v.is_finite() { Some((v / scale).normalize()) } else { None }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::volume::Samples;
+
+    #[test]
+    fn no_unit_vector_comes_from_a_nan() {
+        assert_eq!(unit(DVec3::new(f64::NAN, 1.0, 0.0)), None);
+        assert_eq!(unit(DVec3::new(0.0, f64::INFINITY, 1.0)), None);
+        assert_eq!(unit(DVec3::ZERO), None);
+        assert!((unit(DVec3::new(1e-200, 0.0, 1e-200)).unwrap().length() - 1.0).abs() < 1e-12);
+    }
     use glam::DMat3;
 
     /// 5×4×6 samples of a trilinear function on an oblique, flipped lattice.

@@ -20,8 +20,8 @@ pub struct SurfacePhoton {
     pub isovalue: f32,
     /// Power × isovalue per channel, before reflection.
     pub power: Vec3,
-    /// Cosine of its arrival to the receiver normal over that to the level set's own, at most 4: times `power` it is what
-    /// the receiver normal would have taken up. \[Veach96\]
+    /// Cosine of its arrival to the receiver normal over that to the level set's own, over the share of light from everywhere
+    /// that arrives above both, at most 4: times `power` it is what the receiver normal would have taken up. \[Veach96\]
     pub foreshortening: f32,
     /// The number of the field whose level set it is.
     pub field: u8,
@@ -330,11 +330,19 @@ fn trace_photon<T: Tracer>(
 }
 
 /// See [`SurfacePhoton::foreshortening`]; 1 where there is no normal.
+///
+/// What the receiver normal would take up from below the level set itself never arrives as photons. It is made up for as if
+/// light came alike from everywhere, so that this is 1 on average there: the hemispheres of normals at an angle θ share
+/// (1 + cos θ)/2 of what either takes up.
 #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
 fn foreshortening(receiver: Option<DVec3>, gradient: DVec3, direction: DVec3) -> f32 {
-    let own = gradient.normalize_or_zero().dot(direction).abs();
+    let Some(n) = receiver else { return 1.0 };
+    let own = gradient.normalize_or_zero();
+    let own = if own.dot(direction) > 0.0 { -own } else { own };
+    let share = 0.5 * (1.0 + n.dot(own));
+    let [receiver, own] = [n, own].map(|n| (-direction.dot(n)).max(0.0));
     // Unbounded it is unbiased, but a grazing photon may weigh as much as all others.
-    receiver.map_or(1.0, |n| ((-direction.dot(n)).max(0.0) / own.max(1e-6)).min(4.0) as f32)
+    (receiver / (own * share).max(1e-6)).min(4.0) as f32
 }
 
 /// Photon `index`: source by power, point uniform over the area, direction by the cosine, isovalue uniform over the
@@ -405,6 +413,32 @@ fn emit(scene: &Scene, settings: &PhotonSettings, sources: &[Source], total: f64
                 power,
                 bounces: 1,
             })
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::warp::{Frame, cosine_hemisphere};
+
+    /// Light from everywhere, as an inclined receiver normal takes it up. The bound at 4 costs (1/π) ∫ dφ (sin θ cos φ)²/8 =
+    /// sin²θ/16 over the φ that face it.
+    #[test]
+    fn even_light_is_taken_up_whole_by_inclined_normals() {
+        let own = DVec3::new(0.3, -0.2, 0.9).normalize();
+        let frame = Frame::new(own);
+        for angle in [0.0f64, 0.2, 0.5] {
+            let receiver = frame.to_world(DVec3::new(angle.sin(), 0.0, angle.cos()));
+            let set = Sobol::set(1, Stage::Test, 0);
+            let count = 1 << 16;
+            let mean = (0..count)
+                .map(|i| frame.to_world(cosine_hemisphere(set.point2(i, 0))))
+                .map(|d| f64::from(foreshortening(Some(receiver), -3.0 * own, -d)))
+                .sum::<f64>()
+                / f64::from(count);
+            let expected = 1.0 - angle.sin().powi(2) / 16.0;
+            assert!((mean - expected).abs() < 2e-3, "{angle}: {mean}, {expected}");
         }
     }
 }

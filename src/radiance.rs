@@ -113,6 +113,10 @@ impl<T: Tracer> Sampler<'_, T> {
         let Self { scene, tracer, side, .. } = *self;
         let p = position.as_dvec3();
         let isovalue = scene.field.value(p);
+        // A point of a cell that holds no surface, since a value beside it is not finite.
+        if !isovalue.is_finite() {
+            return None;
+        }
         let receiver = Receiver {
             position,
             normal: scene.normal(p, side)?,
