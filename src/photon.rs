@@ -422,8 +422,8 @@ mod tests {
     use super::*;
     use crate::warp::{Frame, cosine_hemisphere};
 
-    /// Light from everywhere, as an inclined receiver normal takes it up. The bound at 4 costs (1/π) ∫ dφ (sin θ cos φ)²/8 =
-    /// sin²θ/16 over the φ that face it.
+    /// Light from everywhere, as an inclined receiver normal takes it up. With σ = (1 + cos θ)/2, the bound at 4 costs
+    /// (1/π) ∫ dφ (sin θ cos φ/σ)²/(8 − 2 cos θ/σ) = sin²θ/(16σ² − 4σ cos θ) over the φ that face it.
     #[test]
     fn even_light_is_taken_up_whole_by_inclined_normals() {
         let own = DVec3::new(0.3, -0.2, 0.9).normalize();
@@ -437,8 +437,9 @@ mod tests {
                 .map(|d| f64::from(foreshortening(Some(receiver), -3.0 * own, -d)))
                 .sum::<f64>()
                 / f64::from(count);
-            let expected = 1.0 - angle.sin().powi(2) / 16.0;
-            assert!((mean - expected).abs() < 2e-3, "{angle}: {mean}, {expected}");
+            let share = 0.5 * (1.0 + angle.cos());
+            let expected = 1.0 - angle.sin().powi(2) / (16.0 * share * share - 4.0 * share * angle.cos());
+            assert!((mean - expected).abs() < 5e-4, "{angle}: {mean}, {expected}");
         }
     }
 }
