@@ -115,6 +115,13 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
         total
     }
 
+    /// Indirect irradiance by one path.
+    pub(super) fn indirect_once(&mut self, receiver: &Receiver, rng: &mut Rng) -> DVec3 {
+        let direction = Frame::new(receiver.normal).to_world(cosine_hemisphere(rng.unit2()));
+        let ray = self.scene.ray(receiver.position, direction, receiver.isovalue, receiver.departure);
+        self.incoming(ray, rng) * std::f64::consts::PI
+    }
+
     /// Radiance that arrives along `ray`, without what its first hit emits as a luminaire. Russian roulette keeps the
     /// largest channel.
     fn incoming(&mut self, mut ray: FlattenedRay, rng: &mut Rng) -> DVec3 {
@@ -203,8 +210,5 @@ fn path_radiance<T: Tracer>(scene: &Scene, tracer: &T, ray: &FlattenedRay, hit: 
     }
     let mut paths = PathTracer::new(scene, tracer);
     let direct = paths.direct_once(&receiver, rng);
-    let direction = Frame::new(receiver.normal).to_world(cosine_hemisphere(rng.unit2()));
-    let next = scene.ray(receiver.position, direction, ray.isovalue, receiver.departure);
-    let indirect = paths.incoming(next, rng) * std::f64::consts::PI;
-    emission + reflected(albedo, direct + indirect)
+    emission + reflected(albedo, direct + paths.indirect_once(&receiver, rng))
 }

@@ -157,7 +157,8 @@ impl SurfaceMap {
     }
 
     /// Radiance that leaves the surface at `receiver`: direct light, and a final gather of `samples` rays that find
-    /// direct light by a shadow ray and the rest in the map.
+    /// direct light by a shadow ray and the rest in the map. A hit nearer than its kernel reaches would bring the kernel's bias
+    /// whole (in a corner half of all rays find the same photons): such rays go on as paths. \[Jensen01\]
     pub fn outgoing<T: Tracer>(
         &self,
         scene: &Scene,
@@ -181,8 +182,10 @@ impl SurfaceMap {
             let Some((landed, albedo, emission)) = landing(scene, &ray, hit) else { continue };
             sum += emission;
             if albedo != DVec3::ZERO {
-                let irradiance = paths.direct_once(&landed, &mut rng) + self.irradiance(scene, &landed, &mut scratch);
-                sum += reflected(albedo, irradiance);
+                let distance = (scene.lattice().axes() * ray.direction.as_dvec3()).length() * f64::from(hit.t);
+                let (mapped, radius) = self.irradiance(scene, &landed, &mut scratch);
+                let indirect = if distance < radius { paths.indirect_once(&landed, &mut rng) } else { mapped };
+                sum += reflected(albedo, paths.direct_once(&landed, &mut rng) + indirect);
             }
         }
         *rays += paths.rays;
@@ -190,10 +193,10 @@ impl SurfaceMap {
         reflected(scene.surface.albedo.at(f64::from(receiver.isovalue)), direct + indirect) + scene.surface.emission
     }
 
-    /// Irradiance of reflected photons: Σ w K / ∫_A K dA with K = 1 − (d/r)², r the distance of the k-th photon and A
-    /// what lies within r, on the same side, with a similar normal, on mesh or polygon. 0 on caps.
+    /// Irradiance of reflected photons, and the kernel's radius r: Σ w K / ∫_A K dA with K = 1 − (d/r)², r the distance of the
+    /// k-th photon and A what lies within r, on the same side, with a similar normal, on mesh or polygon. 0 on caps.
     #[allow(clippy::cast_possible_truncation, reason = "distances are f32")]
-    pub fn irradiance(&self, scene: &Scene, at: &Receiver, scratch: &mut Neighbours) -> DVec3 {
+    pub fn irradiance(&self, scene: &Scene, at: &Receiver, scratch: &mut Neighbours) -> (DVec3, f64) {
         let world = scene.lattice().to_world(at.position.as_dvec3());
         let q = (world - self.origin).as_vec3();
         let cone = self.settings.cone as f32;
@@ -205,7 +208,7 @@ impl SurfaceMap {
                 (surface, &surface.sides[side.index()], lower_normal(at, side))
             }
             Departure::Polygon(id) => (own, &self.walls[id as usize], Vec3::ZERO),
-            Departure::Free | Departure::Cap(..) => return DVec3::ZERO,
+            Departure::Free | Departure::Cap(..) => return (DVec3::ZERO, 0.0),
         };
         let wall = normal == Vec3::ZERO;
         let k = self.settings.photons;
@@ -213,7 +216,7 @@ impl SurfaceMap {
         share.grid.nearest(q, k, self.radius, accept, scratch);
         let found = scratch.found();
         if found.is_empty() {
-            return DVec3::ZERO;
+            return (DVec3::ZERO, 0.0);
         }
         let farthest = found.iter().map(|e| e.0).fold(0.0, f32::max);
         let most = match at.departure {
@@ -226,7 +229,7 @@ impl SurfaceMap {
         };
         let radius = if found.len() < k { most } else { farthest.sqrt() };
         if radius == 0.0 {
-            return DVec3::ZERO;
+            return (DVec3::ZERO, 0.0);
         }
         let weight = |d2: f32| f64::from((1.0 - d2 / (radius * radius)).max(0.0));
         let power: DVec3 = found.iter().map(|&(d2, slot)| share.photons[slot as usize].0.as_dvec3() * weight(d2)).sum();
@@ -239,7 +242,7 @@ impl SurfaceMap {
                 found.iter().map(|&(d2, slot)| f64::from(surface.areas[slot as usize].0) * weight(d2)).sum()
             }
         };
-        if area > 0.0 { power / area } else { DVec3::ZERO }
+        (if area > 0.0 { power / area } else { DVec3::ZERO }, f64::from(radius))
     }
 
     /// ∫ K dA over the part of the disk on polygon `id` that lies on the receiver's side of the level sets.
