@@ -3,7 +3,7 @@
 use crate::flattened::{Departure, FlattenedRay};
 use crate::luminaire::{Aim, above_horizon, point_term, unoccluded};
 use crate::polygon::sample_convex;
-use crate::rng::{Sobol, Stage};
+use crate::rng::{Rng, Sobol, Stage};
 use crate::scene::Scene;
 use crate::tracer::Tracer;
 use glam::{DVec3, Vec3};
@@ -19,6 +19,20 @@ pub struct Receiver {
     pub isovalue: f32,
     /// What rays from it start on.
     pub departure: Departure,
+}
+
+impl Receiver {
+    /// The ray that asks whether world point `y` of luminaire `l` is seen.
+    #[inline]
+    pub fn shadow_ray(&self, scene: &Scene, y: DVec3, l: u32) -> FlattenedRay {
+        let direction = scene.lattice().to_index(y).as_vec3() - self.position;
+        FlattenedRay {
+            reach: 1.0,
+            departure: self.departure,
+            target: Some(l),
+            ..FlattenedRay::free(self.position, direction, self.isovalue)
+        }
+    }
 }
 
 /// A mean with the variance of its luminance, and the rays it cost.
@@ -108,17 +122,10 @@ pub fn direct_irradiance<T: Tracer>(
             if g == 0.0 {
                 continue;
             }
-            let direction = lattice.to_index(y).as_vec3() - receiver.position;
-            let ray = FlattenedRay {
-                reach: 1.0,
-                departure: receiver.departure,
-                target: Some(l),
-                ..FlattenedRay::free(receiver.position, direction, receiver.isovalue)
-            };
             out.rays += 1;
             sum += g;
             squares += g * g;
-            if !tracer.occluded(&ray) {
+            if !tracer.occluded(&receiver.shadow_ray(scene, y, l)) {
                 seen += g;
                 seen_squares += g * g;
             }
@@ -133,4 +140,20 @@ pub fn direct_irradiance<T: Tracer>(
         out.variance += (luminance(light.emission) * open).powi(2) * spread.max(0.0);
     }
     out
+}
+/// Direct irradiance from one random point per luminaire, counting `rays`: noisy, unbiased and bounded.
+pub fn direct_once<T: Tracer>(scene: &Scene, tracer: &T, receiver: &Receiver, rng: &mut Rng, rays: &mut u64) -> DVec3 {
+    let x = scene.lattice().to_world(receiver.position.as_dvec3());
+    let mut total = DVec3::ZERO;
+    for &l in scene.luminaires() {
+        let light = &scene.polygons()[l as usize];
+        let (y, g) = Aim::new(light, x, receiver.normal).sample(rng.unit2());
+        if g > 0.0 && receiver.departure != Departure::Polygon(l) {
+            *rays += 1;
+            if !tracer.occluded(&receiver.shadow_ray(scene, y, l)) {
+                total += light.emission * g;
+            }
+        }
+    }
+    total
 }

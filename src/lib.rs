@@ -43,6 +43,7 @@ pub mod embree;
 // Light transport, generic over the tracer.
 pub mod photon;
 pub mod direct;
+pub mod landing;
 pub mod photon_map;
 pub mod radiance_cache;
 pub mod gather;

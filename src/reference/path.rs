@@ -1,10 +1,11 @@
 //! Unbiased path tracing with next-event estimation. \[Kajiya86\]
 
 use crate::brdf::reflected;
-use crate::direct::Receiver;
+use crate::direct::{Receiver, direct_once};
 use crate::error::Result;
 use crate::export::picture::Picture;
-use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target};
+use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Target};
+use crate::landing::landing;
 use crate::luminaire::{Aim, unoccluded};
 use crate::render::{Camera, trace_picture};
 use crate::rng::{Rng, Sobol, Stage};
@@ -70,8 +71,9 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
                 for i in 0..count {
                     let (y, g) = aim.sample(set.point2(i, 0));
                     all += g;
-                    if g > 0.0 && self.visible(receiver, y, l) {
-                        seen += g;
+                    if g > 0.0 {
+                        self.rays += 1;
+                        seen += if self.tracer.occluded(&receiver.shadow_ray(scene, y, l)) { 0.0 } else { g };
                     }
                 }
                 (all, seen)
@@ -86,33 +88,9 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
         total
     }
 
-    /// Whether `y` on luminaire `l` is seen from `receiver`.
-    #[inline]
-    fn visible(&mut self, receiver: &Receiver, y: DVec3, l: u32) -> bool {
-        self.rays += 1;
-        let direction = self.scene.lattice().to_index(y).as_vec3() - receiver.position;
-        let ray = FlattenedRay {
-            reach: 1.0,
-            departure: receiver.departure,
-            target: Some(l),
-            ..FlattenedRay::free(receiver.position, direction, receiver.isovalue)
-        };
-        !self.tracer.occluded(&ray)
-    }
-
-    /// Direct irradiance from one random point per luminaire: noisy, unbiased and bounded.
+    /// As [`direct_once`], counting its rays.
     pub(super) fn direct_once(&mut self, receiver: &Receiver, rng: &mut Rng) -> DVec3 {
-        let scene = self.scene;
-        let x = scene.lattice().to_world(receiver.position.as_dvec3());
-        let mut total = DVec3::ZERO;
-        for &l in scene.luminaires() {
-            let light = &scene.polygons()[l as usize];
-            let (y, g) = Aim::new(light, x, receiver.normal).sample(rng.unit2());
-            if g > 0.0 && receiver.departure != Departure::Polygon(l) && self.visible(receiver, y, l) {
-                total += light.emission * g;
-            }
-        }
-        total
+        direct_once(self.scene, self.tracer, receiver, rng, &mut self.rays)
     }
 
     /// Indirect irradiance by one path.
@@ -144,38 +122,6 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
             ray = self.scene.ray(receiver.position, direction, ray.isovalue, receiver.departure);
         }
     }
-}
-
-/// What stands at a hit: a receiver, its albedo, and its emission unless it is a luminaire, whose light counts as direct.
-/// `None` where ∇h vanishes or nothing reflects.
-#[inline]
-pub(super) fn landing(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> Option<(Receiver, DVec3, DVec3)> {
-    let position = ray.at(hit.t).as_vec3();
-    let isovalue = ray.isovalue;
-    let none = DVec3::ZERO;
-    let (normal, departure, albedo, emission) = match hit.target {
-        Target::Surface(side) => {
-            let normal = scene.normal(position.as_dvec3(), side)?;
-            (normal, Departure::Surface(side), scene.surface.albedo.at(f64::from(isovalue)), scene.surface.emission)
-        }
-        Target::Companion(n, side) => {
-            let companion = &scene.companions()[usize::from(n)];
-            let (normal, surface) = (companion.normal(position.as_dvec3(), side)?, &companion.member.surface);
-            (normal, Departure::Companion(n, side), surface.albedo.at(f64::from(ray.isovalue)), surface.emission)
-        }
-        Target::Cap(face, side) => {
-            let n = scene.face_normal(face);
-            let albedo = scene.face_surface(face).albedo.at(f64::from(ray.isovalue));
-            (if side == Side::Lower { n } else { -n }, Departure::Free, albedo, none)
-        }
-        Target::Polygon(id) => {
-            let p = &scene.polygons()[id as usize];
-            // The back of a luminaire is black.
-            let seen = (scene.lattice().axes() * ray.direction.as_dvec3()).dot(p.normal()) < 0.0;
-            (p.normal(), Departure::Polygon(id), if seen { p.albedo } else { none }, none)
-        }
-    };
-    Some((Receiver { position, normal, isovalue, departure }, albedo, emission))
 }
 
 /// A picture of hyperplane `isovalue` by `samples` paths per pixel; luminaires are seen.

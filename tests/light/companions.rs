@@ -461,7 +461,8 @@ fn a_held_volume_lights_as_one_that_sweeps() {
 /// What final gather finds at the vertices themselves, without a grid in between, against path tracing of two meshes: cross
 /// light on nuclear pasta, whose surfaces run through each other. A folder with `pasta-proton.vti` and `pasta-neutron.vti`
 /// (`isolume generate pasta --species both -o pasta.vti`) in ISOLUME_PASTA; by hand. Neutrons were 5.07 % [1.33, 7.05] as long as
-/// points spread over the luminaire's area missed what vertices right below it see.
+/// points spread over the luminaire's area missed what vertices right below it see, and 2.06 % [1.11, 2.69] as long as gather
+/// rays that land in the crevice where the surfaces cross read the lit nodes around it.
 #[test]
 #[ignore = "needs simulated volumes and minutes"]
 fn pasta_at_its_vertices() {
@@ -475,8 +476,8 @@ fn pasta_at_its_vertices() {
     let tracers = [0, 1].map(|n| GraphTracer::new(&device, &views[n]).unwrap());
     let photons = trace_photons(&views[0], &tracers[0], &emission(1 << 22, 1), &|_| true);
     let settings = CacheSettings {
-        node_shadow_rays: 4,
-        flat_shadow_rays: 32,
+        node_shadow_rays: 16,
+        flat_shadow_rays: 128,
         flat_resolution: 64,
         isovalue_resolution: 32,
         seed: 1,
@@ -487,7 +488,7 @@ fn pasta_at_its_vertices() {
     for k in 0..2 {
         let seen = &views[k];
         let mesh = SurfaceMesh::extract(seen, c, 1).unwrap();
-        let triangles = SurfaceTracer::new(&device, seen, c, 1).unwrap();
+        let triangles = SurfaceTracer::new(&device, seen, c, 4).unwrap();
         // Surfaces run into the luminaire, where paths are noisy.
         let paths = [1, 2].map(|seed| {
             let settings =
@@ -498,7 +499,8 @@ fn pasta_at_its_vertices() {
         let at: Vec<_> = chosen.iter().map(|&v| mesh.local[v].as_vec3()).collect();
         let gather = Indirect::Gather(&cache, 256);
         let side = seen.surface.outside;
-        let got = sample_radiance(seen, &tracers[k], &gather, &at, side, 128, 1, checkpoint::Stage::UNSAVED, &|_| true);
+        let got =
+            sample_radiance(seen, &tracers[k], &gather, &at, side, 1024, 1, checkpoint::Stage::UNSAVED, &|_| true);
         let mut moments = Moments::default();
         for (&v, sample) in chosen.iter().zip(&got.samples) {
             let Some(sample) = sample else { continue };
