@@ -280,8 +280,27 @@ impl Run<'_> {
             return Err(direct);
         }
         state.counts.shadow_rays += state.counts.valid * lights as u64;
-        let (b, unit) = self.reflect(flats, &direct, None, [1.0; 3]);
-        Ok(Passes { direct, b, unit, monitor: Monitor::default(), late: 0, bounce: 0 })
+        let late = if self.warm(state) { LATE - 1 } else { 0 };
+        let (b, unit) = if late > 0 {
+            let share = 1.0 / state.done as f32;
+            flats.take(&state.flats, share);
+            self.reflect(flats, &[(state.total.light.as_slice(), [share; 3])])
+        } else {
+            self.reflect(flats, &[(direct.as_slice(), [1.0; 3])])
+        };
+        Ok(Passes { direct, b, unit, monitor: Monitor::default(), late, bounce: 0 })
+    }
+
+    /// Whether a replicate starts from the light of those before instead of from luminaires alone: then its last pass is all
+    /// it needs. What replicates share in this way are the bounces before their last, which the last one averages over the
+    /// sphere.
+    fn warm(&self, state: &State) -> bool {
+        state.done > 0 && self.settles() && state.total.sides().len() == self.sides.len()
+    }
+
+    /// Whether bounces go on until what is left out is small, not to a small number.
+    fn settles(&self) -> bool {
+        self.settings.max_bounces >= 6
     }
 
     /// Direct light, then bounces: coarse passes until the tail is predictable and small, then finer ones.
@@ -317,7 +336,7 @@ impl Run<'_> {
             isa: self.isa,
             workspaces: Mutex::default(),
         };
-        let fixed = s.max_bounces < 6;
+        let fixed = !self.settles();
         while now.bounce < s.max_bounces {
             if self.saved.due() {
                 self.saved.save(0, || state.bytes(Some((&now, flats))));
@@ -336,10 +355,11 @@ impl Run<'_> {
             let lines = directions::lines(self.scene.lattice(), s.seed, set, directions);
             let mut incoming = flats.open();
             let mut family = 0;
+            let more = if now.late + 1 == LATE { 0.0 } else { 3.0 };
             let total = lines.len() * self.sides.len();
             let mut ask = || {
                 family += 1;
-                progress(0.2 + 0.8 * (bounce as f64 - 1.0 + f64::from(family) / total as f64) / (bounce as f64 + 3.0))
+                progress(0.2 + 0.8 * (bounce as f64 - 1.0 + f64::from(family) / total as f64) / (bounce as f64 + more))
             };
             let mut stopped = false;
             for (&side, b) in self.sides.iter().zip(&now.b) {
@@ -363,23 +383,17 @@ impl Run<'_> {
             if now.late == LATE || bounce == s.max_bounces {
                 break;
             }
-            (now.b, now.unit) = self.reflect(flats, &now.direct, Some(&indirect), scale);
+            (now.b, now.unit) = self.reflect(flats, &[(now.direct.as_slice(), [1.0; 3]), (&indirect, scale)]);
             indirect.clear();
         }
         state.see(&now);
         ([now.direct, indirect], true)
     }
 
-    /// B = Le + ρ/π (direct + scale · indirect) of the sides, filled where no surface is, as lines read it; packs the flats
-    /// too. Returns what all was multiplied by.
+    /// B = Le + ρ/π Σ scale · irradiance of the sides, filled where no surface is, as lines read it; packs the flats too.
+    /// `light`: one or two sets of irradiance, each with its scale. Returns what all was multiplied by.
     #[allow(clippy::cast_possible_truncation, reason = "albedo and emission")]
-    fn reflect(
-        &self,
-        flats: &mut Flats,
-        direct: &[Planes],
-        indirect: Option<&[Planes]>,
-        scale: [f32; 3],
-    ) -> (Vec<Vec<Half4>>, f32) {
+    fn reflect(&self, flats: &mut Flats, light: &[(&[Planes], [f32; 3])]) -> (Vec<Vec<Half4>>, f32) {
         let surface = &self.scene.surface;
         let over_pi =
             |albedo: DVec3| -> [f32; 3] { std::array::from_fn(|c| (albedo[c] / std::f64::consts::PI) as f32) };
@@ -391,43 +405,37 @@ impl Run<'_> {
         });
         let emission = surface.emission.as_vec3().to_array();
         let mut most = flats.greatest();
-        for (s, direct) in direct.iter().enumerate() {
+        let sides = light[0].0.len();
+        for s in 0..sides {
             for c in 0..3 {
-                let indirect = indirect.map_or(0.0, |e| scale[c] * grid::greatest(&e[s][c]));
-                most = most.max(emission[c] + greatest[c] * (grid::greatest(&direct[c]) + indirect));
+                let e: f32 = light.iter().map(|(planes, scale)| scale[c] * grid::greatest(&planes[s][c])).sum();
+                most = most.max(emission[c] + greatest[c] * e);
             }
         }
         let unit = half::scale(most);
         flats.pack(unit);
-        let b = (0..direct.len()).map(|s| {
-            let n = direct[s][0].len();
+        let b = (0..sides).map(|s| {
+            let n = light[0].0[s][0].len();
             let mut b = vec![[0; 4]; n];
             b.par_chunks_mut(1 << 12).enumerate().for_each(|(chunk, b)| {
                 let range = chunk << 12..(chunk << 12) + b.len();
                 let lit = &self.geometry.lit[range.clone()];
                 for c in 0..3 {
                     let (le, rho) = (unit * emission[c], unit * greatest[c]);
-                    let direct = &direct[s][c][range.clone()];
-                    let indirect = indirect.map(|e| &e[s][c][range.clone()]);
+                    // A second set that is not there counts nothing.
+                    let set = |n: usize| light.get(n).map(|(planes, scale)| (&planes[s][c][range.clone()], scale[c]));
+                    let (first, f) = set(0).expect("at least one set of light");
+                    let (second, g) = set(1).unwrap_or((first, 0.0));
+                    let e = first.iter().zip(second).map(|(a, b)| f * a + g * b);
+                    let nodes = b.iter_mut().zip(e).zip(lit);
                     if let Some(by_node) = &by_node {
-                        for (n, (b, rho)) in b.iter_mut().zip(&by_node[range.clone()]).enumerate().filter(|n| lit[n.0])
-                        {
-                            let e = direct[n] + indirect.map_or(0.0, |e| scale[c] * e[n]);
+                        for (((b, e), _), rho) in nodes.zip(&by_node[range.clone()]).filter(|n| *n.0.1) {
                             b[c] = half::encode(le + unit * rho[c] * e);
                         }
                         continue;
                     }
-                    match indirect {
-                        Some(e) => {
-                            for (((b, d), e), lit) in b.iter_mut().zip(direct).zip(e).zip(lit) {
-                                b[c] = half::encode(if *lit { le + rho * (d + scale[c] * e) } else { 0.0 });
-                            }
-                        }
-                        None => {
-                            for ((b, d), lit) in b.iter_mut().zip(direct).zip(lit) {
-                                b[c] = half::encode(if *lit { le + rho * d } else { 0.0 });
-                            }
-                        }
+                    for ((b, e), lit) in nodes {
+                        b[c] = half::encode(if *lit { le + rho * e } else { 0.0 });
                     }
                 }
             });

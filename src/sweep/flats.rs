@@ -158,6 +158,15 @@ impl Flats {
         self.textures.iter().flatten().flat_map(|t| &t.radiance).fold(0.0, |m, x| m.max(*x))
     }
 
+    /// Takes sums of radiance times `share` for the flats' own.
+    pub(super) fn take(&mut self, sums: &[Option<Vec<f32>>], share: f32) {
+        for (texture, sum) in self.textures.iter_mut().zip(sums) {
+            if let (Some(t), Some(sum)) = (texture, sum) {
+                t.radiance.iter_mut().zip(sum).for_each(|(b, s)| *b = share * s);
+            }
+        }
+    }
+
     /// Makes B times `scale` what lines read.
     pub(super) fn pack(&mut self, scale: f32) {
         for t in self.textures.iter().flatten() {

@@ -1,0 +1,246 @@
+//! How a ray begins: the part of it in Ω, its isovalue, and the cell of its departure.
+
+use super::{Begun, Child, FLIPS, INTEGERS, Lane, PARALLEL, Ray, Step, cap, first_of, not_below, point, state};
+use crate::field::Field;
+use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side};
+use crate::pyramid::Pyramid;
+use crate::pyramid::kernel::{Kernel, Line, Piece};
+use glam::{Vec3, Vec4};
+
+impl Pyramid {
+    /// What comes before the hierarchy: the part of the ray in Ω, its isovalue, and the cell of its departure.
+    #[inline(always)]
+    pub(in crate::pyramid) fn begin<'a, const ANY: bool, K: Kernel>(
+        &self,
+        kernel: K,
+        field: &'a Field,
+        ray: &FlattenedRay,
+        reach: f64,
+        lane: &mut Option<Lane<'a, K::Ray>>,
+    ) -> Begun {
+        match self.begin_within(kernel, field, ray, reach, lane) {
+            Begun::Otherwise => kernel.outlined(|| self.begin_anywhere::<ANY, K>(kernel, field, ray, reach, lane)),
+            begun => begun,
+        }
+    }
+
+    /// [`Pyramid::begin`] of most rays: they start amid Ω, and those on the surface leave their cell without meeting it
+    /// again.
+    #[inline(always)]
+    #[allow(clippy::cast_possible_truncation, reason = "clamped: t and c leave as f32")]
+    fn begin_within<'a, K: Kernel>(
+        &self,
+        kernel: K,
+        field: &'a Field,
+        ray: &FlattenedRay,
+        reach: f64,
+        lane: &mut Option<Lane<'a, K::Ray>>,
+    ) -> Begun {
+        let (origin, direction) = (ray.origin.extend(0.5), ray.direction.extend(0.0));
+        let size = direction.abs();
+        let scale = size.max_element();
+        let amid = (origin.cmpgt(Vec4::ZERO) & origin.cmplt(self.far)).all();
+        if !(amid && scale > 0.0 && scale < f32::INFINITY) || matches!(ray.departure, Departure::Cap(..)) {
+            return Begun::Otherwise;
+        }
+        let backward = direction.cmplt(Vec4::ZERO);
+        let floor = origin.floor();
+        // On a shared plane the ray is in the cell it goes to.
+        let corner = floor - Vec4::select(backward & origin.cmpeq(floor), Vec4::ONE, Vec4::ZERO);
+        let [x, y, z, _] = (corner + INTEGERS).to_array().map(|x| x.to_bits() & 0x7f_ffff);
+        let cell = [x, y, z];
+        // What is cold most often, on the way while the first cell is computed.
+        self.prefetch(kernel, cell, 0);
+        let crosses = size.cmpgt(Vec4::splat(PARALLEL * scale));
+        let backward = backward & crosses;
+        let mut line = Line {
+            o: Vec4::select(crosses, origin, corner + 0.5),
+            inv: Vec4::select(crosses, scale / direction, Vec4::splat(1e30)),
+            far: Vec4::select(backward, Vec4::ZERO, Vec4::ONE),
+            flip: FLIPS[backward.bitmask() as usize & 7],
+            // Roughly: the cells decide.
+            end: (reach * f64::from(scale) * (1.0 + 1e-5) + 1e-3) as f32,
+            most_lo: 0,
+            least_hi: 0,
+        };
+        let (o, d) = (origin.to_array().map(f64::from), direction.to_array().map(f64::from));
+        let inv = d.map(|x| 1.0 / x);
+        let (mut c, mut c32) = (f64::from(ray.isovalue), ray.isovalue);
+        let mut departing = false;
+        if let Departure::Surface(side) = ray.departure {
+            let planes = corner + line.far;
+            let (exit, _) = first_of(line.times(planes));
+            let t_exit = ((f64::from(planes.to_array()[exit]) - o[exit]) * inv[exit]).max(0.0);
+            let last = t_exit >= reach;
+            let corners = kernel.corners(field.samples(), self.sample(cell), self.steps);
+            self.ask_around(kernel, field.samples(), &line, cell);
+            let on = if last { 0 } else { 1 << exit };
+            let t = [0.0, if last { reach } else { t_exit }];
+            let v = kernel.span(&corners, &Piece { o: &o, d: &d, far: line.far, cell: corner, t, on: [0, on] });
+            // So that the root at the start is exactly 0.
+            c = v[0];
+            c32 = not_below(c);
+            // The Bernstein coefficients of the cubic without this root, but for factors.
+            let sign = if side == Side::Higher { 1.0 } else { -1.0 };
+            let rises = [(v[1] + v[2] + v[4]) - 3.0 * c, (v[3] + v[5] + v[6]) - 3.0 * c, v[7] - c].map(|x| sign * x);
+            let clear = (rises[0] > self.rounding) & (rises[1] > self.rounding) & (rises[2] > self.rounding);
+            let inside = kernel.inside(&corners, c32);
+            let end = state(inside, exit, !line.negative(exit), v[7] >= c);
+            if !(clear & (last | (end == (side == Side::Higher)))) {
+                return Begun::Otherwise;
+            }
+            if last {
+                return Begun::Done(None);
+            }
+            departing = true;
+        }
+        line.hold(&self.ranks, c32);
+        let ray = Ray { samples: field.samples(), steps: self.steps, o, d, inv, c, c32, t: 0.0, reach, within: true };
+        *lane = Some(Lane::new(kernel.ray(&line), ray, line, cell, departing, self.capped));
+        Begun::On
+    }
+
+    /// Asks memory for the rows of samples that the cells after `cell` add: most rays that leave a surface meet it in a
+    /// neighbour's cell, and look there.
+    #[inline(always)]
+    fn ask_around<K: Kernel>(&self, kernel: K, samples: &[f32], line: &Line, cell: [u32; 3]) {
+        let at = samples.as_ptr().wrapping_add(self.sample(cell));
+        let [y, z] = self.steps;
+        let beyond = |axis: usize, step: usize| {
+            at.wrapping_add(if line.negative(axis) { step.wrapping_neg() } else { 2 * step })
+        };
+        for row in [beyond(1, y), beyond(1, y).wrapping_add(z), beyond(2, z), beyond(2, z).wrapping_add(y)] {
+            kernel.ask(row.cast());
+        }
+    }
+
+    /// The cell of a start, roughly: only to ask memory for it.
+    #[inline(always)]
+    pub(in crate::pyramid) fn start(&self, origin: Vec3) -> Child {
+        let floor = origin.extend(0.0).max(Vec4::ZERO).min(self.far).floor();
+        let [x, y, z, _] = (floor + INTEGERS).to_array().map(|x| x.to_bits() & 0x7f_ffff);
+        Child { at: self.sample([x, y, z]), ..Child::default() }
+    }
+
+    /// [`Pyramid::begin`] of any ray.
+    #[allow(clippy::cast_possible_truncation, reason = "clamped cell numbers; t leaves as f32")]
+    #[inline(always)]
+    fn begin_anywhere<'a, const ANY: bool, K: Kernel>(
+        &self,
+        kernel: K,
+        field: &'a Field,
+        ray: &FlattenedRay,
+        reach: f64,
+        lane: &mut Option<Lane<'a, K::Ray>>,
+    ) -> Begun {
+        let n = self.cells;
+        let mut o = ray.origin.as_dvec3().to_array();
+        let d = ray.direction.as_dvec3().to_array();
+        // Faces from 6 on are another field's.
+        if let Departure::Cap(face @ 0..6, side) = ray.departure {
+            let (axis, far) = (usize::from(face % 3), face >= 3);
+            let inward = if far { d[axis] < 0.0 } else { d[axis] > 0.0 };
+            if inward != (side == Side::Higher) && d[axis] != 0.0 {
+                return Begun::Done(Some(FlattenedHit { t: 0.0, target: cap(axis, far, side) }));
+            }
+            if side == Side::Lower {
+                // Ω is convex: what leaves it never comes back.
+                return Begun::Done(None);
+            }
+            o[axis] = if far { n[axis] as f64 } else { 0.0 };
+        }
+        if let Departure::Surface(side) = ray.departure {
+            let outwards = |a: usize| (o[a] == 0.0 && d[a] < 0.0) || (o[a] == n[a] as f64 && d[a] > 0.0);
+            if let Some(axis) = (0..3).find(|&a| outwards(a)) {
+                // It leaves Ω where it starts. There h = c counts as inside, which must not end a ray from the lower side.
+                let closed = self.capped && side == Side::Higher;
+                let target = cap(axis, d[axis] > 0.0, side);
+                return Begun::Done(closed.then_some(FlattenedHit { t: 0.0, target }));
+            }
+        }
+        let inv = d.map(|x| 1.0 / x);
+        // Clip to Ω. A component 0 (or −0) never crosses a plane: its slab holds the whole line or nothing of it.
+        let (mut t, mut t_out, mut entry) = (0f64, reach, None);
+        if !(0..3).all(|a| o[a] >= 0.0 && o[a] <= n[a] as f64) {
+            for a in 0..3 {
+                let far = n[a] as f64;
+                if d[a] == 0.0 {
+                    if !(o[a] >= 0.0 && o[a] <= far) {
+                        return Begun::Done(None);
+                    }
+                    continue;
+                }
+                let (near_plane, far_plane) = if d[a] > 0.0 { (0.0, far) } else { (far, 0.0) };
+                let t0 = (near_plane - o[a]) * inv[a];
+                if t0 > t {
+                    (t, entry) = (t0, Some(a));
+                }
+                t_out = t_out.min((far_plane - o[a]) * inv[a]);
+            }
+        }
+        let scale = d[0].abs().max(d[1].abs()).max(d[2].abs());
+        if !(t <= t_out) || scale == 0.0 {
+            return Begun::Done(None);
+        }
+        // The cell of the start, and the line from there.
+        let mut cell = [0u32; 3];
+        let mut line = Line {
+            o: Vec4::ZERO,
+            inv: Vec4::splat(1e30),
+            far: Vec4::ONE,
+            flip: 0,
+            // Roughly: the cells decide.
+            end: ((reach - t) * scale * (1.0 + 1e-5) + 1e-3) as f32,
+            most_lo: 0,
+            least_hi: 0,
+        };
+        for a in 0..3 {
+            let p = o[a] + t * d[a];
+            // On a shared plane the ray is in the cell it goes to.
+            let below = d[a] < 0.0 && p == p.floor();
+            cell[a] = (p.floor() as i32 - i32::from(below)).clamp(0, n[a] as i32 - 1).cast_unsigned();
+            if d[a].abs() > f64::from(PARALLEL) * scale {
+                (line.o[a], line.inv[a]) = (p as f32, (scale * inv[a]) as f32);
+                line.flip |= (u32::from(d[a] < 0.0) * 3) << (2 * a);
+                line.far[a] = if d[a] < 0.0 { 0.0 } else { 1.0 };
+            } else {
+                line.o[a] = cell[a] as f32 + 0.5;
+            }
+        }
+        self.prefetch(kernel, cell, 0);
+
+        let c = f64::from(ray.isovalue);
+        let within = entry.is_none();
+        let four = |[x, y, z]: [f64; 3]| [x, y, z, 0.0];
+        let (samples, steps) = (field.samples(), self.steps);
+        let (o, d, inv) = (four(o), four(d), four(inv));
+        let mut ray_in = Ray { samples, steps, o, d, inv, c, c32: ray.isovalue, t, reach, within };
+        let mut departing = None;
+        if let (Departure::Surface(side), true) = (ray.departure, within) {
+            let here = ray_in.cell_at(self.sample(cell)).value(ray_in.local(point(cell), 0.0));
+            if here.is_finite() {
+                // So that the root at the start is exactly 0.
+                (ray_in.c, ray_in.c32) = (here, not_below(here));
+                departing = Some(side);
+            }
+        }
+        line.hold(&self.ranks, ray_in.c32);
+        let ray = ray_in;
+        if let Some(axis) = entry {
+            let far = d[axis] < 0.0;
+            if self.capped && ray.cell_at(self.sample(cell)).face_inside_ray(axis, far, &ray, point(cell), t) {
+                return Begun::Done(Some(FlattenedHit { t: t as f32, target: cap(axis, far, Side::Lower) }));
+            }
+        }
+        if let Some(side) = departing {
+            match ray.first_cell::<ANY>(&line, self.sample(cell), point(cell), side) {
+                Step::On => {}
+                Step::Hit(hit) => return Begun::Done(Some(hit)),
+                Step::End => return Begun::Done(None),
+            }
+        }
+
+        *lane = Some(Lane::new(kernel.ray(&line), ray, line, cell, departing.is_some(), self.capped));
+        Begun::On
+    }
+}
