@@ -141,6 +141,7 @@ pub fn direct_irradiance<T: Tracer>(
     }
     out
 }
+
 /// Direct irradiance from one random point per luminaire, counting `rays`: noisy, unbiased and bounded.
 pub fn direct_once<T: Tracer>(scene: &Scene, tracer: &T, receiver: &Receiver, rng: &mut Rng, rays: &mut u64) -> DVec3 {
     let x = scene.lattice().to_world(receiver.position.as_dvec3());

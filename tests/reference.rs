@@ -267,13 +267,12 @@ fn the_photon_map_agrees_with_the_path_tracer() {
         let of_scene: Vec<f64> = (0..mesh.local.len())
             .filter(|&v| path.sampled[v])
             .map(|v| {
+                let difference = luminance(photon.radiance[v] - path.radiance[v]);
                 // Luminance of standard deviations: the channels share their paths, so that this is an upper bound.
                 let deviation = |r: &isolume::reference::Reference| luminance(r.variance[v].map(f64::sqrt));
-                let difference = luminance(photon.radiance[v] - path.radiance[v]);
                 difference / deviation(&photon).hypot(deviation(&path)).max(1e-9)
             })
             .collect();
-        assert_eq!(of_scene.len(), 400, "{name}");
         let mean = of_scene.iter().sum::<f64>() / of_scene.len() as f64;
         println!(
             "{name}: {} vertices, mean z {mean:+.3}, {} rays began inside",
@@ -281,6 +280,7 @@ fn the_photon_map_agrees_with_the_path_tracer() {
             tracer.inside_starts()
         );
         assert!(mean.abs() < 0.5, "{name}: no common bias worth half a standard deviation: {mean}");
+        assert_eq!(of_scene.len(), 400, "{name}");
         z.extend(of_scene);
     }
     let level = normal_quantile(sidak(0.01, z.len()));
