@@ -27,6 +27,9 @@ pub struct Gathered {
 const NEAR: f64 = 1.0;
 /// Such hits in a row at most.
 const CORNERS: usize = 4;
+/// One of so many of a receiver's rays that land so goes on, for all of them: it corrects what the cache says, which is the
+/// mean of the rays that it stands for but for a part that light in corners adds. \[Arvo90\]
+const SHARE: u64 = 8;
 /// Fewest rays that show a receiver to be sealed off from all light.
 const PILOT: u32 = 16;
 
@@ -49,6 +52,8 @@ pub fn gathered_irradiance<T: Tracer>(
     let (mut misses, mut traced) = (0, 0);
     // Rays that landed, and of them those that found any light.
     let (mut landed, mut lit) = (0, 0);
+    let turn = Rng::stream(seed, Stage::Gather, index << 20 ^ 0xF_FFFF).bits();
+    let mut corners = Corners { scene, tracer, cache, turn };
     for i in 0..rays {
         if i == PILOT.max(rays / 4) && landed == i && lit == 0 {
             break;
@@ -59,7 +64,7 @@ pub fn gathered_irradiance<T: Tracer>(
         let radiance = tracer.intersect(&ray).map_or(DVec3::ZERO, |hit| {
             landed += 1;
             let mut rng = || Rng::stream(seed, Stage::Gather, index << 20 ^ u64::from(i));
-            Corners { scene, tracer, cache }.radiance(ray, hit, &mut rng, &mut misses, &mut traced)
+            corners.radiance(ray, hit, &mut rng, &mut misses, &mut traced)
         });
         lit += u32::from(radiance != DVec3::ZERO);
         sums[usize::from(i >= first)] += radiance;
@@ -97,6 +102,8 @@ struct Corners<'a, T> {
     scene: &'a Scene,
     tracer: &'a T,
     cache: &'a RadianceCache,
+    /// Counts the rays that landed near.
+    turn: u64,
 }
 
 impl<T: Tracer> Corners<'_, T> {
@@ -104,7 +111,7 @@ impl<T: Tracer> Corners<'_, T> {
     /// on a path until it is. `rng` makes the random numbers of the path.
     #[inline]
     fn radiance(
-        &self,
+        &mut self,
         ray: FlattenedRay,
         hit: FlattenedHit,
         rng: &mut dyn FnMut() -> Rng,
@@ -115,7 +122,11 @@ impl<T: Tracer> Corners<'_, T> {
         if cached == DVec3::ZERO || !near(self.scene, &ray, hit) {
             return cached;
         }
-        self.path(ray, hit, cached, &mut rng(), misses, rays)
+        self.turn = self.turn.wrapping_add(1);
+        if self.turn % SHARE != 0 {
+            return cached;
+        }
+        cached + (self.path(ray, hit, cached, &mut rng(), misses, rays) - cached) * SHARE as f64
     }
 
     /// The same along a path from a near `hit`, for which the cache says `cached`.
@@ -129,7 +140,7 @@ impl<T: Tracer> Corners<'_, T> {
         misses: &mut u64,
         rays: &mut u64,
     ) -> DVec3 {
-        let Self { scene, tracer, cache } = *self;
+        let Self { scene, tracer, cache, .. } = *self;
         let (mut total, mut weight) = (DVec3::ZERO, DVec3::ONE);
         for _ in 0..CORNERS {
             if cached == DVec3::ZERO || !near(scene, &ray, hit) {

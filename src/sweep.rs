@@ -97,7 +97,8 @@ pub struct SweepResult {
     pub flats: Vec<Option<FlatTexture>>,
     /// Indirect bounces of the replicate that took the most.
     pub bounces: usize,
-    /// Bound on the share of mean indirect light that later bounces would add; NaN where `max_bounces` came first.
+    /// Bound on the share of mean indirect light that later bounces would add; NaN where bounces were cut before
+    /// it was known.
     pub residual: f64,
     /// Whether `tick` stopped the work.
     pub stopped: bool,

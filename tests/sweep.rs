@@ -152,6 +152,22 @@ fn integrating_sphere() {
     }
 }
 
+/// What bounces leave out is known where they converged, replicates that start warm among them, and is not 0 where they were cut.
+#[test]
+fn the_residual_of_cut_bounces_is_not_known() {
+    let f = bumps(21);
+    let walls = cornell_box(f.lattice(), 0.0).unwrap();
+    let scene = Scene::new(f, Surface::default(), Boundary::Open, walls).unwrap();
+    for (max_bounces, replicates, known) in [(64, 1, true), (64, 3, true), (2, 1, false), (2, 3, false)] {
+        let settings =
+            SweepSettings { directions: 32, light_points: 4, max_bounces, replicates, ..SweepSettings::default() };
+        let got = run(&scene, settings);
+        println!("at most {max_bounces} bounces, {replicates} replicates: {} left out", got.residual);
+        assert_eq!(got.residual.is_finite(), known);
+        assert!(!known || got.residual > 0.0 && got.residual < settings.target);
+    }
+}
+
 /// Walls on Ω's faces that all emit.
 fn emissive_box(lattice: &Lattice, albedo: f64, emission: f64) -> Vec<Polygon> {
     let far = lattice.far();

@@ -68,7 +68,15 @@ impl State {
     /// Takes note of how far a replicate came.
     pub(super) fn see(&mut self, passes: &Passes) {
         self.bounces = self.bounces.max(passes.bounce);
-        self.residual = passes.monitor.missing(0).unwrap_or(f64::NAN).max(self.residual);
+        let missing = match passes.monitor.missing(0) {
+            // From the light of replicates before.
+            None if passes.late > 0 => 0.0,
+            missing => missing.unwrap_or(f64::NAN),
+        };
+        // f64::max passes over NaN.
+        if missing.is_nan() || missing > self.residual {
+            self.residual = missing;
+        }
     }
 
     /// Everything as bytes, with the passes of a replicate that is under way.
