@@ -4,6 +4,8 @@
 use super::directions::Layout;
 use super::flats::{Flats, capped};
 use super::grid::{Blocks, Geometry, Planes};
+use super::pack::LANES;
+use super::segments::Segments;
 use super::simd::Isa;
 use crate::flat;
 use crate::flattened::{Departure, Side};
@@ -178,60 +180,6 @@ pub(super) fn march_row(row: &[f32], [u0, du]: [f32; 2], most: &mut [f32], least
     }
 }
 
-/// Least and greatest h along the segment from local `a` to `b` inside Ω, at the slices of its dominant axis and its
-/// ends; (∞, −∞) if it misses Ω.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "values are f32, places in the lattice")]
-fn extrema(scene: &Scene, a: DVec3, b: DVec3) -> (f32, f32) {
-    let far = scene.lattice().far();
-    let d = b - a;
-    let (mut from, mut to) = (0f64, 1f64);
-    for x in 0..3 {
-        if d[x] == 0.0 {
-            if a[x] < 0.0 || a[x] > far[x] {
-                return (f32::INFINITY, f32::NEG_INFINITY);
-            }
-            continue;
-        }
-        let (t0, t1) = (-a[x] / d[x], (far[x] - a[x]) / d[x]);
-        from = from.max(t0.min(t1));
-        to = to.min(t0.max(t1));
-    }
-    if !(from <= to) {
-        return (f32::INFINITY, f32::NEG_INFINITY);
-    }
-    let size = d.abs();
-    let axis = if size.z >= size.x && size.z >= size.y { 2 } else { usize::from(size.y >= size.x) };
-    let mut range = (f32::INFINITY, f32::NEG_INFINITY);
-    for t in [from, to] {
-        let h = scene.field.value(a + t * d) as f32;
-        range = (range.0.min(h), range.1.max(h));
-    }
-    if d[axis] == 0.0 {
-        return range;
-    }
-    // In slices of the axis h is bilinear.
-    let dims = scene.lattice().dims();
-    let strides = [1, dims[0], dims[0] * dims[1]];
-    let [u, v] = [(axis + 1) % 3, (axis + 2) % 3];
-    let (su, sv, sa) = (strides[u], strides[v], strides[axis]);
-    let h = scene.field.samples();
-    let (p, q) = (a[axis] + from * d[axis], a[axis] + to * d[axis]);
-    let (k0, k1) = (p.min(q).ceil().max(0.0) as usize, (p.max(q).floor().max(0.0) as usize).min(dims[axis] - 1));
-    let slope = [u, v].map(|x| (d[x] / d[axis]) as f32);
-    let start = [u, v].map(|x| (a[x] - a[axis] * d[x] / d[axis]) as f32);
-    let last = [u, v].map(|x| dims[x] - 2);
-    for k in k0..=k1 {
-        let [x, y] = [0, 1].map(|i| (start[i] + k as f32 * slope[i]).max(0.0));
-        let (i, j) = ((x as usize).min(last[0]), (y as usize).min(last[1]));
-        let (f, g) = ((x - i as f32).min(1.0), (y - j as f32).min(1.0));
-        let at = k * sa + i * su + j * sv;
-        let (near, far) = (h[at] + f * (h[at + su] - h[at]), h[at + sv] + f * (h[at + sv + su] - h[at + sv]));
-        let value = near + g * (far - near);
-        range = (range.0.min(value), range.1.max(value));
-    }
-    range
-}
-
 /// What stands between a luminaire and its receivers.
 struct Blockers {
     polygons: Vec<(u32, LocalPolygon)>,
@@ -354,15 +302,62 @@ pub(super) fn direct(
                 }
             });
         }
-        walls(scene, flats, sides, number, &points, (seed, index));
+        walls((scene, isa), flats, sides, number, &points, (seed, index));
     }
     (planes, true)
+}
+
+/// Light by isovalue texel as sums of steps: lit from a texel on, on the lower side, and up to one, on the higher.
+struct Staircases {
+    from: Vec<f64>,
+    until: Vec<f64>,
+}
+
+impl Staircases {
+    fn new(isovalues: usize) -> Self {
+        Self { from: vec![0.0; isovalues + 1], until: vec![0.0; isovalues + 1] }
+    }
+
+    /// `g` at texels `from`.. on the lower side and ..`until` on the higher.
+    #[inline]
+    fn add(&mut self, g: f64, from: usize, until: usize) {
+        self.from[from] += g;
+        self.until[until] += g;
+    }
+
+    /// Light of each texel, of the sides that count.
+    fn sums(self, lower: bool, higher: bool) -> Vec<f64> {
+        let n = self.from.len() - 1;
+        let mut out = vec![0.0; n];
+        if lower {
+            let mut sum = 0.0;
+            for (out, g) in out.iter_mut().zip(&self.from) {
+                sum += g;
+                *out += sum;
+            }
+        }
+        if higher {
+            let mut sum = 0.0;
+            for (out, g) in out.iter_mut().zip(&self.until[1..]).rev() {
+                sum += g;
+                *out += sum;
+            }
+        }
+        out
+    }
 }
 
 /// Direct light of one luminaire on all flats: every texel looks from a point of its own along the segment to each
 /// luminaire point; it is lit at the isovalues above the greatest h there (and, inside solids, up to the least).
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the isovalues")]
-fn walls(scene: &Scene, flats: &mut Flats, sides: &[Side], number: u32, points: &[DVec3], key: (u64, u64)) {
+fn walls(
+    (scene, isa): (&Scene, Isa),
+    flats: &mut Flats,
+    sides: &[Side],
+    number: u32,
+    points: &[DVec3],
+    key: (u64, u64),
+) {
     let lattice = scene.lattice();
     let light = &scene.polygons()[number as usize];
     let nc = flats.isovalues;
@@ -388,39 +383,40 @@ fn walls(scene: &Scene, flats: &mut Flats, sides: &[Side], number: u32, points: 
             let mut rng = Rng::stream(key.0, Stage::Sweep, stream ^ 1 << 63);
             // Number of isovalue texels at or below h.
             let below = |h: f32| ((h * nc as f32 + 0.5).floor().max(0.0) as usize).min(nc);
-            let (mut lit, mut all) = (vec![0f64; nc], vec![0f64; nc]);
-            for &y in points {
-                let [a, b] = rng.unit2();
-                let x = place(a, b);
-                let g = point_term(x, flat.normal, y, light.normal());
-                if g == 0.0 {
-                    continue;
+            // Σ g of what begins at each isovalue texel on the lower side, and of what ends before it on the higher one.
+            let (mut lit, mut all) = (Staircases::new(nc), Staircases::new(nc));
+            for points in points.chunks(LANES) {
+                let mut segments = Segments::NONE;
+                let mut seen = [(0.0, 0); LANES];
+                for (lane, &y) in points.iter().enumerate() {
+                    let [a, b] = rng.unit2();
+                    let x = place(a, b);
+                    let g = point_term(x, flat.normal, y, light.normal());
+                    if g == 0.0 {
+                        continue;
+                    }
+                    let (lx, ly) = (lattice.to_index(x), lattice.to_index(y));
+                    let within = (0..3).all(|a| lx[a] >= -1e-6 && lx[a] <= far[a] + 1e-6);
+                    let here =
+                        if within && id < caps && !capped(scene) { below(scene.field.value(lx) as f32) } else { 0 };
+                    all.add(g, here, here);
+                    if blockers.block(number, receiver, ly, lx) {
+                        continue;
+                    }
+                    if id >= caps {
+                        lit.add(g, 0, 0);
+                        continue;
+                    }
+                    segments.set(lane, &scene.field, ly, lx);
+                    seen[lane] = (g, here);
                 }
-                let (lx, ly) = (lattice.to_index(x), lattice.to_index(y));
-                let within = (0..3).all(|a| lx[a] >= -1e-6 && lx[a] <= far[a] + 1e-6);
-                let here = if within && id < caps && !capped(scene) { below(scene.field.value(lx) as f32) } else { 0 };
-                if lower {
-                    all[here..].iter_mut().for_each(|s| *s += g);
-                }
-                if higher {
-                    all[..here].iter_mut().for_each(|s| *s += g);
-                }
-                if blockers.block(number, receiver, ly, lx) {
-                    continue;
-                }
-                if id >= caps {
-                    lit.iter_mut().for_each(|s| *s += g);
-                    continue;
-                }
-                let (least, most) = extrema(scene, ly, lx);
-                let open = below(most).max(here);
-                if lower {
-                    lit[open..].iter_mut().for_each(|s| *s += g);
-                }
-                if higher {
-                    lit[..below(least).min(open)].iter_mut().for_each(|s| *s += g);
+                isa.extrema(scene.field.samples(), &mut segments);
+                for (lane, &(g, here)) in seen.iter().enumerate().filter(|(_, s)| s.0 != 0.0) {
+                    let open = below(segments.most[lane]).max(here);
+                    lit.add(g, open, below(segments.least[lane]).min(open));
                 }
             }
+            let [lit, all] = [lit, all].map(|s| s.sums(lower, higher));
             let rgb = (light.emission * e).to_array();
             for c in 0..3 {
                 for t in (0..nc).filter(|&t| all[t] > 0.0) {

@@ -9,6 +9,7 @@ use super::flats::{Ends, Flats};
 use super::gather::{COSINES, accumulate_row, sum_cosines};
 use super::grid::Source;
 use super::pack::{Light, Pack, Plan, Way};
+use super::segments::Segments;
 
 /// An instruction set that this machine was found to have.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -96,6 +97,16 @@ impl Isa {
         }
     }
 
+    /// [`Segments::march`].
+    pub(super) fn extrema(self, h: &[f32], segments: &mut Segments) {
+        match self.0 {
+            // SAFETY: `detect` made this kind on a machine with the features that `extrema` enables.
+            #[cfg(target_arch = "x86_64")]
+            Kind::Avx512 if i32::try_from(h.len()).is_ok() => unsafe { avx512::extrema(h, segments) },
+            _ => segments.march(h),
+        }
+    }
+
     /// [`Pack::scan`].
     pub(super) fn scan(self, pack: &mut Pack, way: Way, light: Light, out: &mut [Vec<f32>], place: (usize, usize)) {
         match self.0 {
@@ -112,6 +123,7 @@ mod avx512 {
     use super::super::direct::{HIGHER, LOWER, SAMPLED};
     use super::super::half::Half4;
     use super::super::pack::{LANES, Light, OUTSIDE, Pack, Way};
+    use super::super::segments::Segments;
     use std::arch::x86_64::*;
 
     /// [`Pack::scan`] with a line per lane.
@@ -162,6 +174,58 @@ mod avx512 {
                 let seen = _mm_or_si128(seen, _mm_maskz_mov_epi8(below, higher));
                 _mm_mask_storeu_epi8(out.as_mut_ptr().cast::<i8>().add(start), mask, seen);
             }
+        }
+    }
+
+    /// [`Segments::march`] for at most 2³¹ samples.
+    #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
+    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, reason = "at most 2³¹ samples")]
+    pub(super) fn extrema(h: &[f32], s: &mut Segments) {
+        // SAFETY: sixteen numbers each.
+        let floats = |x: &[f32; LANES]| unsafe { _mm512_loadu_ps(x.as_ptr()) };
+        // SAFETY: as above.
+        let ints = |x: &[i32; LANES]| unsafe { _mm512_loadu_si512(x.as_ptr().cast()) };
+        let (start, slope) = ([floats(&s.start[0]), floats(&s.start[1])], [floats(&s.slope[0]), floats(&s.slope[1])]);
+        let (last, stride) = ([ints(&s.last[0]), ints(&s.last[1])], [ints(&s.stride[0]), ints(&s.stride[1])]);
+        let (first, count, across) = (ints(&s.first), ints(&s.count), ints(&s.stride[2]));
+        let (mut least, mut most) = (floats(&s.least), floats(&s.most));
+        let (zero, one) = (_mm512_setzero_ps(), _mm512_set1_ps(1.0));
+        let end = _mm512_set1_epi32(h.len() as i32);
+        for step in 0..s.count.iter().copied().max().unwrap_or(0) {
+            let step = _mm512_set1_epi32(step);
+            let k = _mm512_add_epi32(first, step);
+            let slice = _mm512_cvtepi32_ps(k);
+            let place = |i: usize| {
+                let x = _mm512_max_ps(_mm512_add_ps(start[i], _mm512_mul_ps(slice, slope[i])), zero);
+                let cell = _mm512_min_epi32(_mm512_cvttps_epi32(x), last[i]);
+                (cell, _mm512_min_ps(_mm512_sub_ps(x, _mm512_cvtepi32_ps(cell)), one))
+            };
+            let ((i, f), (j, g)) = (place(0), place(1));
+            let at = _mm512_add_epi32(_mm512_mullo_epi32(i, stride[0]), _mm512_mullo_epi32(j, stride[1]));
+            let at = _mm512_add_epi32(at, _mm512_mullo_epi32(k, across));
+            let beside = _mm512_add_epi32(at, stride[0]);
+            let [over, opposite] = [at, beside].map(|x| _mm512_add_epi32(x, stride[1]));
+            let exists = |at| _mm512_cmp_epu32_mask::<_MM_CMPINT_LT>(at, end);
+            let mask = _mm512_cmp_epi32_mask::<_MM_CMPINT_LT>(step, count)
+                & (exists(at) & exists(beside) & exists(over) & exists(opposite));
+            // SAFETY: in lanes of the mask all four places, as unsigned numbers, are below the length of `h`, which is below 2³¹.
+            let [a, b, c, d] = unsafe {
+                let sample = |at| _mm512_mask_i32gather_ps::<4>(zero, mask, at, h.as_ptr());
+                [sample(at), sample(beside), sample(over), sample(opposite)]
+            };
+            let near = _mm512_add_ps(a, _mm512_mul_ps(f, _mm512_sub_ps(b, a)));
+            let far = _mm512_add_ps(c, _mm512_mul_ps(f, _mm512_sub_ps(d, c)));
+            let value = _mm512_add_ps(near, _mm512_mul_ps(g, _mm512_sub_ps(far, near)));
+            // Comparisons pass over NaN.
+            let lower = _mm512_mask_cmp_ps_mask::<_CMP_LT_OQ>(mask, value, least);
+            let higher = _mm512_mask_cmp_ps_mask::<_CMP_GT_OQ>(mask, value, most);
+            least = _mm512_mask_mov_ps(least, lower, value);
+            most = _mm512_mask_mov_ps(most, higher, value);
+        }
+        // SAFETY: sixteen numbers each.
+        unsafe {
+            _mm512_storeu_ps(s.least.as_mut_ptr(), least);
+            _mm512_storeu_ps(s.most.as_mut_ptr(), most);
         }
     }
 
@@ -347,10 +411,13 @@ mod avx512 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::field::{Field, Sweep};
     use crate::rng::{Rng, Stage};
     use crate::sweep::half::Half4;
     use crate::sweep::half::{decode, encode};
     use crate::sweep::pack::{ASLEEP, LANES, OUTSIDE};
+    use crate::volume::{Lattice, Samples, Volume};
+    use glam::DVec3;
 
     /// A pack of noise with plateaus, gaps, rows that were not read, ends outside and cuts.
     fn noise(seed: u64) -> Pack {
@@ -419,6 +486,28 @@ mod tests {
                 (most.iter().chain(&least).map(|x| x.to_bits()).collect::<Vec<_>>(), out)
             };
             assert_eq!(run(Isa::PLAIN), run(Isa::detect()), "{count} lines");
+        }
+    }
+
+    #[test]
+    fn every_instruction_set_finds_the_same_extrema() {
+        let mut rng = Rng::stream(6, Stage::Test, 0);
+        let lattice = Lattice::aligned([9, 14, 11], DVec3::ZERO, DVec3::ONE).unwrap();
+        let mut samples: Vec<f64> = (0..lattice.len()).map(|_| rng.unit()).collect();
+        samples[700] = f64::NAN;
+        let volume = Volume::new("noise", lattice, Samples::F64(samples)).unwrap();
+        let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+        for _ in 0..200 {
+            let mut segments = Segments::NONE;
+            // Partly outside; the last lanes stay empty.
+            let mut point = || DVec3::new(rng.unit(), rng.unit(), rng.unit()) * 20.0 - 4.0;
+            (0..13).for_each(|lane| segments.set(lane, &field, point(), point()));
+            let run = |isa: Isa| {
+                let mut segments = segments.clone();
+                isa.extrema(field.samples(), &mut segments);
+                [segments.least, segments.most].map(|x| x.map(f32::to_bits))
+            };
+            assert_eq!(run(Isa::PLAIN), run(Isa::detect()));
         }
     }
 

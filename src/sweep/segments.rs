@@ -1,0 +1,166 @@
+//! Extrema of h along many segments at once: what stands between points of a wall and points of a luminaire.
+
+use super::pack::LANES;
+use crate::field::Field;
+use glam::DVec3;
+
+/// Up to sixteen segments; lanes that are not used find nothing.
+#[repr(C, align(64))]
+#[derive(Clone, Debug)]
+pub(super) struct Segments {
+    /// Where each meets slice 0 of its dominant axis, along the two others, and its steps from slice to slice.
+    pub start: [[f32; LANES]; 2],
+    pub slope: [[f32; LANES]; 2],
+    /// Greatest index of a cell along the two other axes.
+    pub last: [[i32; LANES]; 2],
+    /// Strides of the two other axes and the dominant one.
+    pub stride: [[i32; LANES]; 3],
+    /// First slice and number of slices inside Ω: those of the samples are within it.
+    pub first: [i32; LANES],
+    pub count: [i32; LANES],
+    /// Least and greatest h so far.
+    pub least: [f32; LANES],
+    pub most: [f32; LANES],
+}
+
+impl Segments {
+    /// None.
+    pub(super) const NONE: Self = Self {
+        start: [[0.0; LANES]; 2],
+        slope: [[0.0; LANES]; 2],
+        last: [[0; LANES]; 2],
+        stride: [[0; LANES]; 3],
+        first: [0; LANES],
+        count: [0; LANES],
+        least: [f32::INFINITY; LANES],
+        most: [f32::NEG_INFINITY; LANES],
+    };
+
+    /// Takes the segment from local `a` to `b` into `lane`, clipped to Ω, with h at its ends; (∞, −∞) if it misses Ω.
+    #[allow(
+        clippy::cast_possible_truncation,
+        clippy::cast_possible_wrap,
+        reason = "values are f32, places in the lattice"
+    )]
+    pub(super) fn set(&mut self, lane: usize, field: &Field, a: DVec3, b: DVec3) {
+        (self.least[lane], self.most[lane], self.count[lane]) = (f32::INFINITY, f32::NEG_INFINITY, 0);
+        let far = field.lattice().far();
+        let d = b - a;
+        let (mut from, mut to) = (0f64, 1f64);
+        for x in 0..3 {
+            if d[x] == 0.0 {
+                if a[x] < 0.0 || a[x] > far[x] {
+                    return;
+                }
+                continue;
+            }
+            let (t0, t1) = (-a[x] / d[x], (far[x] - a[x]) / d[x]);
+            from = from.max(t0.min(t1));
+            to = to.min(t0.max(t1));
+        }
+        if !(from <= to) {
+            return;
+        }
+        for t in [from, to] {
+            let h = field.value(a + t * d) as f32;
+            self.least[lane] = self.least[lane].min(h);
+            self.most[lane] = self.most[lane].max(h);
+        }
+        let size = d.abs();
+        let axis = if size.z >= size.x && size.z >= size.y { 2 } else { usize::from(size.y >= size.x) };
+        if d[axis] == 0.0 {
+            return;
+        }
+        let dims = field.lattice().dims();
+        let strides = [1, dims[0], dims[0] * dims[1]];
+        let across = [(axis + 1) % 3, (axis + 2) % 3];
+        for (i, &x) in across.iter().enumerate() {
+            let slope = d[x] / d[axis];
+            self.start[i][lane] = (a[x] - a[axis] * slope) as f32;
+            self.slope[i][lane] = slope as f32;
+            self.last[i][lane] = dims[x] as i32 - 2;
+            self.stride[i][lane] = strides[x] as i32;
+        }
+        self.stride[2][lane] = strides[axis] as i32;
+        let (p, q) = (a[axis] + from * d[axis], a[axis] + to * d[axis]);
+        let (first, end) = (p.min(q).ceil().max(0.0) as i32, (p.max(q).floor() as i32).min(dims[axis] as i32 - 1));
+        (self.first[lane], self.count[lane]) = (first, (end + 1 - first).max(0));
+    }
+
+    /// Takes h of all slices into the extrema, bilinear in each; NaN counts nothing. `h`: the samples of the fields of
+    /// [`Segments::set`].
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
+    pub(super) fn march(&mut self, h: &[f32]) {
+        for lane in 0..LANES {
+            let stride = self.stride.map(|s| s[lane] as usize);
+            for k in self.first[lane]..self.first[lane] + self.count[lane] {
+                let x = [0, 1].map(|i| (self.start[i][lane] + k as f32 * self.slope[i][lane]).max(0.0));
+                let cell = [0, 1].map(|i| (x[i] as i32).min(self.last[i][lane]));
+                let [f, g] = [0, 1].map(|i| (x[i] - cell[i] as f32).min(1.0));
+                let at = k as usize * stride[2] + cell[0] as usize * stride[0] + cell[1] as usize * stride[1];
+                let line = |at: usize| h[at] + f * (h[at + stride[0]] - h[at]);
+                let (near, far) = (line(at), line(at + stride[1]));
+                let value = near + g * (far - near);
+                // f32::min and max pass over NaN.
+                self.least[lane] = self.least[lane].min(value);
+                self.most[lane] = self.most[lane].max(value);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::Sweep;
+    use crate::rng::{Rng, Stage};
+    use crate::volume::{Lattice, Samples, Volume};
+
+    fn field(dims: [usize; 3], h: impl FnMut(DVec3) -> f64) -> Field {
+        let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::ONE).unwrap();
+        let place = |o| DVec3::from_array(lattice.ijk(o).map(|i| i as f64));
+        let samples = (0..lattice.len()).map(place).map(h).collect();
+        let volume = Volume::new("known", lattice, Samples::F64(samples)).unwrap();
+        Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap()
+    }
+
+    /// On noise: the trilinear field itself, asked at every slice and at the ends.
+    #[test]
+    fn extrema_are_those_of_the_field_at_every_slice() {
+        let mut rng = Rng::stream(1, Stage::Test, 0);
+        let noise = field([12, 9, 15], |_| rng.unit());
+        let far = noise.lattice().far();
+        let mut rng = Rng::stream(2, Stage::Test, 0);
+        for _ in 0..200 {
+            let mut segments = Segments::NONE;
+            let ends: [[DVec3; 2]; LANES] =
+                std::array::from_fn(|_| [0, 1].map(|_| DVec3::new(rng.unit(), rng.unit(), rng.unit()) * far));
+            ends.iter().enumerate().for_each(|(lane, e)| segments.set(lane, &noise, e[0], e[1]));
+            segments.march(noise.samples());
+            for (lane, [a, b]) in ends.into_iter().enumerate() {
+                let d = b - a;
+                let axis = d.abs().to_array().iter().position(|x| *x == d.abs().max_element()).unwrap();
+                let slices = (0..=far[axis] as usize).map(|k| (k as f64 - a[axis]) / d[axis]);
+                let at = slices.filter(|t| (0.0..=1.0).contains(t)).chain([0.0, 1.0]);
+                let values: Vec<f64> = at.map(|t| noise.value(a + t * d)).collect();
+                let [lo, hi] = [f64::min, f64::max].map(|f| values.iter().copied().reduce(f).unwrap());
+                let off = (f64::from(segments.least[lane]) - lo).abs().max((f64::from(segments.most[lane]) - hi).abs());
+                assert!(off < 1e-5, "{a} to {b}: {off}");
+            }
+        }
+    }
+
+    /// A segment that runs from outside through a ramp, and one that misses it.
+    #[test]
+    fn segments_are_clipped() {
+        let ramp = field([11; 3], |x| x.x / 10.0);
+        let mut segments = Segments::NONE;
+        segments.set(0, &ramp, DVec3::new(-5.0, 2.0, 3.0), DVec3::new(7.5, 4.0, 3.0));
+        segments.set(1, &ramp, DVec3::new(-5.0, 2.0, 3.0), DVec3::new(-1.0, 9.0, 9.0));
+        segments.march(ramp.samples());
+        assert!((segments.least[0]).abs() < 1e-6 && (segments.most[0] - 0.75).abs() < 1e-6);
+        for lane in 1..LANES {
+            assert_eq!((segments.least[lane], segments.most[lane]), (f32::INFINITY, f32::NEG_INFINITY));
+        }
+    }
+}
