@@ -264,7 +264,7 @@ impl BakeSettings {
             Preset::Reference => (1 << 24, 4.0, 1024, 256, 16, 128, 64, 128),
         };
         let (directions, light_points) = match preset {
-            Preset::Preview => (32, 8),
+            Preset::Preview => (64, 16),
             Preset::Standard => (128, 32),
             Preset::Reference => (512, 128),
         };

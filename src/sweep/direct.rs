@@ -207,11 +207,12 @@ impl Blockers {
     }
 }
 
-/// A luminaire's points, low-discrepancy over its area.
+/// A luminaire's points, low-discrepancy over its area: those of replicate `index`, together with those of the others too.
 fn points(light: &Polygon, seed: u64, index: u64, number: u32, count: usize) -> Vec<DVec3> {
-    let set = Sobol::set(seed, Stage::Sweep, index << 32 | 1 << 31 | u64::from(number));
+    let set = Sobol::set(seed, Stage::Sweep, 1 << 31 | u64::from(number));
     #[allow(clippy::cast_possible_truncation, reason = "a few thousand points")]
-    (0..count as u32).map(|i| light.sample(set.point2(i, 0))).collect()
+    let (first, count) = (index as u32 * count as u32, count as u32);
+    (first..first + count).map(|i| light.sample(set.point2(i, 0))).collect()
 }
 
 /// Direct irradiance of every node, one set of planes per side in `sides`, and of the flats. `index` tells replicates
