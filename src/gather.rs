@@ -123,7 +123,7 @@ impl<T: Tracer> Corners<'_, T> {
             return cached;
         }
         self.turn = self.turn.wrapping_add(1);
-        if self.turn % SHARE != 0 {
+        if !self.turn.is_multiple_of(SHARE) {
             return cached;
         }
         cached + (self.path(ray, hit, cached, &mut rng(), misses, rays) - cached) * SHARE as f64
