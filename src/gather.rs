@@ -73,7 +73,9 @@ pub fn gathered_irradiance<T: Tracer>(
     let n = f64::from(rays.max(1));
     let mean = (sums[0] + sums[1]) * (PI / n);
     let half = |sum: DVec3, count: u32| if first > 0 { sum * (PI / f64::from(count)) } else { mean };
-    let estimate = Estimate { mean, variance: PI * PI * moments.variance() / n, rays: traced, misses };
+    // Corrections by a few rays may take more than there is.
+    let estimate =
+        Estimate { mean: mean.max(DVec3::ZERO), variance: PI * PI * moments.variance() / n, rays: traced, misses };
     Gathered { estimate, halves: [half(sums[0], first), half(sums[1], rays - first)] }
 }
 
