@@ -15,7 +15,7 @@ pub(super) struct Segments {
     pub last: [[i32; LANES]; 2],
     /// Strides of the two other axes and the dominant one.
     pub stride: [[i32; LANES]; 3],
-    /// First slice and number of slices inside Ω: those of the samples are within it.
+    /// First slice and number of slices, all inside Ω.
     pub first: [i32; LANES],
     pub count: [i32; LANES],
     /// Least and greatest h so far.
