@@ -15,6 +15,7 @@
 mod arrive;
 mod direct;
 mod directions;
+mod ends;
 mod flats;
 mod gather;
 mod grid;
@@ -153,7 +154,7 @@ pub fn supported(scene: &Scene) -> Result<()> {
             "{polygons} polygons: sweeps test each line against all, {MOST_POLYGONS} at most; use --engine photon"
         )));
     }
-    let inside = flats::inside(scene);
+    let inside = ends::inside(scene);
     if let Some((_, p)) = inside.iter().zip(scene.polygons()).find(|(inside, p)| **inside && !p.opaque_back) {
         return Err(Error::NotSupported(format!(
             "polygon '{}' stands inside the volume, where sweeps cannot see it; use --engine photon",
@@ -185,7 +186,7 @@ pub fn sweep_resumable(
     tick: &(dyn Fn(f64) -> bool + Sync),
 ) -> Result<SweepResult> {
     supported(scene)?;
-    let inside = flats::inside(scene);
+    let inside = ends::inside(scene);
     let geometry = Geometry::new(&scene.field);
     let stored = scene.surface.stored_sides();
     let sides = swept_sides(scene);

@@ -1,7 +1,8 @@
 //! What lines bring to walls and caps: from a wall's point one line sees every isovalue at once, a staircase of the
 //! running maximum of h.
 
-use super::flats::{Arrivals, Ends, Flats, Stop, fill_column};
+use super::ends::Ends;
+use super::flats::{Arrivals, Flats, Stop, fill_column};
 use super::gather::{Pass, local_bounds};
 use super::half::{Half4, decode};
 use super::pack::{LANES, OUTSIDE, Pack, Plan};

@@ -2,7 +2,8 @@
 
 use super::arrive;
 use super::directions::{Layout, Shear};
-use super::flats::{Arrivals, Ends, Flats, Incoming};
+use super::ends::Ends;
+use super::flats::{Arrivals, Flats, Incoming};
 use super::grid::{Geometry, NORMAL_SCALE, Planes, Source, transposed, untransposed};
 use super::half::Half4;
 use super::pack::{LANES, Light, Pack, Plan, Way};

@@ -3,7 +3,8 @@
 #![allow(clippy::needless_range_loop, reason = "a channel indexes several planes at once")]
 
 use super::directions::Shear;
-use super::flats::{Ends, Flats, Stop};
+use super::ends::Ends;
+use super::flats::{Flats, Stop};
 use super::grid::Source;
 use super::half::{Half4, decode};
 

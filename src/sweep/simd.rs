@@ -5,7 +5,8 @@
 #![allow(clippy::needless_range_loop, reason = "a channel indexes several planes at once")]
 
 use super::direct::march_row;
-use super::flats::{Ends, Flats};
+use super::ends::Ends;
+use super::flats::Flats;
 use super::gather::{COSINES, accumulate_row, sum_cosines};
 use super::grid::Source;
 use super::pack::{Light, Pack, Plan, Way};

@@ -1,0 +1,224 @@
+//! Where lines end: on walls, on luminaires inside Ω, and on the backs of both.
+
+#![allow(clippy::needless_range_loop, reason = "closures are not compiled for the wider instruction set")]
+
+use super::directions::Shear;
+use super::flats::{Flats, Stop};
+use super::pack::LANES;
+use crate::scene::Scene;
+use glam::DVec3;
+
+/// a + b p + c q.
+type Affine = [f64; 3];
+
+#[inline]
+fn at(f: &Affine, p: f64, q: f64) -> f64 {
+    f[0] + f[1] * p + f[2] * q
+}
+
+/// A polygon met by the parallel lines of one family: everything is affine in the line's numbers (p, q).
+struct Met {
+    number: u32,
+    tau: Affine,
+    uv: [Affine; 2],
+    /// Inside is where none of these is below −slack.
+    edges: Vec<Affine>,
+    slack: f64,
+    /// Whether its front faces lines that run towards +τ.
+    front_plus: bool,
+    opaque_back: bool,
+    other_face: i32,
+    /// Whether it stands inside Ω: a luminaire that cuts lines.
+    inside: bool,
+    reflects: bool,
+}
+
+/// Finds what the lines of one family end on.
+pub(super) struct Ends {
+    met: Vec<Met>,
+}
+
+impl Ends {
+    pub(super) fn new(scene: &Scene, flats: &Flats, shear: &Shear, inside: &[bool]) -> Self {
+        let lattice = scene.lattice();
+        let [u, v, a] = shear.layout.axes;
+        let [e, f, g] = [u, v, a].map(|x| lattice.axes().col(x));
+        let step = shear.slope[0] * e + shear.slope[1] * f + g;
+        let start = lattice.origin() + shear.offset[0] * e + shear.offset[1] * f;
+        let met = scene
+            .polygons()
+            .iter()
+            .enumerate()
+            .filter_map(|(i, p)| {
+                let n = p.normal();
+                let along = n.dot(step);
+                if along.abs() < 1e-9 * step.length() {
+                    return None;
+                }
+                let v = p.vertices();
+                let tau = [n.dot(v[0] - start) / along, -n.dot(e) / along, -n.dot(f) / along];
+                let point = |p: f64, q: f64| start + p * e + q * f + at(&tau, p, q) * step;
+                let affine = |h: &dyn Fn(DVec3) -> f64| {
+                    let o = h(point(0.0, 0.0));
+                    [o, h(point(1.0, 0.0)) - o, h(point(0.0, 1.0)) - o]
+                };
+                let size = v.iter().map(|&x| (x - v[0]).length()).fold(0.0, f64::max);
+                let edges = (0..v.len())
+                    .map(|k| {
+                        let (x0, x1) = (v[k], v[(k + 1) % v.len()]);
+                        let normal = n.cross(x1 - x0).normalize();
+                        affine(&|x| normal.dot(x - x0))
+                    })
+                    .collect();
+                Some(Met {
+                    number: u32::try_from(i).expect("scenes hold fewer than 2¹⁶ polygons"),
+                    tau,
+                    uv: [affine(&|x| p.texture(x)[0]), affine(&|x| p.texture(x)[1])],
+                    edges,
+                    slack: 1e-9 * size,
+                    front_plus: along < 0.0,
+                    opaque_back: p.opaque_back,
+                    other_face: p.other_face,
+                    inside: inside[i],
+                    reflects: flats.textures[i].is_some(),
+                })
+            })
+            .collect();
+        Self { met }
+    }
+
+    /// Whether lines may be cut inside Ω.
+    pub(super) fn cut(&self) -> bool {
+        self.met.iter().any(|m| m.inside)
+    }
+
+    /// What line (p, q) meets first beyond `from`, towards +τ (`forward`) or −τ; polygon `except` does not
+    /// count, nor its other face.
+    #[inline(always)]
+    #[allow(clippy::cast_possible_truncation, reason = "texture coordinates")]
+    pub(super) fn stop(&self, p: f64, q: f64, from: f64, forward: bool, except: Option<u32>) -> Option<Stop> {
+        let mut best: Option<(f64, &Met)> = None;
+        for m in &self.met {
+            let excepted = |e| e == m.number || e == m.number.wrapping_add_signed(m.other_face);
+            if (m.front_plus != forward && !m.opaque_back) || except.is_some_and(excepted) {
+                continue;
+            }
+            let tau = at(&m.tau, p, q);
+            // 1e-6 of a slice: a wall in Ω's face stands where the line leaves Ω, to rounding.
+            let beyond = if forward { tau - from } else { from - tau };
+            if !(beyond >= -1e-6) || best.is_some_and(|(t, _)| if forward { t <= tau } else { t >= tau }) {
+                continue;
+            }
+            if m.edges.iter().all(|e| at(e, p, q) >= -m.slack) {
+                best = Some((tau, m));
+            }
+        }
+        best.map(|(tau, m)| m.stop(p, q, tau, forward))
+    }
+
+    /// [`Ends::stop`] of lines first + 0 … 15 of row q from `from`, with their place in [`Flats::packed`].
+    #[inline(always)]
+    #[allow(clippy::cast_possible_truncation, reason = "texture coordinates")]
+    pub(super) fn stops(
+        &self,
+        flats: &Flats,
+        (first, q): (f64, f64),
+        from: &[f64; LANES],
+        forward: bool,
+        random: &[f32; LANES],
+        places: &mut [u32; LANES],
+    ) {
+        let mut best = [if forward { f64::INFINITY } else { f64::NEG_INFINITY }; LANES];
+        let mut which = [u32::MAX; LANES];
+        let sign = if forward { 1.0 } else { -1.0 };
+        for (number, m) in self.met.iter().enumerate() {
+            if m.front_plus != forward && !m.opaque_back {
+                continue;
+            }
+            let (t0, dt) = (at(&m.tau, first, q), m.tau[1]);
+            let mut tau = [0f64; LANES];
+            let mut slack = [f64::INFINITY; LANES];
+            for l in 0..LANES {
+                tau[l] = t0 + l as f64 * dt;
+            }
+            for e in &m.edges {
+                let (e0, de) = (at(e, first, q), e[1]);
+                for l in 0..LANES {
+                    slack[l] = slack[l].min(e0 + l as f64 * de);
+                }
+            }
+            for l in 0..LANES {
+                // 1e-6 of a slice, as in `stop`.
+                let beyond = (sign * (tau[l] - from[l]) >= -1e-6) & (sign * tau[l] < sign * best[l]);
+                let ok = beyond & (slack[l] >= -m.slack);
+                best[l] = if ok { tau[l] } else { best[l] };
+                which[l] = if ok { number as u32 } else { which[l] };
+            }
+        }
+        for l in 0..LANES {
+            let stop = self.met.get(which[l] as usize).map(|m| m.stop(first + l as f64, q, best[l], forward));
+            places[l] = flats.place(stop, random[l]);
+        }
+    }
+
+    /// Calls `visit` with every reflecting front that line (p, q) meets, and whether it looks towards +τ.
+    pub(super) fn fronts(&self, p: f64, q: f64, mut visit: impl FnMut(Stop, bool)) {
+        for m in self.met.iter().filter(|m| m.reflects) {
+            if m.edges.iter().all(|e| at(e, p, q) >= -m.slack) {
+                visit(m.stop(p, q, at(&m.tau, p, q), m.front_plus), !m.front_plus);
+            }
+        }
+    }
+
+    /// The luminaires that cut line (p, q) between `from` and `to`, in order of τ: how each looks from before and behind.
+    pub(super) fn cuts(&self, p: f64, q: f64, from: f64, to: f64, out: &mut Vec<[Stop; 2]>) {
+        out.clear();
+        for m in self.met.iter().filter(|m| m.inside) {
+            let tau = at(&m.tau, p, q);
+            if tau > from + 1e-6 && tau < to - 1e-6 && m.edges.iter().all(|e| at(e, p, q) >= -m.slack) {
+                out.push([m.stop(p, q, tau, true), m.stop(p, q, tau, false)]);
+            }
+        }
+        out.sort_by(|a, b| a[0].tau.total_cmp(&b[0].tau));
+    }
+}
+
+impl Met {
+    #[inline]
+    #[allow(clippy::cast_possible_truncation, reason = "texture coordinates")]
+    fn stop(&self, p: f64, q: f64, tau: f64, forward: bool) -> Stop {
+        let front = self.front_plus == forward && self.reflects;
+        let uv = [0, 1].map(|a| at(&self.uv[a], p, q).clamp(0.0, 1.0) as f32);
+        Stop { tau, flat: front.then_some(self.number), uv }
+    }
+}
+
+/// Polygons that reach into the interior of Ω (by more than 1e-6 of a cell).
+pub(super) fn inside(scene: &Scene) -> Vec<bool> {
+    let far = scene.lattice().far();
+    scene
+        .polygons()
+        .iter()
+        .map(|p| {
+            let mut points: Vec<DVec3> = p.vertices().iter().map(|&x| scene.lattice().to_index(x)).collect();
+            for a in 0..3 {
+                for (sign, plane) in [(1.0, 1e-6), (-1.0, -(far[a] - 1e-6))] {
+                    let height = |x: DVec3| sign * x[a] - plane;
+                    let mut kept = Vec::new();
+                    for (i, &x) in points.iter().enumerate() {
+                        let y = points[(i + 1) % points.len()];
+                        let (hx, hy) = (height(x), height(y));
+                        if hx > 0.0 {
+                            kept.push(x);
+                        }
+                        if (hx > 0.0) != (hy > 0.0) {
+                            kept.push(x + (y - x) * (hx / (hx - hy)));
+                        }
+                    }
+                    points = kept;
+                }
+            }
+            points.len() >= 3
+        })
+        .collect()
+}
