@@ -86,9 +86,9 @@ pub struct SweptSide {
     pub side: Side,
     /// Irradiance E (world, not divided by π), straight from luminaires and from everything else.
     pub irradiance: Vec<[f32; 3]>,
-    /// Bound on the standard error of the luminance of the reflected radiance ρE/π, from the spread of the replicates, which do
-    /// better together: 1.5 to 2.5 times too large. Empty with fewer than 2. What the grid cannot hold between its nodes is not
-    /// part of it.
+    /// Standard error of the luminance of the reflected radiance ρE/π, from the spread of the replicates and how much better than
+    /// independent ones they are together (measured over all nodes; a bound unless they are 4, 8, 16 …). Empty with fewer than 2.
+    /// What the grid cannot hold between its nodes is not part of it.
     pub std_error: Vec<f32>,
 }
 
@@ -357,10 +357,9 @@ impl Run<'_> {
             let directions = directions.max(LEAST).min(s.directions);
             // Coarse passes share their directions: then nothing but bounces changes the mean from one to the next. What
             // counts are parts of one set, a part per replicate.
-            let replicates = s.replicates.max(1);
             let (set, part) = match () {
-                () if fixed => (bounce as u64, (state.done, replicates)),
-                () if late => ((LATE - now.late) as u64, (state.done, replicates)),
+                () if fixed => (bounce as u64, (state.done, s.replicates.max(1))),
+                () if late => ((LATE - now.late) as u64, (state.done, s.replicates.max(1))),
                 () => (1 << 32 | number, (0, 1)),
             };
             let lines = directions::lines(self.scene.lattice(), (s.seed, set), directions, part);

@@ -81,6 +81,7 @@ impl Shear {
 /// `directions`/2 lines, low-discrepancy and uniform over the projective sphere in **world** space, each family with its
 /// own lattice offset: a Fibonacci lattice of the hemisphere \[Marques13\], turned at random. Sets of different `index`
 /// are independent; the `parts` of one are interleaved, and together as well distributed as one set of that many more.
+/// The first 2, 4, 8 … parts of a power of two of them are evenly spread, too.
 #[allow(clippy::cast_possible_truncation, reason = "at most 2³¹ directions")]
 pub(super) fn lines(
     lattice: &Lattice,
@@ -94,9 +95,11 @@ pub(super) fn lines(
     let turn = rotation([rng.unit(), rng.unit(), rng.unit()]);
     let (shift, phase) = (rng.unit(), rng.unit());
     let (part, parts) = (part as u32, parts as u32);
+    // Bits reversed.
+    let place = if parts > 1 && parts.is_power_of_two() { part.reverse_bits() >> (32 - parts.ilog2()) } else { part };
     let mut all: Vec<Shear> = (0..count)
         .map(|n| {
-            let i = n * parts + part;
+            let i = n * parts + place;
             let z = (f64::from(i) + shift) / f64::from(count * parts);
             let phi = TAU * (f64::from(i) * GOLDEN_RATIO + phase).fract();
             let r = (1.0 - z * z).max(0.0).sqrt();
@@ -158,7 +161,9 @@ mod tests {
         };
         let (one, others) = (hole(&parts([7; 4])), hole(&parts([7, 8, 9, 10])));
         let whole = hole(&lines(&lattice, (1, 7), 512, (0, 1)));
-        println!("holes: a whole set {whole:.2}, four parts {one:.2}, parts of four sets {others:.2}");
-        assert!(one < 1.02 * whole && others > 1.2 * whole);
+        let first: Vec<Shear> = (0..2).flat_map(|part| lines(&lattice, (1, 7), 128, (part, 4))).collect();
+        let half = hole(&first);
+        println!("holes: a whole set {whole:.2}, four parts {one:.2}, two {half:.2}, parts of four sets {others:.2}");
+        assert!(one < 1.02 * whole && others > 1.2 * whole && half < 1.2 * whole);
     }
 }

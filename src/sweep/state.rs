@@ -5,7 +5,7 @@ use super::flats::Flats;
 use super::grid::Planes;
 use super::half::Half4;
 use super::monitor::Monitor;
-use super::totals::Totals;
+use super::totals::{STRIDE, Totals};
 use crate::flattened::Side;
 use crate::scene::Scene;
 
@@ -96,7 +96,7 @@ impl State {
         }
         if self.done > 0 {
             out.planes(&self.total.light);
-            self.total.spread.iter().for_each(|s| out.numbers(s));
+            self.total.spread.iter().chain(&self.total.parts).for_each(|s| out.numbers(s));
             self.flats.iter().flatten().for_each(|f| out.numbers(f));
         }
         out.count(usize::from(passes.is_some()));
@@ -124,7 +124,7 @@ impl State {
         let (state, passes) = self.parse(bytes, sides, flats)?;
         let stored = std::mem::replace(&mut self.total.light, state.total.light);
         debug_assert!(stored.is_empty(), "restored once, into a fresh state");
-        self.total.spread = state.total.spread;
+        (self.total.spread, self.total.parts) = (state.total.spread, state.total.parts);
         self.total.count = state.done as f32;
         (self.done, self.flats) = (state.done, state.flats);
         (self.bounces, self.residual, self.counts) = (state.bounces, state.residual, state.counts);
@@ -159,6 +159,9 @@ impl State {
             for spread in &mut state.total.spread {
                 *spread = from.numbers(nodes)?;
             }
+            let parts = if state.total.spread.is_empty() { 0 } else { state.done };
+            let each = state.total.spread.len() * nodes.div_ceil(STRIDE);
+            state.total.parts = (0..parts).map(|_| from.numbers(each)).collect::<Option<_>>()?;
             for (sum, texture) in state.flats.iter_mut().zip(&flats.textures) {
                 if let Some(t) = texture {
                     *sum = Some(from.numbers(t.radiance.len())?);
