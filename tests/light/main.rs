@@ -4,6 +4,7 @@ mod caps;
 mod closed_forms;
 mod colour;
 mod companions;
+mod crossings;
 mod context;
 mod invariance;
 mod photons;
