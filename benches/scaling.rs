@@ -4,7 +4,7 @@
 //! bake against the size of the lattice, and the exponents between sizes.
 
 use glam::Vec3;
-use isolume::bake::{BakeOptions, BakeSettings, Preset, bake};
+use isolume::bake::{BakeOptions, BakeSettings, Engine, Preset, bake};
 use isolume::checkpoint;
 use isolume::embree::{Device, GraphTracer, SurfaceTracer};
 use isolume::export::bake_file;
@@ -56,7 +56,7 @@ fn growth(sizes: &[usize]) {
         shadow_rays: Some(4),
         ..BakeOptions::default()
     };
-    let settings = BakeSettings::new(&few).expect("settings");
+    let settings = BakeSettings::with_engine(&few, Engine::Photon).expect("settings");
     let mut before: Option<(usize, [f64; 4])> = None;
     println!(
         "bumps, preview with 4 gather and 4 shadow rays; CPU seconds, exponent of the points since the size before"
@@ -155,7 +155,7 @@ fn main() {
         wall_resolution: Some(8),
         ..BakeOptions::default()
     };
-    let settings = BakeSettings::new(&few).expect("settings");
+    let settings = BakeSettings::new(&few, &scene).expect("settings");
     let baked = bake(&scene, &settings, &device, Progress::Quiet).expect("a bake");
     let folder = tempfile::tempdir().expect("a folder");
     let file = folder.path().join("a.vti");

@@ -231,10 +231,17 @@ pub fn bake_fields(
 /// # Errors
 /// `NotSupported` as [`sweep::supported`].
 pub fn supported(scene: &Scene, settings: &BakeSettings) -> Result<()> {
-    match (settings.engine, scene.policy()) {
-        (Engine::Photon, _) => Ok(()),
-        (Engine::Sweep, Policy::Joint) => sweep::supported(scene),
-        (Engine::Sweep, Policy::Independent) => (0..scene.fields()).try_for_each(|n| sweep::supported(&scene.lit(n))),
+    match settings.engine {
+        Engine::Photon => Ok(()),
+        Engine::Sweep => can_sweep(scene),
+    }
+}
+
+/// Whether sweeps can light the scene, all its fields.
+fn can_sweep(scene: &Scene) -> Result<()> {
+    match scene.policy() {
+        Policy::Joint => sweep::supported(scene),
+        Policy::Independent => (0..scene.fields()).try_for_each(|n| sweep::supported(&scene.lit(n))),
     }
 }
 

@@ -64,7 +64,7 @@ fn light(bakes: &[Bake]) -> (Vec<u64>, usize) {
 fn same_in_bands(name: &str, scene: &Scene, options: &BakeOptions) {
     let device = Device::new(1).unwrap();
     let baked = |bands: usize| {
-        let settings = BakeSettings::new(&BakeOptions { bands: Some(bands), ..options.clone() }).unwrap();
+        let settings = BakeSettings::new(&BakeOptions { bands: Some(bands), ..options.clone() }, scene).unwrap();
         let bakes = bake_fields(scene, &settings, &device, Progress::Quiet, None).unwrap();
         assert!(bakes.iter().all(|b| b.report.misses == 0), "{name}: every ray lands where the cache holds something");
         light(&bakes)
@@ -158,4 +158,21 @@ fn memory_that_is_allowed_decides_the_bands() {
     }
     let (code, text) = bake(&["--engine", "sweep", "--bands", "2"]);
     assert!(code == Some(2) && text.contains("bands") && text.lines().count() == 1, "{text}");
+
+    // Sweeps know no bands: too large for the memory, they leave the work to photons, unless they were asked for.
+    let dry = |more: &[&str]| {
+        run(&[&["bake", "b.vti", "-o", "o.vti", "--isovalues", "3.6", "95", "--preset", "preview", "--dry-run"], more]
+            .concat())
+    };
+    let needed = |more: &[&str]| {
+        let text = dry(more).1;
+        text.split("about ").nth(1).unwrap().split_whitespace().next().unwrap().parse::<f64>().unwrap()
+    };
+    let (sweep, photon) = (needed(&["--engine", "sweep"]), needed(&["--engine", "photon", "--bands", "64"]));
+    let limit = format!("{}", ((0.1 * sweep + 0.9 * photon) * 1e6) as u64);
+    let (code, text) = dry(&["--max-memory", &limit]);
+    assert!(code == Some(0) && text.contains("engine  photon") && text.contains("of isovalues"), "{text}");
+    let (code, text) = dry(&["--max-memory", "64G"]);
+    assert!(code == Some(0) && text.contains("engine  sweep"), "{text}");
+    assert_eq!(dry(&["--max-memory", &limit, "--engine", "sweep"]).0, Some(2));
 }

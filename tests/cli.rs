@@ -200,6 +200,43 @@ fn bad_input_is_one_clear_line_and_leaves_nothing() {
     refused(dir, &["bake", "s.toml", "-o", "out.vti"], &["s.toml:5", "albdo", "albedo"]);
 }
 
+/// Sweeps, unless the scene, an option or the user asks for photons; options of both need a word.
+#[test]
+fn scene_and_options_choose_the_engine() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "13", "-o", "b.nrrd", "--quiet"]);
+    fs::write(dir.join("needle.obj"), "v .4 .4 .4\nv .6 .4 .4\nv .4 .6 .4\nf 1 2 3\n").unwrap();
+    let volume = "isovalues = [10, 90]\n[volume]\nfile = \"b.nrrd\"\n";
+    fs::write(dir.join("plain.toml"), volume).unwrap();
+    fs::write(dir.join("needle.toml"), format!("{volume}[[context]]\nfile = \"needle.obj\"\n")).unwrap();
+    fs::write(dir.join("map.toml"), format!("{volume}[bake]\ngather = 0\n")).unwrap();
+    for (scene, more, engine) in [
+        ("plain.toml", &[][..], "sweep"),
+        ("plain.toml", &["--preset", "reference", "--grid", "2x"], "sweep"),
+        ("plain.toml", &["--directions", "64"], "sweep"),
+        ("plain.toml", &["--photons", "1000"], "photon"),
+        ("plain.toml", &["--strategy", "planes"], "photon"),
+        ("plain.toml", &["--engine", "photon"], "photon"),
+        ("plain.toml", &["--engine", "sweep", "--gather", "8"], "sweep"),
+        ("map.toml", &[], "photon"),
+        ("map.toml", &["--engine", "sweep"], "sweep"),
+        ("needle.toml", &[], "photon"),
+    ] {
+        let dry = ok(dir, &[&["bake", scene, "-o", "out.vti", "--dry-run"], more].concat());
+        let lines = text(&dry.stderr);
+        assert!(lines.contains(&format!("engine  {engine}")), "{scene} {more:?}: {lines}");
+    }
+    let both = ["bake", "map.toml", "-o", "out.vti", "--directions", "64"];
+    refused(dir, &both, &["gather", "directions", "photon engine", "sweep engine"]);
+    refused(dir, &["bake", "needle.toml", "-o", "out.vti", "--engine", "sweep"], &["needle", "--engine photon"]);
+    // A bake says what it was.
+    ok(dir, &["bake", "plain.toml", "-o", "out.vti", "--preset", "preview", "--report", "r.json", "--quiet"]);
+    let report: serde_json::Value = serde_json::from_slice(&fs::read(dir.join("r.json")).unwrap()).unwrap();
+    assert_eq!(report["settings"]["engine"], "sweep");
+    assert!(report["sweep_queries"].as_u64() > Some(50_000) && report["photons"]["emitted"] == 0, "{report}");
+}
+
 /// Two volumes: a file each and one that names them; every verb that should takes them.
 #[test]
 fn several_volumes_in_one_scene() {

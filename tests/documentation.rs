@@ -1,7 +1,7 @@
 //! The documents stay true: keys, defaults, names in the code, links, commands of the tutorial.
 
 use isolume::bake::{BakeOptions, BakeSettings, Preset};
-use isolume::scene_file::SceneFile;
+use isolume::scene_file::{SceneFile, SceneOptions, load};
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -93,10 +93,11 @@ fn the_defaults_of_bakes_are_the_described_ones() {
         }
         cell.parse().ok()
     };
+    let scene = load(&root().join("scenes/cornell-bumps.toml"), &SceneOptions::default()).unwrap().scene;
     let mut compared = 0;
     for (i, preset) in [Preset::Preview, Preset::Standard, Preset::Reference].into_iter().enumerate() {
         let options = BakeOptions { preset: Some(preset), ..BakeOptions::default() };
-        let settings = serde_json::to_value(BakeSettings::new(&options).unwrap()).unwrap();
+        let settings = serde_json::to_value(BakeSettings::new(&options, &scene).unwrap()).unwrap();
         for row in table(&text, "[bake]") {
             let key = quoted(row[0])[0].replace('-', "_");
             let key = if key == "gather" { "gather_rays" } else { &key };

@@ -189,7 +189,7 @@ fn an_extruded_field_looks_to_n_3_as_to_n_2() {
             wall_resolution: Some(64),
             ..BakeOptions::default()
         };
-        let mut settings = BakeSettings::new(&options).unwrap();
+        let mut settings = BakeSettings::new(&options, &scene).unwrap();
         (settings.wall_shadow_rays, settings.wall_isovalues, settings.cache_shadow_rays) = (4, 32, 16);
         let baked = bake(&scene, &settings, &device, Progress::Quiet).unwrap();
         let world = World::new(&device, flat, Transport::Flattened).unwrap();

@@ -120,7 +120,8 @@ fn init_writes_a_scene_whose_comments_are_the_defaults() {
     assert!(keys >= 14, "{keys} keys");
     fs::write(dir.join("all.toml"), opened.join("\n")).unwrap();
     let all = load(&dir.join("all.toml"), &SceneOptions::default()).unwrap();
-    assert_eq!(BakeSettings::new(&all.bake).unwrap(), BakeSettings::new(&SceneFile::default().bake).unwrap());
+    let settings = |options| BakeSettings::new(options, &all.scene).unwrap();
+    assert_eq!(settings(&all.bake), settings(&SceneFile::default().bake));
     assert_eq!((&all.scene.surface, all.scene.boundary), (&Surface::default(), loaded.scene.boundary));
     assert_eq!(all.scene.polygons(), loaded.scene.polygons());
 

@@ -1,9 +1,11 @@
 //! What a user may set about a bake, and the presets.
 
+use super::can_sweep;
 use crate::error::{Error, Result};
 use crate::illumination_grid::GridSize;
 use crate::photon_map::{EstimateSettings, Estimator, Normalisation};
 use crate::sampling::Strategy;
+use crate::scene::Scene;
 use crate::sweep::SweepSettings;
 use serde::{Deserialize, Serialize};
 
@@ -24,13 +26,12 @@ pub enum Preset {
 }
 
 /// How light is computed.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub enum Engine {
     /// Line sweeps: every grid point and every isovalue at once.
     Sweep,
     /// BB09's photons and final gather, by exact rays.
-    #[default]
     Photon,
 }
 
@@ -82,7 +83,7 @@ pub struct BakeOptions {
     /// Amount of work: preview (seconds), standard (minutes) or reference
     #[arg(long)]
     pub preset: Option<Preset>,
-    /// How light is computed
+    /// How light is computed (default: sweep, or photon for scenes that cannot be swept and with options that are its own)
     #[arg(long)]
     pub engine: Option<Engine>,
     /// Sweep engine: directions per pass and replicate (a power of two)
@@ -187,6 +188,51 @@ impl BakeOptions {
             bands: self.bands.or(other.bands),
         }
     }
+
+    /// The first option that is set and means nothing to sweeps, or little: they take a part of its rays where they end.
+    fn of_photons(&self) -> Option<&'static str> {
+        let own = [
+            ("photons", self.photons.is_some()),
+            ("bounces", self.bounces.is_some()),
+            ("estimator", self.estimator.is_some()),
+            ("photons-per-estimate", self.photons_per_estimate.is_some()),
+            ("tau", self.tau.is_some()),
+            ("samples", self.samples.is_some()),
+            ("strategy", self.strategy.is_some()),
+            ("shadow-rays", self.shadow_rays.is_some()),
+            ("gather", self.gather_rays.is_some()),
+            ("smoothing", self.smoothing.is_some()),
+            ("neighbours", self.neighbours.is_some()),
+            ("interpolation", self.interpolation.is_some()),
+            ("bands", self.bands.is_some()),
+        ];
+        own.into_iter().find(|(_, set)| *set).map(|(name, _)| name)
+    }
+
+    /// The first option that is set and means nothing to photons.
+    fn of_sweeps(&self) -> Option<&'static str> {
+        let own = [("directions", self.directions.is_some()), ("light-points", self.light_points.is_some())];
+        own.into_iter().find(|(_, set)| *set).map(|(name, _)| name)
+    }
+
+    /// Whether nothing that is set asks for one of the engines.
+    pub fn leaves_engine(&self) -> bool {
+        self.engine.is_none() && self.of_photons().or(self.of_sweeps()).is_none()
+    }
+
+    /// The engine for a scene: the one that is asked for; else sweeps, which are faster and err less, unless options that
+    /// only photons know are set or the scene cannot be swept.
+    fn engine(&self, scene: &Scene) -> Result<Engine> {
+        match (self.engine, self.of_photons(), self.of_sweeps()) {
+            (Some(engine), ..) => Ok(engine),
+            (None, Some(photons), Some(sweeps)) => Err(Error::Invalid(format!(
+                "{photons} is an option of the photon engine, {sweeps} of the sweep engine: say which with engine"
+            ))),
+            (None, Some(_), None) => Ok(Engine::Photon),
+            (None, None, Some(_)) => Ok(Engine::Sweep),
+            (None, None, None) => Ok(if can_sweep(scene).is_ok() { Engine::Sweep } else { Engine::Photon }),
+        }
+    }
 }
 
 /// A bake fully decided.
@@ -251,11 +297,19 @@ fn grid_size_text<S: serde::Serializer>(grid: &GridSize, s: S) -> std::result::R
 }
 
 impl BakeSettings {
-    /// The preset with the options that are set.
+    /// The preset with the options that are set, for a scene: it says whether it can be swept, which is the default.
+    ///
+    /// # Errors
+    /// `Invalid` for values out of range, and for options of both engines if neither is named; the message names the option.
+    pub fn new(o: &BakeOptions, scene: &Scene) -> Result<Self> {
+        Self::with_engine(o, o.engine(scene)?)
+    }
+
+    /// As [`BakeSettings::new`], for an engine that is decided.
     ///
     /// # Errors
     /// `Invalid` for values out of range; the message names the option.
-    pub fn new(o: &BakeOptions) -> Result<Self> {
+    pub fn with_engine(o: &BakeOptions, engine: Engine) -> Result<Self> {
         let preset = o.preset.unwrap_or_default();
         // photons, samples per point, shadow, gather, cache shadow, wall texels, wall isovalues, wall shadow
         let (photons, density, shadow, gather, cache, wall, isovalues, wall_shadow) = match preset {
@@ -274,7 +328,7 @@ impl BakeSettings {
         let per_estimate = if gather_rays == 0 && estimator == Estimator::Splat { 1000 } else { 64 };
         let settings = Self {
             preset,
-            engine: o.engine.unwrap_or_default(),
+            engine,
             directions: o.directions.unwrap_or(directions),
             light_points: o.light_points.unwrap_or(light_points),
             photons: o.photons.unwrap_or(photons),

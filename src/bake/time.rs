@@ -7,6 +7,7 @@ use crate::embree::{Device, GraphTracer, pyramids};
 use crate::error::Result;
 use crate::flat;
 use crate::flattened::Departure;
+use crate::illumination_grid::GridSize;
 use crate::mask::{Mask, masks};
 use crate::nearest::Neighbours;
 use crate::photon::{PhotonSettings, Photons, trace_photons};
@@ -16,6 +17,7 @@ use crate::radiance_cache::RadianceCache;
 use crate::rng::Stage;
 use crate::sampling::{Strategy, positions};
 use crate::scene::Scene;
+use crate::sweep::{self, SweepSettings};
 use rayon::prelude::*;
 use std::time::Instant;
 
@@ -23,7 +25,15 @@ use std::time::Instant;
 const PHOTONS: u64 = 1 << 15;
 const SAMPLES: u64 = 1 << 12;
 
-/// Estimated wall seconds of a bake by the photon engine, stage by stage, on as many threads as it will have.
+/// Sweeps are tried on a coarse copy of the field, with half the points along each edge or so many along the longest, walls
+/// likewise, and with the number of directions divided by each of these.
+const COARSE: usize = 32;
+const DIRECTIONS: [usize; 2] = [8, 4];
+
+/// A sweep's time grows as this power of the number of points: measured from 64³ to 256³, walls included.
+const GROWTH: f64 = 0.84;
+
+/// Estimated wall seconds of a bake, stage by stage, on as many threads as it will have.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TimeEstimate {
     /// Name and seconds of each stage.
@@ -32,15 +42,52 @@ pub struct TimeEstimate {
 
 impl TimeEstimate {
     /// Does a small part of each stage and scales it up: right within a factor of about 2 on a machine that stays as busy
-    /// as it is. Interpolation of scattered samples and export are left out. `None` for the sweep engine, whose passes
-    /// depend on how often light bounces.
+    /// as it is. Interpolation of scattered samples, rays beside the ends of a sweep and export are left out.
     ///
     /// # Errors
-    /// `Invalid` if the grid has too many points; `Embree`.
-    pub fn new(scene: &Scene, settings: &BakeSettings, device: &Device) -> Result<Option<Self>> {
-        if settings.engine == Engine::Sweep {
-            return Ok(None);
+    /// `Invalid` if the grid has too many points; `NotSupported` as [`sweep::sweep`]; `Embree`.
+    pub fn new(scene: &Scene, settings: &BakeSettings, device: &Device) -> Result<Self> {
+        match settings.engine {
+            Engine::Sweep => Self::of_sweeps(scene, settings),
+            Engine::Photon => Self::of_photons(scene, settings, device),
         }
+    }
+
+    fn of_sweeps(scene: &Scene, settings: &BakeSettings) -> Result<Self> {
+        let mut all = 0.0;
+        for number in 0..scene.fields() {
+            let lit = scene.lit(number);
+            let dims = lit.lattice().dims();
+            let shrink = (dims.into_iter().max().unwrap_or(1) as f64 / COARSE as f64).max(2.0);
+            #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a part of a length")]
+            let shrunk = |n: usize| ((n as f64 / shrink).round() as usize).max(2);
+            let points = dims.map(shrunk);
+            // So that a wall's share of the work stays what it is.
+            let walls = (shrunk(settings.wall_resolution), settings.wall_isovalues);
+            let coarse = lit.resampled(&GridSize::Points(points).lattice(lit.lattice())?);
+            let seconds = |part: usize| -> Result<f64> {
+                let few = SweepSettings {
+                    directions: (settings.directions / part).max(8),
+                    light_points: (settings.light_points / part).max(1),
+                    flat_resolution: walls,
+                    ..settings.sweep()
+                };
+                let begun = Instant::now();
+                sweep::sweep(&coarse, &few, &|_| true)?;
+                Ok(begun.elapsed().as_secs_f64())
+            };
+            // Some of the time is for directions, some is not.
+            let [few, more] = [seconds(DIRECTIONS[0])?, seconds(DIRECTIONS[1])?];
+            let part = |n: usize| 1.0 / n as f64;
+            let slope = (more - few).max(0.0) / (part(DIRECTIONS[1]) - part(DIRECTIONS[0]));
+            let grid = settings.grid.lattice(lit.lattice())?;
+            let larger = grid.len() as f64 / coarse.lattice().len() as f64;
+            all += (more + slope * (1.0 - part(DIRECTIONS[1]))) * larger.powf(GROWTH);
+        }
+        Ok(Self { stages: vec![("sweep", all)] })
+    }
+
+    fn of_photons(scene: &Scene, settings: &BakeSettings, device: &Device) -> Result<Self> {
         let pyramids = pyramids(scene);
         let tracer = GraphTracer::with_pyramids(device, scene, &pyramids)?;
         let count = settings.photons.min(PHOTONS);
@@ -57,7 +104,7 @@ impl TimeEstimate {
         }
         let texels = flat::texels(scene, settings.wall_resolution, settings.wall_isovalues);
         let walls = texels as f64 * f64::from(settings.wall_shadow_rays) * per_ray;
-        Ok(Some(Self { stages: vec![("photons", all), ("cache", cache + walls), ("samples", samples)] }))
+        Ok(Self { stages: vec![("photons", all), ("cache", cache + walls), ("samples", samples)] })
     }
 
     /// All stages together, seconds.

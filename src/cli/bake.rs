@@ -2,7 +2,7 @@
 
 use super::{device, expect_extension, writable};
 use crate::bake::{
-    BakeOptions, BakeReport, BakeSettings, MemoryEstimate, TimeEstimate, bake_fields, digest, job, supported,
+    BakeOptions, BakeReport, BakeSettings, Engine, MemoryEstimate, TimeEstimate, bake_fields, digest, job, supported,
 };
 use crate::checkpoint::Checkpoint;
 use crate::error::{Error, Result};
@@ -53,8 +53,8 @@ pub(super) struct Bake {
     /// Go on where an interrupted bake of the same settings stopped; from the beginning if there is no checkpoint
     #[arg(long)]
     resume: bool,
-    /// Cut the sweep into bands until the estimated memory is at most this, such as 8G or 500M; refuse a bake that still
-    /// needs more
+    /// The estimated memory is to be at most this, such as 8G or 500M: by the photon engine if sweeps need more, its isovalues
+    /// cut into bands; refuse a bake that still needs more
     #[arg(long, value_name = "BYTES", value_parser = bytes)]
     max_memory: Option<u64>,
     /// Print what memory and time it would take, check everything, and stop before the work
@@ -147,7 +147,8 @@ impl Bake {
             _ => {}
         }
         let volumes: Vec<&Volume> = [&loaded.volume].into_iter().chain(&loaded.companions).collect();
-        let mut settings = BakeSettings::new(&self.bake.clone().or(&loaded.bake))?;
+        let options = self.bake.clone().or(&loaded.bake);
+        let mut settings = BakeSettings::new(&options, &loaded.scene)?;
         let sweep = loaded.scene.field.sweep();
         supported(&loaded.scene, &settings).map_err(|e| e.in_file(&self.input))?;
         let members = loaded.scene.members();
@@ -172,23 +173,31 @@ impl Bake {
         let device = device()?;
         let memory = match self.max_memory {
             Some(most) => {
-                let (bands, estimate) = MemoryEstimate::within(most, &loaded.scene, &volumes, &settings, &device)?;
+                let fit = |s: &BakeSettings| MemoryEstimate::within(most, &loaded.scene, &volumes, s, &device);
+                let mut fitted = fit(&settings);
+                if fitted.is_err() && settings.engine == Engine::Sweep && options.leaves_engine() {
+                    settings = BakeSettings::with_engine(&options, Engine::Photon)?;
+                    fitted = fit(&settings);
+                }
+                let (bands, estimate) = fitted?;
                 settings.bands = bands;
                 estimate
             }
             None => MemoryEstimate::new(&loaded.scene, &volumes, &settings, &device)?,
         };
         if progress == Progress::Shown || self.dry_run {
+            let engine = match settings.engine {
+                Engine::Sweep => "sweep: every isovalue at once",
+                Engine::Photon => "photon: exact rays",
+            };
+            eprintln!("{:>14}  {engine}", "engine");
             eprintln!("{:>14}  {memory}", "memory");
             if settings.bands > 1 {
                 eprintln!("{:>14}  {} of isovalues, one after another", "bands", settings.bands);
             }
         }
         if self.dry_run {
-            match TimeEstimate::new(&loaded.scene, &settings, &device)? {
-                Some(time) => eprintln!("{:>14}  {time}", "time"),
-                None => eprintln!("{:>14}  not estimated for the sweep engine", "time"),
-            }
+            eprintln!("{:>14}  {}", "time", TimeEstimate::new(&loaded.scene, &settings, &device)?);
             return Ok(sweep);
         }
         let job = job(&loaded.scene, &settings);
@@ -240,15 +249,16 @@ impl Bake {
         // Fields that light each other share rays and counts.
         let runs = if scene.policy() == Policy::Joint { &reports[..1] } else { reports };
         let sum = |of: fn(&BakeReport) -> u64| runs.iter().map(of).sum::<u64>();
-        eprintln!(
-            "{:>14}  {:.2} s: {} rays ({:.1} M/s), {} photons stored, {} samples",
-            "total",
-            r.seconds.total,
-            sum(|r| r.rays),
-            r.rays_per_second / 1e6,
-            sum(|r| r.photons.stored),
-            sum(|r| r.samples)
-        );
+        let work = match r.settings.engine {
+            Engine::Sweep => format!("{} queries along lines, {} rays", sum(|r| r.sweep_queries), sum(|r| r.rays)),
+            Engine::Photon => format!(
+                "{} rays, {} photons stored, {} samples",
+                sum(|r| r.rays),
+                sum(|r| r.photons.stored),
+                sum(|r| r.samples)
+            ),
+        };
+        eprintln!("{:>14}  {:.2} s: {work} ({:.1} M/s)", "total", r.seconds.total, r.rays_per_second / 1e6);
         let each = |of: fn(&BakeReport) -> u64| reports.iter().map(of).sum::<u64>();
         eprintln!(
             "{:>14}  {} masked ({} filled), {} gather misses, {} without gradient, {} not finite",

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 Examples:
   isolume study flatland -o results
   isolume study strategies scenes/cornell-bumps.toml -o results --quick
-  isolume study curve scenes/cornell-bumps.toml -o results")]
+  isolume study curve scenes/cornell-bumps.toml -o results --limit 60")]
 pub(super) struct Study {
     #[command(subcommand)]
     what: What,
@@ -28,7 +28,7 @@ enum What {
     /// Error, interpolation floor and seconds of each data set
     Datasets(SceneStudy),
     /// Error against wall seconds over photons, samples and gather rays
-    Curve(SceneStudy),
+    Curve(Curve),
 }
 
 #[derive(clap::Args, Debug)]
@@ -73,6 +73,15 @@ struct SceneStudy {
     bake: BakeOptions,
 }
 
+#[derive(clap::Args, Debug)]
+struct Curve {
+    /// Leave out ways that are estimated to take longer for one bake
+    #[arg(long, value_name = "SECONDS")]
+    limit: Option<f64>,
+    #[command(flatten)]
+    study: SceneStudy,
+}
+
 /// Data sets of BB09's kinds by file name, with sweep and main isovalue.
 const DATA: [(&str, &str, [f64; 2], f64); 2] =
     [("brain", "ch2.nii.gz", [15.0, 200.0], 80.0), ("neuron", "neuron.mha", [20.0, 200.0], 60.0)];
@@ -82,7 +91,7 @@ impl Study {
         match self.what {
             What::Strategies(v) => v.run(study::strategies, progress),
             What::Datasets(v) => v.run(study::datasets, progress),
-            What::Curve(v) => v.run(study::curve, progress),
+            What::Curve(v) => v.study.run(|s, subjects, base| study::curve(s, subjects, base, v.limit), progress),
             What::Flatland(v) => {
                 super::folder(&v.output)?;
                 let settings = StudySettings { most: v.most, seed: v.seed, ..StudySettings::default() };
@@ -94,7 +103,11 @@ impl Study {
 
 impl SceneStudy {
     /// Loads the scenes and runs `table` on them.
-    fn run(self, table: fn(&study::Study, &[Subject], &BakeOptions) -> Result<()>, progress: Progress) -> Result<()> {
+    fn run(
+        &self,
+        table: impl Fn(&study::Study, &[Subject], &BakeOptions) -> Result<()>,
+        progress: Progress,
+    ) -> Result<()> {
         let mut subjects = Vec::new();
         for path in &self.scenes {
             let loaded = load(path, &SceneOptions::default())?;
@@ -113,7 +126,7 @@ impl SceneStudy {
         if subjects.is_empty() {
             return Err(Error::Invalid("--data: the folder holds neither ch2.nii.gz nor neuron.mha".into()));
         }
-        let study = study::Study::new(self.output, super::device()?, progress, self.quick)?;
+        let study = study::Study::new(self.output.clone(), super::device()?, progress, self.quick)?;
         table(&study, &subjects, &self.bake)
     }
 }

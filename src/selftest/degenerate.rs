@@ -210,7 +210,6 @@ fn numbers(bake: &Bake) -> impl Iterator<Item = f32> {
 
 fn judge(input: &Input, engine: Engine, device: &Device) -> Outcome {
     let options = BakeOptions {
-        engine: Some(engine),
         photons: Some(1 << 12),
         gather_rays: Some(8),
         shadow_rays: Some(8),
@@ -219,7 +218,7 @@ fn judge(input: &Input, engine: Engine, device: &Device) -> Outcome {
         wall_resolution: Some(8),
         ..BakeOptions::default()
     };
-    let settings = BakeSettings::new(&options).map_err(|e| e.to_string())?;
+    let settings = BakeSettings::with_engine(&options, engine).map_err(|e| e.to_string())?;
     let result = scene(input).and_then(|scene| bake(&scene, &settings, device, Progress::Quiet));
     let bake = match (result, &input.expect) {
         (Ok(bake), Expect::Refusal(_)) => return Err(format!("was baked: {} points", bake.lattice.len())),

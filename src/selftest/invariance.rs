@@ -250,7 +250,7 @@ fn baked(scene: &Scene, seed: u64, device: &Device) -> Result<Bake> {
         seed: Some(seed),
         ..BakeOptions::default()
     };
-    bake(scene, &BakeSettings::new(&options)?, device, Progress::Quiet)
+    bake(scene, &BakeSettings::new(&options, scene)?, device, Progress::Quiet)
 }
 
 /// Mean luminance of the valid nodes of each octant of the *world*.

@@ -1,7 +1,7 @@
 //! Error against wall seconds: how every change of speed or accuracy is judged.
 
 use super::{Effort, Study, Subject, Table, accuracy_of, provenance};
-use crate::bake::{BakeOptions, BakeSettings, Engine, StrategyName};
+use crate::bake::{BakeOptions, BakeSettings, Engine, StrategyName, TimeEstimate};
 use crate::error::Result;
 use crate::plot::{Plot, Series};
 
@@ -62,11 +62,12 @@ fn candidates(quick: bool) -> Vec<Candidate> {
     out
 }
 
-/// Bakes in many ways; the error is the RMS over five isovalues of the sweep.
+/// Bakes in many ways, those that are estimated to take at most `limit` wall seconds; the error is the RMS over five
+/// isovalues of the sweep.
 ///
 /// # Errors
 /// As bakes, references and tables.
-pub fn curve(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Result<()> {
+pub fn curve(study: &Study, subjects: &[Subject], base: &BakeOptions, limit: Option<f64>) -> Result<()> {
     let mut table = Table::open(study.folder.join("curve.csv"), &COLUMNS, 6)?;
     for subject in subjects {
         let fractions: &[f64] = if study.quick { &[0.475] } else { &[0.18, 0.344, 0.475, 0.617, 0.836] };
@@ -87,8 +88,16 @@ pub fn curve(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Result<
             if table.has(&key) {
                 continue;
             }
+            let settings = BakeSettings::new(&options.or(base), &subject.scene)?;
+            if let Some(limit) = limit {
+                let estimate = TimeEstimate::new(&subject.scene, &settings, &study.device)?.total();
+                if estimate > limit {
+                    study.say(&format!("{}: {}: left out, about {estimate:.0} s", subject.name, described(&key)));
+                    continue;
+                }
+            }
             study.say(&format!("{}: {}", subject.name, described(&key)));
-            let (bake, seconds) = study.bake(subject, &BakeSettings::new(&options.or(base))?)?;
+            let (bake, seconds) = study.bake(subject, &settings)?;
             let (mut sum, mut worst) = (0.0, 0f64);
             for r in &references {
                 let a = accuracy_of(&bake, r)?;
@@ -107,7 +116,8 @@ pub fn curve(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Result<
             table.push(row)?;
         }
     }
-    summarise(study, subjects, &table)
+    let left_out = limit.map_or(String::new(), |s| format!("Ways estimated at more than {s} s were left out.\n\n"));
+    summarise(study, subjects, &table, &left_out)
 }
 
 /// What a row is about, in words.
@@ -129,8 +139,8 @@ fn pareto(mut points: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
     points
 }
 
-fn summarise(study: &Study, subjects: &[Subject], table: &Table) -> Result<()> {
-    let mut notes = String::new();
+fn summarise(study: &Study, subjects: &[Subject], table: &Table, left_out: &str) -> Result<()> {
+    let mut notes = left_out.to_owned();
     for subject in subjects {
         let rows: Vec<&Vec<String>> = table.rows().iter().filter(|r| r[0] == subject.name).collect();
         let point = |r: &&Vec<String>| (table.number(r, "seconds"), table.number(r, "percent_rms"));

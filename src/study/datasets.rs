@@ -87,7 +87,7 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
             if table.has(&key(mode)) {
                 continue;
             }
-            let settings = BakeSettings::new(&options.clone().or(base))?;
+            let settings = BakeSettings::new(&options.clone().or(base), scene)?;
             let (bake, seconds) = study.bake(subject, &settings)?;
             let a = accuracy_of(&bake, &references)?;
             let s = bake.report.seconds;

@@ -2,7 +2,7 @@
 
 use super::figure6::figure6;
 use super::{Effort, Study, Subject, Table, accuracy_of, provenance};
-use crate::bake::{BakeOptions, BakeSettings, StrategyName};
+use crate::bake::{BakeOptions, BakeSettings, Engine, StrategyName};
 use crate::error::Result;
 use crate::illumination_grid::GridSize;
 use crate::mask::{Mask, masks};
@@ -56,12 +56,16 @@ fn measure(study: &Study, subjects: &[Subject], base: &BakeOptions, counts: &[u6
                     continue;
                 }
                 study.say(&format!("{}: {count} samples, {name}", subject.name));
-                let mut options =
-                    BakeOptions { samples: Some(count), strategy: Some(strategy), ..BakeOptions::default() };
+                let mut options = BakeOptions {
+                    engine: Some(Engine::Photon),
+                    samples: Some(count),
+                    strategy: Some(strategy),
+                    ..BakeOptions::default()
+                };
                 if strategy == StrategyName::Nodes {
                     options.grid = Some(grid_of(subject, count)?);
                 }
-                let (bake, seconds) = study.bake(subject, &BakeSettings::new(&options.or(base))?)?;
+                let (bake, seconds) = study.bake(subject, &BakeSettings::new(&options.or(base), &subject.scene)?)?;
                 for &c in &isovalues {
                     if table.has(&key(c)) {
                         continue;

@@ -1,7 +1,7 @@
 //! Scenes whose light is known, and the judges.
 
 use glam::{DVec3, Vec3};
-use isolume::bake::{Bake, BakeOptions, BakeSettings, StrategyName, bake};
+use isolume::bake::{Bake, BakeOptions, BakeSettings, Engine, StrategyName, bake};
 use isolume::embree::{Device, GraphTracer};
 use isolume::field::{Field, Sweep};
 use isolume::flattened::Side;
@@ -66,7 +66,8 @@ pub(crate) fn at_nodes(seed: u64) -> BakeSettings {
     BakeSettings {
         photons: 1 << 17,
         strategy: StrategyName::Nodes,
-        ..BakeSettings::new(&BakeOptions { seed: Some(seed), ..BakeOptions::default() }).unwrap()
+        ..BakeSettings::with_engine(&BakeOptions { seed: Some(seed), ..BakeOptions::default() }, Engine::Photon)
+            .unwrap()
     }
 }
 
