@@ -42,7 +42,8 @@ pub struct TimeEstimate {
 
 impl TimeEstimate {
     /// Does a small part of each stage and scales it up: right within a factor of about 2 on a machine that stays as busy
-    /// as it is. Interpolation of scattered samples, rays beside the ends of a sweep and export are left out.
+    /// as it is; of sweeps only the order of magnitude, since a coarse copy of a field bounces light otherwise. Interpolation of
+    /// scattered samples, rays beside the ends of a sweep and export are left out.
     ///
     /// # Errors
     /// `Invalid` if the grid has too many points; `NotSupported` as [`sweep::sweep`]; `Embree`.
