@@ -87,7 +87,7 @@ pub struct SweptSide {
     /// Irradiance E (world, not divided by π), straight from luminaires and from everything else.
     pub irradiance: Vec<[f32; 3]>,
     /// Standard error of the luminance of the reflected radiance ρE/π, from the spread of the replicates and how much better than
-    /// independent ones they are together (measured over all nodes; a bound unless they are 4, 8, 16 …). Empty with fewer than 2.
+    /// independent ones they are together (measured at one node in sixteen; a bound unless they are 4, 8, 16 …). Empty with fewer than 2.
     /// What the grid cannot hold between its nodes is not part of it.
     pub std_error: Vec<f32>,
 }

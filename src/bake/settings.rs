@@ -220,7 +220,7 @@ impl BakeOptions {
         self.engine.is_none() && self.of_photons().or(self.of_sweeps()).is_none()
     }
 
-    /// The engine for a scene: the one that is asked for; else sweeps, which are faster and err less, unless options that
+    /// The engine for a scene: the one that is asked for; else sweeps, which are faster for the same error, unless options that
     /// only photons know are set or the scene cannot be swept.
     fn engine(&self, scene: &Scene) -> Result<Engine> {
         match (self.engine, self.of_photons(), self.of_sweeps()) {

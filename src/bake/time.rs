@@ -26,9 +26,8 @@ const PHOTONS: u64 = 1 << 15;
 const SAMPLES: u64 = 1 << 12;
 
 /// Sweeps are tried on a coarse copy of the field, with half the points along each edge or so many along the longest, walls
-/// likewise, and with the number of directions divided by each of these.
+/// likewise, and with an eighth and a quarter of the directions.
 const COARSE: usize = 32;
-const DIRECTIONS: [usize; 2] = [8, 4];
 
 /// A sweep's time grows as this power of the number of points: measured from 64³ to 256³, walls included.
 const GROWTH: f64 = 0.84;
@@ -56,6 +55,8 @@ impl TimeEstimate {
 
     fn of_sweeps(scene: &Scene, settings: &BakeSettings) -> Result<Self> {
         let mut all = 0.0;
+        let all_directions = settings.directions;
+        let directions = [(all_directions / 8).max(8), (all_directions / 4).max(16).min(all_directions)];
         for number in 0..scene.fields() {
             let lit = scene.lit(number);
             let dims = lit.lattice().dims();
@@ -66,10 +67,10 @@ impl TimeEstimate {
             // So that a wall's share of the work stays what it is.
             let walls = (shrunk(settings.wall_resolution), settings.wall_isovalues);
             let coarse = lit.resampled(&GridSize::Points(points).lattice(lit.lattice())?);
-            let seconds = |part: usize| -> Result<f64> {
+            let seconds = |directions: usize| -> Result<f64> {
                 let few = SweepSettings {
-                    directions: (settings.directions / part).max(8),
-                    light_points: (settings.light_points / part).max(1),
+                    directions,
+                    light_points: (settings.light_points * directions / all_directions).max(1),
                     flat_resolution: walls,
                     ..settings.sweep()
                 };
@@ -78,12 +79,11 @@ impl TimeEstimate {
                 Ok(begun.elapsed().as_secs_f64())
             };
             // Some of the time is for directions, some is not.
-            let [few, more] = [seconds(DIRECTIONS[0])?, seconds(DIRECTIONS[1])?];
-            let part = |n: usize| 1.0 / n as f64;
-            let slope = (more - few).max(0.0) / (part(DIRECTIONS[1]) - part(DIRECTIONS[0]));
+            let [few, more] = [seconds(directions[0])?, seconds(directions[1])?];
+            let each = (more - few).max(0.0) / (directions[1] - directions[0]).max(1) as f64;
             let grid = settings.grid.lattice(lit.lattice())?;
             let larger = grid.len() as f64 / coarse.lattice().len() as f64;
-            all += (more + slope * (1.0 - part(DIRECTIONS[1]))) * larger.powf(GROWTH);
+            all += (more + each * (all_directions - directions[1]) as f64) * larger.powf(GROWTH);
         }
         Ok(Self { stages: vec![("sweep", all)] })
     }

@@ -95,7 +95,7 @@ pub(super) fn lines(
     let turn = rotation([rng.unit(), rng.unit(), rng.unit()]);
     let (shift, phase) = (rng.unit(), rng.unit());
     let (part, parts) = (part as u32, parts as u32);
-    // Bits reversed.
+    // Halves and quarters of a power of two, in the order in which they come, are every second and fourth direction.
     let place = if parts > 1 && parts.is_power_of_two() { part.reverse_bits() >> (32 - parts.ilog2()) } else { part };
     let mut all: Vec<Shear> = (0..count)
         .map(|n| {
