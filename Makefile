@@ -5,8 +5,11 @@
 # `make deps` writes third_party/env.sh only if libclang had to be unpacked there.
 CARGO = if [ -f third_party/env.sh ]; then . third_party/env.sh; fi; cargo
 
+# The profile that programs are built and run with.
+PROFILE ?= release
+
 all: deps
-	$(CARGO) build --release
+	$(CARGO) build --profile $(PROFILE)
 
 # Embree 4 and libclang: installed ones, or else fetched (see scripts/get-deps). EMBREE_DIR=... names your own Embree.
 deps:
@@ -14,10 +17,10 @@ deps:
 
 # A first picture: bakes the bumps scene and renders one isosurface of it.
 demo: deps
-	$(CARGO) build --release
+	$(CARGO) build --profile $(PROFILE)
 	@mkdir -p demo
-	$(CARGO) run --release --quiet -- bake scenes/cornell-bumps.toml -o demo/bumps.vti --preset preview
-	$(CARGO) run --release --quiet -- render demo/bumps.vti --isovalue 47 -o demo/bumps.png
+	$(CARGO) run --profile $(PROFILE) --quiet -- bake scenes/cornell-bumps.toml -o demo/bumps.vti --preset preview
+	$(CARGO) run --profile $(PROFILE) --quiet -- render demo/bumps.vti --isovalue 47 -o demo/bumps.png
 	@echo
 	@echo "demo/bumps.vti  the volume with its illumination, for every isovalue: open it in ParaView, or render it again:"
 	@echo "                cargo run --release -- render demo/bumps.vti --isovalue 60 -o demo/other.png"

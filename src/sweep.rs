@@ -135,6 +135,10 @@ const LEAST: usize = 16;
 /// Passes after the light has settled, each with twice the directions of the one before. The last one counts: one set of
 /// twice the directions errs less than the mean of two.
 const LATE: usize = 2;
+/// Coarse passes until light has settled, as a rule; only estimates of time rely on it.
+const SETTLING: usize = 6;
+/// The share of a replicate's progress that is direct light.
+pub(crate) const DIRECT_SHARE: f64 = 0.2;
 
 /// Whether sweeps can light a scene.
 ///
@@ -238,6 +242,24 @@ pub(crate) fn swept_sides(scene: &Scene) -> Vec<Side> {
     sides
 }
 
+impl SweepSettings {
+    /// Directions of all passes together, if light settles as fast as it does as a rule.
+    pub(crate) fn expected_directions(&self) -> usize {
+        let replicates = self.replicates.max(1);
+        if !self.settles() {
+            return replicates * self.max_bounces * self.directions;
+        }
+        let coarse = (self.directions / COARSE).max(LEAST).min(self.directions);
+        let late = (0..LATE).map(|n| self.directions >> n).sum::<usize>();
+        SETTLING * coarse + late + (replicates - 1) * self.directions
+    }
+
+    /// Whether bounces go on until what is left out is small, not to a small number.
+    fn settles(&self) -> bool {
+        self.max_bounces >= 6
+    }
+}
+
 /// What the replicates of one sweep share.
 struct Run<'a> {
     scene: &'a Scene,
@@ -267,7 +289,7 @@ impl Run<'_> {
         let mut step = 0;
         let mut ask = || {
             step += 1;
-            progress(0.2 * f64::from(step) / lights as f64)
+            progress(DIRECT_SHARE * f64::from(step) / lights as f64)
         };
         let number = state.done as u64;
         let (direct, complete) = direct::direct(
@@ -300,12 +322,7 @@ impl Run<'_> {
     /// it needs. What replicates share in this way are the bounces before their last, which the last one averages over the
     /// sphere.
     fn warm(&self, state: &State) -> bool {
-        state.done > 0 && self.settles() && state.total.sides().len() == self.sides.len()
-    }
-
-    /// Whether bounces go on until what is left out is small, not to a small number.
-    fn settles(&self) -> bool {
-        self.settings.max_bounces >= 6
+        state.done > 0 && self.settings.settles() && state.total.sides().len() == self.sides.len()
     }
 
     /// Direct light, then bounces: coarse passes until the tail is predictable and small, then finer ones.
@@ -341,7 +358,7 @@ impl Run<'_> {
             isa: self.isa,
             workspaces: Mutex::default(),
         };
-        let fixed = !self.settles();
+        let fixed = !self.settings.settles();
         while now.bounce < s.max_bounces {
             if self.saved.due() {
                 self.saved.save(0, || state.bytes(Some((&now, flats))));
@@ -369,7 +386,8 @@ impl Run<'_> {
             let total = lines.len() * self.sides.len();
             let mut ask = || {
                 family += 1;
-                progress(0.2 + 0.8 * (bounce as f64 - 1.0 + f64::from(family) / total as f64) / (bounce as f64 + more))
+                let passes = bounce as f64 - 1.0 + f64::from(family) / total as f64;
+                progress(DIRECT_SHARE + (1.0 - DIRECT_SHARE) * passes / (bounce as f64 + more))
             };
             let mut stopped = false;
             for (&side, b) in self.sides.iter().zip(&now.b) {

@@ -19,18 +19,19 @@ use crate::sampling::{Strategy, positions};
 use crate::scene::Scene;
 use crate::sweep::{self, SweepSettings};
 use rayon::prelude::*;
+use std::sync::Mutex;
 use std::time::Instant;
 
 /// Photons and samples tried: a second or so.
 const PHOTONS: u64 = 1 << 15;
 const SAMPLES: u64 = 1 << 12;
 
-/// Sweeps are tried on a coarse copy of the field, with half the points along each edge or so many along the longest, walls
-/// likewise, and with an eighth and a quarter of the directions.
-const COARSE: usize = 32;
+/// Directions and points of each luminaire that a sweep is tried with.
+const DIRECTIONS: usize = 16;
+const LIGHT_POINTS: usize = 4;
 
-/// A sweep's time grows as this power of the number of points: measured from 64³ to 256³, walls included.
-const GROWTH: f64 = 0.84;
+/// Lattices of more points than this are tried on a coarse copy of the field.
+const MOST_POINTS: f64 = (1u64 << 21) as f64;
 
 /// Estimated wall seconds of a bake, stage by stage, on as many threads as it will have.
 #[derive(Clone, Debug, PartialEq)]
@@ -41,8 +42,8 @@ pub struct TimeEstimate {
 
 impl TimeEstimate {
     /// Does a small part of each stage and scales it up: right within a factor of about 2 on a machine that stays as busy
-    /// as it is; of sweeps only the order of magnitude, since a coarse copy of a field bounces light otherwise. Interpolation of
-    /// scattered samples, rays beside the ends of a sweep and export are left out.
+    /// as it is, if light settles after as many bounces of a sweep as it does as a rule. Interpolation of scattered samples,
+    /// rays beside the ends of a sweep and export are left out.
     ///
     /// # Errors
     /// `Invalid` if the grid has too many points; `NotSupported` as [`sweep::sweep`]; `Embree`.
@@ -55,35 +56,24 @@ impl TimeEstimate {
 
     fn of_sweeps(scene: &Scene, settings: &BakeSettings) -> Result<Self> {
         let mut all = 0.0;
-        let all_directions = settings.directions;
-        let directions = [(all_directions / 8).max(8), (all_directions / 4).max(16).min(all_directions)];
         for number in 0..scene.fields() {
             let lit = scene.lit(number);
-            let dims = lit.lattice().dims();
-            let shrink = (dims.into_iter().max().unwrap_or(1) as f64 / COARSE as f64).max(2.0);
+            let grid = settings.grid.lattice(lit.lattice())?;
+            let shrink = (grid.len() as f64 / MOST_POINTS).cbrt().max(1.0);
             #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a part of a length")]
             let shrunk = |n: usize| ((n as f64 / shrink).round() as usize).max(2);
-            let points = dims.map(shrunk);
-            // So that a wall's share of the work stays what it is.
-            let walls = (shrunk(settings.wall_resolution), settings.wall_isovalues);
-            let coarse = lit.resampled(&GridSize::Points(points).lattice(lit.lattice())?);
-            let seconds = |directions: usize| -> Result<f64> {
-                let few = SweepSettings {
-                    directions,
-                    light_points: (settings.light_points * directions / all_directions).max(1),
-                    flat_resolution: walls,
-                    ..settings.sweep()
-                };
-                let begun = Instant::now();
-                sweep::sweep(&coarse, &few, &|_| true)?;
-                Ok(begun.elapsed().as_secs_f64())
+            let tried = GridSize::Points(grid.dims().map(shrunk)).lattice(&grid)?;
+            let pilot = SweepSettings {
+                directions: settings.directions.min(DIRECTIONS),
+                light_points: settings.light_points.min(LIGHT_POINTS),
+                max_bounces: settings.sweep().max_bounces.min(1),
+                replicates: 1,
+                // So that a wall's share of the work stays what it is.
+                flat_resolution: (shrunk(settings.wall_resolution), settings.wall_isovalues),
+                ..settings.sweep()
             };
-            // Some of the time is for directions, some is not.
-            let [few, more] = [seconds(directions[0])?, seconds(directions[1])?];
-            let each = (more - few).max(0.0) / (directions[1] - directions[0]).max(1) as f64;
-            let grid = settings.grid.lattice(lit.lattice())?;
-            let larger = grid.len() as f64 / coarse.lattice().len() as f64;
-            all += (more + each * (all_directions - directions[1]) as f64) * larger.powf(GROWTH);
+            let seconds = sweep_seconds(&lit.resampled(&tried), &pilot, &settings.sweep())?;
+            all += seconds * grid.len() as f64 / tried.len() as f64;
         }
         Ok(Self { stages: vec![("sweep", all)] })
     }
@@ -112,6 +102,31 @@ impl TimeEstimate {
     pub fn total(&self) -> f64 {
         self.stages.iter().map(|s| s.1).sum()
     }
+}
+
+/// Estimated seconds of a sweep, of which `pilot` does a small part.
+fn sweep_seconds(scene: &Scene, pilot: &SweepSettings, settings: &SweepSettings) -> Result<f64> {
+    let begun = Instant::now();
+    // Ends of the first and the last luminaire point.
+    let direct = Mutex::new(Vec::new());
+    sweep::sweep(scene, pilot, &|fraction| {
+        if fraction <= sweep::DIRECT_SHARE
+            && let Ok(mut ends) = direct.lock()
+        {
+            ends.push(begun.elapsed().as_secs_f64());
+        }
+        true
+    })?;
+    let end = begun.elapsed().as_secs_f64();
+    let ends = direct.into_inner().unwrap_or_default();
+    let [first, last] = [ends.first(), ends.last()].map(|e| e.copied().unwrap_or(0.0));
+    // Reading the field comes before the first point, once.
+    let per_point = if ends.len() > 1 { (last - first) / (ends.len() - 1) as f64 } else { first };
+    let points = settings.light_points * ends.len() / pilot.light_points.max(1);
+    let per_direction = (end - last) / pilot.directions.max(1) as f64;
+    let replicates = settings.replicates.max(1) as f64;
+    let bounces = if pilot.max_bounces > 0 { settings.expected_directions() as f64 * per_direction } else { 0.0 };
+    Ok((first - per_point).max(0.0) + replicates * points as f64 * per_point + bounces)
 }
 
 /// Estimated seconds of the cache's nodes and of the samples of the scene's own field, and seconds per ray.

@@ -5,13 +5,14 @@ use crate::bake::{BakeOptions, BakeSettings, Engine, StrategyName, TimeEstimate}
 use crate::error::Result;
 use crate::plot::{Plot, Series};
 
-const COLUMNS: [&str; 11] = [
+const COLUMNS: [&str; 12] = [
     "scene",
     "way",
     "photons",
     "samples",
     "gather",
     "directions",
+    "light_points",
     "percent_rms",
     "worst",
     "seconds",
@@ -26,12 +27,14 @@ struct Candidate {
     options: BakeOptions,
 }
 
-/// The photon engine over photons × samples × gather rays × strategy, and the sweep engine over directions.
+/// The photon engine over photons × samples × gather rays × strategy, and the sweep engine over directions × luminaire points.
 fn candidates(quick: bool) -> Vec<Candidate> {
-    let photons: &[u64] = if quick { &[1 << 17, 1 << 19] } else { &[1 << 18, 1 << 20, 1 << 22] };
-    let samples: &[u64] = if quick { &[10_000, 100_000] } else { &[10_000, 100_000, 1_000_000] };
-    let gathers: &[u32] = if quick { &[0, 16] } else { &[0, 16, 64, 256] };
-    let directions: &[usize] = if quick { &[32, 64] } else { &[32, 64, 128, 256, 512] };
+    let photons: &[u64] = if quick { &[1 << 17, 1 << 19] } else { &[1 << 17, 1 << 19, 1 << 21] };
+    let samples: &[u64] = if quick { &[10_000, 100_000] } else { &[100_000, 1_000_000] };
+    let gathers: &[u32] = if quick { &[0, 16] } else { &[0, 16, 64] };
+    // Directions, and points of each luminaire.
+    let sweeps: &[[usize; 2]] =
+        if quick { &[[32, 8], [64, 16]] } else { &[[32, 8], [64, 16], [64, 32], [128, 32], [128, 64], [256, 64]] };
     let mut out = Vec::new();
     for &photons in photons {
         for &gather in gathers {
@@ -50,11 +53,11 @@ fn candidates(quick: bool) -> Vec<Candidate> {
             }
         }
     }
-    for &directions in directions {
+    for &[directions, light_points] in sweeps {
         let options = BakeOptions {
             engine: Some(Engine::Sweep),
             directions: Some(directions),
-            light_points: Some(directions / 4),
+            light_points: Some(light_points),
             ..BakeOptions::default()
         };
         out.push(Candidate { name: "sweep", options });
@@ -68,7 +71,7 @@ fn candidates(quick: bool) -> Vec<Candidate> {
 /// # Errors
 /// As bakes, references and tables.
 pub fn curve(study: &Study, subjects: &[Subject], base: &BakeOptions, limit: Option<f64>) -> Result<()> {
-    let mut table = Table::open(study.folder.join("curve.csv"), &COLUMNS, 6)?;
+    let mut table = Table::open(study.folder.join("curve.csv"), &COLUMNS, 7)?;
     for subject in subjects {
         let fractions: &[f64] = if study.quick { &[0.475] } else { &[0.18, 0.344, 0.475, 0.617, 0.836] };
         let mut references = Vec::new();
@@ -84,6 +87,7 @@ pub fn curve(study: &Study, subjects: &[Subject], base: &BakeOptions, limit: Opt
                 number(options.samples),
                 number(options.gather_rays.map(u64::from)),
                 number(options.directions.map(|n| n as u64)),
+                number(options.light_points.map(|n| n as u64)),
             ];
             if table.has(&key) {
                 continue;
@@ -122,8 +126,8 @@ pub fn curve(study: &Study, subjects: &[Subject], base: &BakeOptions, limit: Opt
 
 /// What a row is about, in words.
 fn described(row: &[String]) -> String {
-    let units = ["photons", "samples", "gather rays", "directions"];
-    let set = row[2..6].iter().zip(units).filter(|(n, _)| *n != "-").map(|(n, unit)| format!(", {n} {unit}"));
+    let units = ["photons", "samples", "gather rays", "directions", "light points"];
+    let set = row[2..7].iter().zip(units).filter(|(n, _)| *n != "-").map(|(n, unit)| format!(", {n} {unit}"));
     set.fold(row[1].clone(), |text, part| text + &part)
 }
 
