@@ -5,22 +5,21 @@
 # `make deps` writes third_party/env.sh only if libclang had to be unpacked there.
 CARGO = if [ -f third_party/env.sh ]; then . third_party/env.sh; fi; cargo
 
-# The profile that programs are built and run with.
-PROFILE ?= release
+# The program that errands run: built here, unless ISOLUME names one.
+PROGRAM = $(or $(ISOLUME),$${CARGO_TARGET_DIR:-target}/release/isolume)
 
 all: deps
-	$(CARGO) build --profile $(PROFILE)
+	$(if $(ISOLUME),,$(CARGO) build --release)
 
 # Embree 4 and libclang: installed ones, or else fetched (see scripts/get-deps). EMBREE_DIR=... names your own Embree.
 deps:
 	@scripts/get-deps
 
 # A first picture: bakes the bumps scene and renders one isosurface of it.
-demo: deps
-	$(CARGO) build --profile $(PROFILE)
+demo: all
 	@mkdir -p demo
-	$(CARGO) run --profile $(PROFILE) --quiet -- bake scenes/cornell-bumps.toml -o demo/bumps.vti --preset preview
-	$(CARGO) run --profile $(PROFILE) --quiet -- render demo/bumps.vti --isovalue 47 -o demo/bumps.png
+	$(PROGRAM) bake scenes/cornell-bumps.toml -o demo/bumps.vti --preset preview
+	$(PROGRAM) render demo/bumps.vti --isovalue 47 -o demo/bumps.png
 	@echo
 	@echo "demo/bumps.vti  the volume with its illumination, for every isovalue: open it in ParaView, or render it again:"
 	@echo "                cargo run --release -- render demo/bumps.vti --isovalue 60 -o demo/other.png"
@@ -28,8 +27,7 @@ demo: deps
 
 # The paper's figures and more, into docs/gallery: some minutes. DATA=folder adds ch2.nii.gz (brain) and neuron.mha; QUALITY=full
 # takes standard bakes and larger pictures instead of previews.
-gallery: deps
-	$(CARGO) build --release
+gallery: all
 	scripts/gallery $(PROGRAM) docs/gallery --work demo/gallery $(if $(DATA),--data $(DATA)) $(if $(QUALITY),--$(QUALITY))
 
 test: deps
@@ -43,9 +41,7 @@ check: deps
 
 # Every reader and writer against the tools people use (PyPI, pinned), the recipes, and radiance against Mitsuba 3. PEERS_DATA=folder adds its volumes.
 PEERS = third_party/peers
-PROGRAM = $${CARGO_TARGET_DIR:-target}/release/isolume
-peers: deps $(PEERS)/installed
-	$(CARGO) build --release
+peers: all $(PEERS)/installed
 	$(PEERS)/bin/python scripts/peers/formats.py $(PROGRAM) $(PEERS_DATA)
 	$(PEERS)/bin/python scripts/peers/recipes.py $(PROGRAM) docs/recipes.md
 	$(PEERS)/bin/python scripts/peers/mitsuba3.py $(PROGRAM) $(PEERS)/mitsuba3

@@ -9,8 +9,6 @@ fn every_command_of_the_readme_runs() {
     let readme = std::fs::read_to_string(root.join("README.md")).unwrap();
     let dir = tempfile::tempdir().unwrap();
     let binary = Path::new(env!("CARGO_BIN_EXE_isolume")).parent().unwrap();
-    // `make` builds what the tests were built from: another profile would compile everything once more.
-    let profile = if cfg!(debug_assertions) { "dev" } else { "release" };
     let path = std::env::var_os("PATH").unwrap_or_default();
     let path = std::env::join_paths(std::iter::once(binary.to_path_buf()).chain(std::env::split_paths(&path))).unwrap();
     let mut ran = 0;
@@ -22,7 +20,9 @@ fn every_command_of_the_readme_runs() {
             // Commands about the checkout run in it, the tutorial's in a folder of its own.
             let folder = if command.starts_with("make") { root } else { dir.path() };
             let mut shell = Command::new("sh");
-            shell.arg("-c").arg(command).current_dir(folder).env("PATH", &path).env("PROFILE", profile);
+            shell.arg("-c").arg(command).current_dir(folder).env("PATH", &path);
+            // Errands of `make` take this program: the release profile would compile everything once more.
+            shell.env("ISOLUME", env!("CARGO_BIN_EXE_isolume"));
             let output = shell.output().unwrap();
             assert!(output.status.success(), "{command}: {}", String::from_utf8_lossy(&output.stderr));
             ran += 1;
