@@ -396,6 +396,8 @@ impl Run<'_> {
                 indirect.push(e);
             }
             if stopped {
+                // Half a pass is not kept, and may be as large as what is.
+                indirect.clear();
                 self.saved.save(0, || state.bytes(Some((&now, flats))));
                 state.see(&now);
                 return ([now.direct, Vec::new()], false);

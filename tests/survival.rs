@@ -265,11 +265,10 @@ fn the_memory_estimate_is_near_the_peak() {
         ("33", &["--photons", "1000000"][..], 0.5..1.3),
         ("101", &["--photons", "200000"], 0.5..1.3),
         ("101", &["--photons", "200000", "--bands", "16", "--sides=both"], 0.5..1.3),
-        // A checkpoint between the passes of a later replicate is the worst moment, and a slow disk may have none due then:
-        // it holds a third of what a sweep takes.
-        ("64", &sweep, 0.6..1.1),
-        ("101", &sweep, 0.6..1.1),
-        ("101", &both, 0.6..1.1),
+        // What a checkpoint holds is part of it.
+        ("64", &sweep, 0.7..1.3),
+        ("101", &sweep, 0.7..1.3),
+        ("101", &both, 0.7..1.3),
     ] {
         volume(dir, size);
         let (peak, estimate) = memory(dir, &[&few[..], more].concat());

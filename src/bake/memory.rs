@@ -41,10 +41,10 @@ const WISH: u64 = 24;
 const SORTED: u64 = 40 + 40 + 12;
 
 /// Bytes of the sweep engine per grid point (normals in two orders, h in the second, what direct light sees), per point and
-/// swept side (direct and incoming light, one plane of it turned over, what lines read), and per point and stored side (sums
-/// over replicates and their spread).
+/// swept side (direct light, what lines read, one plane of a pass turned over), and per point and stored side (sums over
+/// replicates and their spread). What a pass gathers is less than its checkpoint, and gone when that is made.
 const SWEPT: u64 = 24;
-const SWEPT_SIDE: u64 = 36;
+const SWEPT_SIDE: u64 = 24;
 const SUMMED_SIDE: u64 = 16;
 
 /// Bytes per point and side that its checkpoint holds while a replicate is under way, besides the sums.
