@@ -1,8 +1,12 @@
-//! Gather rays of the sweep engine (RGB lookup, cosine and accumulation included) against Embree's rays on the triangles
-//! of one extracted isosurface; per CPU second, interleaved in one run.
+//! Gather rays of the sweep engine (RGB lookup, cosine, accumulation and walls included) against Embree's rays on the
+//! triangles of one extracted isosurface; per CPU second, medians of interleaved repetitions of one run.
+//!
+//! `cargo bench --bench sweep [-- --full] [--data DIR]`. "bumps" leaves two thirds of its nodes outside the sweep, "foam"
+//! (300 blobs, every node in the sweep) none. DIR holds pasta-proton.vti, fluid.vti, neuron.mha, ch2.nii.gz; files that are
+//! not there are left out. `--full` adds the growth with the lattice.
 
 use glam::{DVec3, Vec3};
-use isolume::embree::{Device, Ray, RayHit, SceneBuilder};
+use isolume::embree::{Device, Ray, RayHit, Scene as Bvh, SceneBuilder};
 use isolume::field::{Field, Sweep};
 use isolume::isosurface::extract;
 use isolume::progress::processor_seconds;
@@ -10,104 +14,167 @@ use isolume::rng::{Rng, Stage};
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
 use isolume::sweep::{SweepSettings, sweep};
 use isolume::volume::generate::Generator;
+use isolume::volume::{Lattice, Samples, Volume};
 use isolume::warp::{Frame, cosine_hemisphere};
 use rayon::prelude::*;
+use std::path::Path;
 use std::time::Instant;
 
-fn bumps(n: usize) -> Scene {
-    let volume = Generator::from_name("bumps").and_then(|g| g.sample([n; 3])).expect("a volume");
-    let field = Field::new(&volume, Sweep::new(3.6, 95.0).expect("a sweep")).expect("a field");
+/// Interleaved repetitions, of which medians are taken.
+const REPEATS: usize = 7;
+
+/// Real volumes, their sweeps, and the isovalue of the extracted mesh.
+const DATA: [(&str, [f64; 2], f64); 4] = [
+    ("pasta-proton.vti", [0.01, 0.05], 0.029),
+    ("fluid.vti", [0.1, 0.6], 0.3375),
+    ("neuron.mha", [20.0, 200.0], 60.0),
+    ("ch2.nii.gz", [15.0, 200.0], 80.0),
+];
+
+fn scene_of(volume: &Volume, [lo, hi]: [f64; 2]) -> Scene {
+    let field = Field::new(volume, Sweep::new(lo, hi).expect("a sweep")).expect("a field");
     let walls = cornell_box(field.lattice(), 0.0).expect("a box");
     Scene::new(field, Surface::default(), Boundary::Open, walls).expect("a scene")
 }
 
-/// Cosine-distributed rays off the isosurface of the middle isovalue, in random order.
-fn bounces(scene: &Scene, count: usize) -> (Vec<[f32; 3]>, Vec<[u32; 3]>, Vec<Ray>) {
-    let surface = extract(scene.lattice().dims(), scene.field.samples(), 0.4).expect("a mesh");
-    let vertices: Vec<[f32; 3]> = surface.vertices.iter().map(|p| p.as_vec3().to_array()).collect();
+fn bumps(n: usize) -> Scene {
+    let volume = Generator::from_name("bumps").and_then(|g| g.sample([n; 3])).expect("a volume");
+    scene_of(&volume, [3.6, 95.0])
+}
+
+/// A sum of Gaussian blobs all over, with a sweep that no node is outside of.
+fn foam(n: usize) -> Scene {
+    let lattice = Lattice::aligned([n; 3], DVec3::ZERO, DVec3::splat(1.0 / (n - 1) as f64)).expect("a lattice");
+    let mut rng = Rng::stream(3, Stage::Test, 0);
+    let blobs: Vec<DVec3> = (0..300).map(|_| DVec3::new(rng.unit(), rng.unit(), rng.unit())).collect();
+    let samples: Vec<f32> = (0..lattice.len())
+        .into_par_iter()
+        .map(|at| {
+            let [i, j, k] = lattice.ijk(at);
+            let x = lattice.to_world(DVec3::new(i as f64, j as f64, k as f64));
+            let blob = |m: &DVec3| (-(x - *m).length_squared() / (2.0 * 0.045 * 0.045)).exp();
+            blobs.iter().map(blob).sum::<f64>() as f32
+        })
+        .collect();
+    let range = samples.iter().fold([f32::INFINITY, 0.0], |[lo, hi]: [f32; 2], &h| [lo.min(h), hi.max(h)]);
+    let volume = Volume::new("foam", lattice, Samples::F32(samples)).expect("a volume");
+    scene_of(&volume, range.map(f64::from))
+}
+
+/// Cosine-distributed rays off the isosurface at unit isovalue `c`, in random order, and its mesh in Embree.
+fn bounces<'d>(device: &'d Device, scene: &Scene, c: f32, count: usize) -> (Bvh<'d>, usize, Vec<Ray>) {
+    let surface = extract(scene.lattice().dims(), scene.field.samples(), c).expect("a mesh");
+    let place = |p: DVec3| scene.lattice().to_world(p).as_vec3();
+    let vertices: Vec<[f32; 3]> = surface.vertices.iter().map(|&p| place(p).to_array()).collect();
+    let step = 1e-2 * scene.lattice().spacing().min_element() as f32;
     let mut rng = Rng::stream(1, Stage::Test, 0);
     let rays = (0..count)
         .map(|_| {
-            let p = Vec3::from_array(vertices[(rng.unit() * vertices.len() as f64) as usize]);
-            let n = scene.field.falling_normal(p.as_dvec3()).unwrap_or(DVec3::Z);
+            let at = (rng.unit() * vertices.len() as f64) as usize;
+            let n = scene.field.falling_normal(surface.vertices[at]).unwrap_or(DVec3::Z);
             let d = Frame::new(n).to_world(cosine_hemisphere(rng.unit2())).as_vec3();
-            Ray::new((p + 1e-2 * n.as_vec3()).to_array(), d.to_array(), 0.0, f32::INFINITY)
+            Ray::new((Vec3::from_array(vertices[at]) + step * n.as_vec3()).to_array(), d.to_array(), 0.0, f32::INFINITY)
         })
         .collect();
-    (vertices, surface.triangles.clone(), rays)
+    let mut builder = SceneBuilder::new(device).expect("a scene");
+    builder.triangles(&vertices, &surface.triangles, u32::MAX).expect("triangles");
+    (builder.commit().expect("a built scene"), surface.triangles.len(), rays)
+}
+
+/// Triangle rays per CPU second.
+fn triangle_rate(mesh: &Bvh, rays: &[Ray]) -> f64 {
+    let start = processor_seconds();
+    let hit = |ray: &&Ray| {
+        let mut hit = RayHit::new(**ray);
+        mesh.intersect1(&mut hit);
+        hit.is_hit()
+    };
+    let hits: usize = rays.par_chunks(1 << 12).map(|chunk| chunk.iter().filter(hit).count()).sum();
+    assert!(hits > 0);
+    rays.len() as f64 / (processor_seconds() - start).max(1e-2)
+}
+
+fn median(mut x: Vec<f64>) -> f64 {
+    x.sort_by(f64::total_cmp);
+    x[x.len() / 2]
+}
+
+/// Prints the ratios of one scene; returns the CPU seconds of a pass.
+fn compare(device: &Device, name: &str, scene: &Scene, c: f32) -> f64 {
+    let (mesh, triangles, rays) = bounces(device, scene, c, 1 << 20);
+    let directions = if scene.lattice().len() < 3_000_000 { 128 } else { 32 };
+    let settings = |max_bounces, light_points| SweepSettings {
+        directions,
+        light_points,
+        max_bounces,
+        replicates: 1,
+        ..SweepSettings::default()
+    };
+    let time = |s: SweepSettings| {
+        let start = processor_seconds();
+        let out = sweep(scene, &s, &|_| true).expect("a sweep");
+        (processor_seconds() - start, out.counts)
+    };
+    let mut columns: [Vec<f64>; 7] = Default::default();
+    let mut valid = 0.0;
+    for _ in 0..REPEATS {
+        let exact = triangle_rate(&mesh, &rays);
+        let (t0, _) = time(settings(0, 1));
+        let (t1, _) = time(settings(0, 17));
+        let (t2, counts) = time(settings(1, 1));
+        let pass = (t2 - t0).max(1e-9);
+        let gather = counts.gather_rays as f64 / pass;
+        let direct = 16.0 * counts.valid as f64 / (t1 - t0).max(1e-9);
+        let nodes = scene.lattice().len() as f64;
+        valid = counts.valid as f64 / nodes;
+        let row = [exact, gather, gather / exact, gather / valid, direct, direct / exact, pass];
+        columns.iter_mut().zip(row).for_each(|(column, x)| column.push(x));
+    }
+    let [exact, gather, ratio, all, direct, direct_ratio, pass] = columns.map(median);
+    println!(
+        "{name}: Embree triangles {:.1} M rays/s ({triangles} triangles); gather {:.1} M/s ({ratio:.1}×; {:.0} % of the nodes in \
+         the sweep, {:.1} M/s over all); direct {:.1} M/s ({direct_ratio:.1}×)",
+        exact * 1e-6,
+        gather * 1e-6,
+        100.0 * valid,
+        all * 1e-6,
+        direct * 1e-6,
+    );
+    pass / directions as f64
+}
+
+/// Prints what converged light takes.
+fn converge(scene: &Scene) {
+    let settings = SweepSettings { directions: 128, light_points: 64, replicates: 1, ..SweepSettings::default() };
+    let (start, cpu) = (Instant::now(), processor_seconds());
+    let out = sweep(scene, &settings, &|_| true).expect("a sweep");
+    let (wall, cpu) = (start.elapsed().as_secs_f64(), processor_seconds() - cpu);
+    println!("      converged: {wall:.2} s ({cpu:.2} CPU s), {} bounces", out.bounces);
 }
 
 fn main() {
-    let all = std::env::args().any(|a| a == "--full");
+    let arguments: Vec<String> = std::env::args().collect();
+    let full = arguments.iter().any(|a| a == "--full");
+    let data = arguments.iter().position(|a| a == "--data").and_then(|i| arguments.get(i + 1));
     let device = Device::new(1).expect("Embree starts");
     println!("per CPU second (all threads), {} threads, Embree {}", rayon::current_num_threads(), device.version());
-    for n in if all { vec![64, 101, 128, 256] } else { vec![101, 128] } {
+    let mut passes = Vec::new();
+    for n in if full { vec![64, 101, 128, 256] } else { vec![101] } {
         let scene = bumps(n);
-        let (vertices, triangles, rays) = bounces(&scene, 1 << 20);
-        let mut builder = SceneBuilder::new(&device).expect("a scene");
-        builder.triangles(&vertices, &triangles, u32::MAX).expect("triangles");
-        let mesh = builder.commit().expect("a built scene");
-        let settings = |max_bounces, light_points| SweepSettings {
-            directions: 64,
-            light_points,
-            max_bounces,
-            replicates: 1,
-            ..SweepSettings::default()
-        };
-        let (mut exact, mut gather, mut direct, mut node) = (0f64, 0f64, 0f64, 0f64);
-        for _ in 0..3 {
-            let start = processor_seconds();
-            let hits: usize = rays
-                .par_chunks(1 << 12)
-                .map(|chunk| {
-                    chunk
-                        .iter()
-                        .filter(|&&ray| {
-                            let mut hit = RayHit::new(ray);
-                            mesh.intersect1(&mut hit);
-                            hit.is_hit()
-                        })
-                        .count()
-                })
-                .sum();
-            assert!(hits > 0);
-            exact = exact.max(rays.len() as f64 / (processor_seconds() - start).max(1e-2));
-            let time = |s: SweepSettings| {
-                let start = processor_seconds();
-                let out = sweep(&scene, &s, &|_| true).expect("a sweep");
-                (processor_seconds() - start, out)
-            };
-            let (t0, _) = time(settings(0, 1));
-            let (t1, _) = time(settings(0, 17));
-            let (t2, out) = time(settings(1, 1));
-            gather = gather.max(out.counts.gather_rays as f64 / (t2 - t0).max(1e-9));
-            node = node.max(scene.lattice().len() as f64 * 32.0 / (t2 - t0).max(1e-9));
-            direct = direct.max(16.0 * out.counts.valid as f64 / (t1 - t0).max(1e-9));
-        }
-        println!(
-            "{n:4}³: Embree triangles {:6.1} M rays/s ({} triangles); gather {:6.1} M/s ({:.1}×; {:.1} M/s with masked nodes); \
-             direct {:6.1} M/s ({:.1}×)",
-            exact * 1e-6,
-            triangles.len(),
-            gather * 1e-6,
-            gather / exact,
-            node * 1e-6,
-            direct * 1e-6,
-            direct / exact
-        );
-        let start = Instant::now();
-        let cpu = processor_seconds();
-        let out = sweep(
-            &scene,
-            &SweepSettings { directions: 128, light_points: 64, replicates: 1, ..settings(64, 64) },
-            &|_| true,
-        )
-        .expect("a sweep");
-        println!(
-            "      converged: {:.2} s ({:.2} CPU s), {} bounces",
-            start.elapsed().as_secs_f64(),
-            processor_seconds() - cpu,
-            out.bounces
-        );
+        passes.push(((n as f64).ln() * 3.0, compare(&device, &format!("bumps {n}³"), &scene, 0.4).ln()));
+        converge(&scene);
+    }
+    if let (Some(first), Some(last), true) = (passes.first(), passes.last(), full) {
+        println!("time of a pass over voxels: exponent {:.2}", (last.1 - first.1) / (last.0 - first.0));
+    }
+    let scene = foam(101);
+    compare(&device, "foam 101³", &scene, 0.2);
+    converge(&scene);
+    for (file, range, c) in DATA {
+        let Some(path) = data.map(|d| Path::new(d).join(file)).filter(|p| p.exists()) else { continue };
+        let volume = Volume::open(&path).expect("a volume");
+        let scene = scene_of(&volume, range);
+        compare(&device, file, &scene, scene.field.sweep().isovalue(c));
+        converge(&scene);
     }
 }

@@ -194,3 +194,38 @@ impl std::fmt::Display for TimeEstimate {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::{Field, Sweep};
+    use crate::scene::{Boundary, Surface, cornell_box};
+    use crate::volume::generate::Generator;
+
+    fn scene(name: &str, range: [f64; 2]) -> Scene {
+        let volume = Generator::from_name(name).unwrap().sample([24; 3]).unwrap();
+        let field = Field::new(&volume, Sweep::new(range[0], range[1]).unwrap()).unwrap();
+        let walls = cornell_box(field.lattice(), 0.0).unwrap();
+        Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap()
+    }
+
+    /// Directions along lines and back, of one side, that a sweep took.
+    fn taken(scene: &Scene, settings: &SweepSettings) -> f64 {
+        let counts = sweep::sweep(scene, settings, &|_| true).unwrap().counts;
+        2.0 * counts.families as f64 / sweep::swept_sides(scene).len() as f64
+    }
+
+    #[test]
+    fn a_sweep_takes_about_the_directions_that_its_estimate_counts() {
+        let (bumps, gap) = (scene("bumps", [3.6, 95.0]), scene("two-cylinders", [0.2, 0.8]));
+        for (scene, directions, replicates) in [(&bumps, 64, 4), (&bumps, 256, 1), (&gap, 128, 2)] {
+            let settings = SweepSettings { directions, replicates, light_points: 2, ..SweepSettings::default() };
+            let ratio = taken(scene, &settings) / settings.expected_directions() as f64;
+            println!("{directions} directions, {replicates} replicates: {ratio:.2} of the expected ones");
+            assert!((0.6..1.6).contains(&ratio), "{directions} directions, {replicates} replicates: {ratio}");
+        }
+        let fixed =
+            SweepSettings { directions: 32, replicates: 2, max_bounces: 3, light_points: 2, ..Default::default() };
+        assert!((taken(&bumps, &fixed) - fixed.expected_directions() as f64).abs() < 1e-9);
+    }
+}

@@ -74,7 +74,8 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
         let picture_seconds = reference_picture(study, scene, unit)?;
         let Some(references) = study.references(subject, c, Effort::Table)? else { continue };
         let tracer = GraphTracer::new(&study.device, scene)?;
-        let (shadow, vertices) = if study.quick { (64, 300) } else { (1024, 2000) };
+        // At the vertices of the references: few of them carry much of an error, and of its floor.
+        let (shadow, vertices) = if study.quick { (64, 500) } else { (1024, 4000) };
         let mut floors = Vec::new();
         for factor in 1..=3 {
             let floor = interpolation_floor(scene, &tracer, &mesh, unit, factor, shadow, Some(vertices))?;

@@ -123,26 +123,25 @@ impl<'a> Walls<'a> {
     }
 
     /// What every front on one line sees along it.
+    #[inline(always)]
     fn line(&self, samples: Option<(&Pack, &[Half4], usize, [f64; 2])>, p: isize, q: isize, out: &mut Arrivals) {
         let nc = self.flats.isovalues;
-        let mut values = vec![0f32; 3 * nc];
         let (pf, qf) = (p as f64, q as f64);
-        self.ends.fronts(pf, qf, |wall, forward| {
-            let Some(flat) = wall.flat else { return };
+        for (wall, forward) in self.ends.fronts(pf, qf) {
+            let Some(flat) = wall.flat else { continue };
             let next = self.ends.stop(pf, qf, wall.tau, forward, Some(flat));
-            fill_column(self.flats, next, &mut values);
             let reach = next.map_or(if forward { f64::INFINITY } else { f64::NEG_INFINITY }, |s| s.tau);
-            let range = match samples {
-                Some((pack, b, lane, span)) if self.meets(wall.tau, reach, span) => {
-                    self.staircase((pack, b), lane, span, (wall.tau, reach), (pf, qf), &mut values)
+            out.push((flat, wall.uv), self.weight, nc, |values| {
+                fill_column(self.flats, next, values);
+                match samples {
+                    Some((pack, b, lane, span)) if self.meets(wall.tau, reach, span) => {
+                        self.staircase((pack, b), lane, span, (wall.tau, reach), (pf, qf), values)
+                    }
+                    _ if self.primary => (0, nc),
+                    _ => (0, 0),
                 }
-                _ if self.primary => (0, nc),
-                _ => (0, 0),
-            };
-            if range.0 < range.1 {
-                out.push(flat, wall.uv, self.weight, range, &values);
-            }
-        });
+            });
+        }
     }
 
     fn meets(&self, from: f64, to: f64, span: [f64; 2]) -> bool {
@@ -271,16 +270,17 @@ impl<'a> Walls<'a> {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the isovalues")]
     fn caps(&self, pack: &Pack, lane: usize, span: [f64; 2], (p, q): (isize, isize), out: &mut Arrivals) {
         let nc = self.flats.isovalues;
-        let mut values = vec![0f32; 3 * nc];
         let pq = (p as f64, q as f64);
         for (end, h) in pack.border(self.plan, lane, p, q).into_iter().enumerate() {
             let Some(h) = h else { continue };
             let covered = ((h * nc as f32 + 0.5).floor().max(0.0) as usize).min(nc);
             if covered > 0 {
                 let next = self.ends.stop(pq.0, pq.1, span[end], end == 1, None);
-                fill_column(self.flats, next, &mut values);
                 let cap = self.cap_stop(span[end], pq);
-                out.push(cap.flat.expect("a cap"), cap.uv, self.weight, (0, covered), &values);
+                out.push((cap.flat.expect("a cap"), cap.uv), self.weight, nc, |values| {
+                    fill_column(self.flats, next, values);
+                    (0, covered)
+                });
             }
         }
     }

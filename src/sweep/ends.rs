@@ -161,13 +161,11 @@ impl Ends {
         }
     }
 
-    /// Calls `visit` with every reflecting front that line (p, q) meets, and whether it looks towards +τ.
-    pub(super) fn fronts(&self, p: f64, q: f64, mut visit: impl FnMut(Stop, bool)) {
-        for m in self.met.iter().filter(|m| m.reflects) {
-            if m.edges.iter().all(|e| at(e, p, q) >= -m.slack) {
-                visit(m.stop(p, q, at(&m.tau, p, q), m.front_plus), !m.front_plus);
-            }
-        }
+    /// Every reflecting front that line (p, q) meets, and whether it looks towards +τ.
+    #[inline(always)]
+    pub(super) fn fronts(&self, p: f64, q: f64) -> impl Iterator<Item = (Stop, bool)> {
+        let met = move |m: &&Met| m.reflects && m.edges.iter().all(|e| at(e, p, q) >= -m.slack);
+        self.met.iter().filter(met).map(move |m| (m.stop(p, q, at(&m.tau, p, q), m.front_plus), !m.front_plus))
     }
 
     /// The luminaires that cut line (p, q) between `from` and `to`, in order of τ: how each looks from before and behind.

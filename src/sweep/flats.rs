@@ -94,12 +94,25 @@ pub(super) struct Arrivals {
 }
 
 impl Arrivals {
-    /// Adds radiances (three channels of isovalues, 0 outside `range`) that stand for `weight` = dω × area across.
-    pub(super) fn push(&mut self, flat: u32, uv: [f32; 2], weight: f32, range: (usize, usize), values: &[f32]) {
-        #[allow(clippy::cast_possible_truncation, reason = "isovalue texels")]
-        let range = (range.0 as u32, range.1 as u32);
-        self.list.push(Arrival { flat, uv, weight, range, start: self.values.len() });
-        self.values.extend_from_slice(values);
+    /// Adds what `radiance` writes into three channels of isovalues, which stands for `weight` = dω × area across, for
+    /// the range of isovalues that it returns.
+    #[inline(always)]
+    #[allow(clippy::cast_possible_truncation, reason = "isovalue texels")]
+    pub(super) fn push(
+        &mut self,
+        (flat, uv): (u32, [f32; 2]),
+        weight: f32,
+        isovalues: usize,
+        radiance: impl FnOnce(&mut [f32]) -> (usize, usize),
+    ) {
+        let start = self.values.len();
+        self.values.resize(start + 3 * isovalues, 0.0);
+        let (from, to) = radiance(&mut self.values[start..]);
+        if from < to {
+            self.list.push(Arrival { flat, uv, weight, range: (from as u32, to as u32), start });
+        } else {
+            self.values.truncate(start);
+        }
     }
 }
 

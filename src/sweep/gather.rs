@@ -7,7 +7,7 @@ use super::flats::{Arrivals, Flats, Incoming};
 use super::grid::{Geometry, NORMAL_SCALE, Planes, Source, transposed, untransposed};
 use super::half::Half4;
 use super::pack::{LANES, Light, Pack, Plan, Way};
-use super::simd::Isa;
+use super::simd::{Isa, ask};
 use crate::flattened::Side;
 use crate::scene::Scene;
 use glam::DVec3;
@@ -196,7 +196,11 @@ impl Pass<'_> {
             let q = first + n as isize;
             self.row_of_lines(family, q, &mut work, n % 2, Some(arrivals));
             let (this, before) = (&work.light[n % 2], &work.light[1 - n % 2]);
-            for (k, e) in nodes {
+            for n in 0..nodes.len() {
+                if let Some((k, e)) = nodes.get(n + 1) {
+                    self.ask(family, (*k, q), e);
+                }
+                let (k, e) = &mut nodes[n];
                 self.accumulate(family, (*k, q), [this, before], e);
             }
         }
@@ -233,6 +237,15 @@ impl Pass<'_> {
         if let Some(arrivals) = arrivals {
             family.walls.past(q, within, arrivals);
         }
+    }
+
+    /// Asks for the memory that [`Self::accumulate`] adds to.
+    fn ask(&self, family: &Family, (k, q): (usize, isize), e: &Row) {
+        let layout = &family.plan.shear.layout;
+        let j = (q + family.plan.shift[1][k].0).unsigned_abs();
+        let at = k * layout.stride[1] + j * layout.stride[0];
+        e.iter().for_each(|e| ask(e));
+        self.geometry.normals(layout).iter().for_each(|n| ask(&n[at..][..layout.dims[0]]));
     }
 
     /// Adds what lines q and q − 1 brought to a row of nodes in slice k: each node takes its four nearest lines by
@@ -290,14 +303,14 @@ pub(super) fn accumulate_row(
     (a, b): (usize, usize),
 ) {
     let nu = n[0].len();
-    let cosine =
-        |i: usize| omega[0] * f32::from(n[0][i]) + omega[1] * f32::from(n[1][i]) + omega[2] * f32::from(n[2][i]);
     // Ω's faces: one column of lines.
     for (i, line) in [(0, line0), (nu - 1, line0 + nu - 2)] {
         if a <= i && i < b {
+            let cos = omega[0] * f32::from(n[0][i]) + omega[1] * f32::from(n[1][i]) + omega[2] * f32::from(n[2][i]);
+            let cos = cos.abs();
             for c in 0..3 {
                 let (near, far) = (light[0][c][line], light[1][c][line]);
-                e[c][i] += cosine(i).abs() * ((1.0 - fv) * near + fv * far);
+                e[c][i] += cos * ((1.0 - fv) * near + fv * far);
             }
         }
     }

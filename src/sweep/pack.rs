@@ -7,9 +7,12 @@ use super::ends::Ends;
 use super::flats::{Flats, Stop};
 use super::grid::Source;
 use super::half::{Half4, decode};
+use super::simd::ask;
 
 /// Lines in a pack.
 pub(super) const LANES: usize = 16;
+/// Slices whose h is asked for before it is their turn.
+const AHEAD: usize = 6;
 /// One number for each line of a pack.
 pub(super) type Lanes = [f32; LANES];
 /// h where a line is outside Ω.
@@ -252,6 +255,14 @@ impl Pack {
             } {
                 continue;
             }
+            if let Some(&(k, _)) = self.stripe.get(n + AHEAD) {
+                let (i, j) = (first + plan.shift[0][k].0, q + plan.shift[1][k].0);
+                let at = k as isize * sa as isize + j * sv as isize + i;
+                for at in [at, at + sv as isize] {
+                    let h = source.h.get(at.max(0).unsigned_abs()..).unwrap_or_default();
+                    ask(&h[..h.len().min(LANES + 1)]);
+                }
+            }
             let at = k as isize * sa as isize + j * sv as isize + i;
             let taps = Taps {
                 at: [at, at + 1, at + sv as isize, at + sv as isize + 1],
@@ -292,16 +303,16 @@ impl Pack {
             }
             let (lo, hi) = plan.within(k, (first, q));
             let beside = self.beside(plan, k, (first, q));
-            for lane in lo..hi {
-                let line = (first + lane as isize, q);
-                for (leaves, (lo, hi)) in [false, true].into_iter().zip(beside) {
-                    if lane < lo || lane >= hi {
-                        let row = if leaves { k + 2 } else { k };
-                        if !self.is_awake[row] {
-                            self.is_awake[row] = true;
-                            blank(&mut self.h[row], lo, hi);
-                        }
-                        self.side(plan, source, line, lane, k, leaves);
+            for (leaves, (from, to)) in [false, true].into_iter().zip(beside) {
+                let row = if leaves { k + 2 } else { k };
+                // The lanes of lo..hi that are not in from..to.
+                for lanes in [lo..hi.min(from), lo.max(to)..hi] {
+                    if !lanes.is_empty() && !self.is_awake[row] {
+                        self.is_awake[row] = true;
+                        blank(&mut self.h[row], from, to);
+                    }
+                    for lane in lanes {
+                        self.side(plan, source, (first + lane as isize, q), lane, k, leaves);
                     }
                 }
             }

@@ -25,6 +25,19 @@ enum Kind {
     Avx512,
 }
 
+/// Asks for the memory of `x`, which is needed soon.
+#[inline(always)]
+pub(super) fn ask<T>(x: &[T]) {
+    #[cfg(target_arch = "x86_64")]
+    for at in (0..size_of_val(x)).step_by(64) {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        // SAFETY: the address is inside `x`; asking changes nothing.
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(x.as_ptr().cast::<i8>().add(at)) };
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = x;
+}
+
 /// Defines a method of [`Isa`] that runs `$inner` compiled for its instruction set.
 macro_rules! dispatch {
     ($name:ident, $inner:path, ($($arg:ident: $type:ty),*) $(-> $out:ty)?) => {
