@@ -5,7 +5,7 @@ use crate::accuracy::{ReferenceMesh, interpolation_floor, total_floor};
 use crate::bake::{Bake, BakeOptions, BakeSettings, Engine, StrategyName};
 use crate::embree::{GraphTracer, SurfaceTracer};
 use crate::error::Result;
-use crate::illumination_grid::IlluminationGrid;
+use crate::illumination_grid::{GridSize, IlluminationGrid};
 use crate::reference::{Reference, ReferenceSettings, path_picture, reference};
 use crate::render::Camera;
 use crate::scene::Scene;
@@ -41,7 +41,8 @@ const COLUMNS: [&str; 25] = [
 ];
 
 /// Each data set at its main isovalue: straight from the map, with uniform samples as BB09 and with samples at the nodes;
-/// samples at the nodes with final gather, and the sweep engine; the interpolation floor at grid factors 1, 2, 3; the reference on triangles against the one on the trilinear surface.
+/// samples at the nodes with final gather, and the sweep engine; the interpolation floor of direct light at grid factors 1, 2, 3, and of
+/// all light at that of the bakes; the reference on triangles against the one on the trilinear surface.
 ///
 /// # Errors
 /// As bakes, references and tables.
@@ -82,7 +83,11 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
             floors.push(floor.percent_rms);
         }
         let paths = if study.quick { 64 } else { 256 };
-        let total = total_floor(scene, &tracer, &mesh, &references, 1, paths, vertices)?;
+        let factor = match base.grid {
+            Some(GridSize::Factor(factor)) => factor,
+            _ => 1,
+        };
+        let total = total_floor(scene, &tracer, &mesh, &references, factor, paths, vertices)?;
         let triangles = triangle_error(study, subject, &mesh, unit)?;
         for (mode, options) in &modes {
             if table.has(&key(mode)) {
