@@ -42,7 +42,7 @@ const COLUMNS: [&str; 25] = [
 
 /// Each data set at its main isovalue: straight from the map, with uniform samples as BB09 and with samples at the nodes;
 /// samples at the nodes with final gather, and the sweep engine; the interpolation floor of direct light at grid factors 1, 2, 3, and of
-/// all light at that of the bakes; the reference on triangles against the one on the trilinear surface.
+/// all light at that of the bakes (1 if their grid is given in points); the reference on triangles against the one on the trilinear surface.
 ///
 /// # Errors
 /// As bakes, references and tables.
@@ -76,7 +76,8 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
         let Some(references) = study.references(subject, c, Effort::Table)? else { continue };
         let tracer = GraphTracer::new(&study.device, scene)?;
         // At the vertices of the references: few of them carry much of an error, and of its floor.
-        let (shadow, vertices) = if study.quick { (64, 500) } else { (1024, 4000) };
+        let vertices = references[0].sampled.iter().filter(|s| **s).count();
+        let shadow = if study.quick { 64 } else { 1024 };
         let mut floors = Vec::new();
         for factor in 1..=3 {
             let floor = interpolation_floor(scene, &tracer, &mesh, unit, factor, shadow, Some(vertices))?;

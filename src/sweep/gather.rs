@@ -7,7 +7,7 @@ use super::flats::{Arrivals, Flats, Incoming};
 use super::grid::{Geometry, NORMAL_SCALE, Planes, Source, transposed, untransposed};
 use super::half::Half4;
 use super::pack::{LANES, Light, Pack, Plan, Way};
-use super::simd::{Isa, ask};
+use super::simd::{Isa, prefetch};
 use crate::flattened::Side;
 use crate::scene::Scene;
 use glam::DVec3;
@@ -196,11 +196,11 @@ impl Pass<'_> {
             let q = first + n as isize;
             self.row_of_lines(family, q, &mut work, n % 2, Some(arrivals));
             let (this, before) = (&work.light[n % 2], &work.light[1 - n % 2]);
-            for n in 0..nodes.len() {
-                if let Some((k, e)) = nodes.get(n + 1) {
-                    self.ask(family, (*k, q), e);
+            for row in 0..nodes.len() {
+                if let Some((k, e)) = nodes.get(row + 1) {
+                    self.prefetch(family, (*k, q), e);
                 }
-                let (k, e) = &mut nodes[n];
+                let (k, e) = &mut nodes[row];
                 self.accumulate(family, (*k, q), [this, before], e);
             }
         }
@@ -239,13 +239,13 @@ impl Pass<'_> {
         }
     }
 
-    /// Asks for the memory that [`Self::accumulate`] adds to.
-    fn ask(&self, family: &Family, (k, q): (usize, isize), e: &Row) {
+    /// Brings what [`Self::accumulate`] reads and adds to into the cache.
+    fn prefetch(&self, family: &Family, (k, q): (usize, isize), e: &Row) {
         let layout = &family.plan.shear.layout;
         let j = (q + family.plan.shift[1][k].0).unsigned_abs();
         let at = k * layout.stride[1] + j * layout.stride[0];
-        e.iter().for_each(|e| ask(e));
-        self.geometry.normals(layout).iter().for_each(|n| ask(&n[at..][..layout.dims[0]]));
+        e.iter().for_each(|e| prefetch(e));
+        self.geometry.normals(layout).iter().for_each(|n| prefetch(&n[at..][..layout.dims[0]]));
     }
 
     /// Adds what lines q and q − 1 brought to a row of nodes in slice k: each node takes its four nearest lines by

@@ -7,11 +7,11 @@ use super::ends::Ends;
 use super::flats::{Flats, Stop};
 use super::grid::Source;
 use super::half::{Half4, decode};
-use super::simd::ask;
+use super::simd::prefetch;
 
 /// Lines in a pack.
 pub(super) const LANES: usize = 16;
-/// Slices whose h is asked for before it is their turn.
+/// How many slices ahead h is prefetched.
 const AHEAD: usize = 6;
 /// One number for each line of a pack.
 pub(super) type Lanes = [f32; LANES];
@@ -260,7 +260,7 @@ impl Pack {
                 let at = k as isize * sa as isize + j * sv as isize + i;
                 for at in [at, at + sv as isize] {
                     let h = source.h.get(at.max(0).unsigned_abs()..).unwrap_or_default();
-                    ask(&h[..h.len().min(LANES + 1)]);
+                    prefetch(&h[..h.len().min(LANES + 1)]);
                 }
             }
             let at = k as isize * sa as isize + j * sv as isize + i;

@@ -25,13 +25,13 @@ enum Kind {
     Avx512,
 }
 
-/// Asks for the memory of `x`, which is needed soon.
+/// Brings `x`, which is needed soon, into the cache.
 #[inline(always)]
-pub(super) fn ask<T>(x: &[T]) {
+pub(super) fn prefetch<T>(x: &[T]) {
     #[cfg(target_arch = "x86_64")]
     for at in (0..size_of_val(x)).step_by(64) {
         use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-        // SAFETY: the address is inside `x`; asking changes nothing.
+        // SAFETY: the address is inside `x`; a prefetch changes nothing.
         unsafe { _mm_prefetch::<_MM_HINT_T0>(x.as_ptr().cast::<i8>().add(at)) };
     }
     #[cfg(not(target_arch = "x86_64"))]
