@@ -37,27 +37,58 @@ pub fn masks(field: &Field, lattice: &Lattice) -> Vec<Mask> {
         #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
         (0..lattice.len()).into_par_iter().map(|o| field.value(at(o)) as f32).collect::<Vec<_>>().into()
     };
-    (0..lattice.len())
-        .into_par_iter()
-        .with_min_len(4096)
-        .map(|o| {
+    let area = dims[0] * dims[1];
+    let mut out = vec![Mask::Empty; lattice.len()];
+    out.par_chunks_mut(SLICES * area).enumerate().for_each(|(chunk, out)| {
+        let first = chunk * SLICES;
+        let last = first + out.len() / area - 1;
+        let planes: Vec<Vec<[f32; 2]>> = (first.saturating_sub(1)..=(last + 1).min(dims[2] - 1))
+            .map(|z| extrema(&values[z * area..(z + 1) * area], dims[0]))
+            .collect();
+        let below = first.min(1);
+        for (n, mask) in out.iter_mut().enumerate() {
+            let (z, i, o) = (n / area + below, n % area, first * area + n);
             let h = values[o];
-            if (0.0..=1.0).contains(&h) && field.falling_normal(at(o)).is_some() {
-                return Mask::Valid;
-            }
-            let [i, j, k] = lattice.ijk(o);
-            let (mut lo, mut hi) = (f32::INFINITY, f32::NEG_INFINITY);
-            for z in k.saturating_sub(1)..=(k + 1).min(dims[2] - 1) {
-                for y in j.saturating_sub(1)..=(j + 1).min(dims[1] - 1) {
-                    for x in i.saturating_sub(1)..=(i + 1).min(dims[0] - 1) {
-                        let s = values[lattice.offset(x, y, z)];
-                        (lo, hi) = (lo.min(s), hi.max(s));
-                    }
-                }
-            }
-            if lo <= 1.0 && hi >= 0.0 && lo < hi { Mask::Filled } else { Mask::Empty }
-        })
-        .collect()
+            let [lo, hi] =
+                planes[z.saturating_sub(1)..(z + 2).min(planes.len())].iter().fold(NOTHING, |m, p| wider(m, p[i]));
+            *mask = if (0.0..=1.0).contains(&h) && field.falling_normal(at(o)).is_some() {
+                Mask::Valid
+            } else if lo <= 1.0 && hi >= 0.0 && lo < hi {
+                Mask::Filled
+            } else {
+                Mask::Empty
+            };
+        }
+    });
+    out
+}
+
+/// Slices of constant z that are looked at together.
+const SLICES: usize = 8;
+/// The range of no values.
+const NOTHING: [f32; 2] = [f32::INFINITY, f32::NEG_INFINITY];
+
+/// The range of two; NaN is none.
+#[inline]
+fn wider(a: [f32; 2], b: [f32; 2]) -> [f32; 2] {
+    [a[0].min(b[0]), a[1].max(b[1])]
+}
+
+/// The range of values within a step of each point of a plane in rows of `nx`, first along rows, then across.
+fn extrema(plane: &[f32], nx: usize) -> Vec<[f32; 2]> {
+    let mut along = Vec::with_capacity(plane.len());
+    for row in plane.chunks(nx) {
+        along.extend((0..nx).map(|x| {
+            let around = &row[x.saturating_sub(1)..(x + 2).min(nx)];
+            around.iter().fold(NOTHING, |m, &h| wider(m, [h; 2]))
+        }));
+    }
+    let rows = plane.len() / nx;
+    let across = |i: usize| {
+        let (y, x) = (i / nx, i % nx);
+        (y.saturating_sub(1)..(y + 2).min(rows)).fold(NOTHING, |m, y| wider(m, along[y * nx + x]))
+    };
+    (0..plane.len()).map(across).collect()
 }
 
 /// Points of the graph that stand for lattice point `o`: itself if a level set of the sweep passes through it, else up to
@@ -97,5 +128,20 @@ mod tests {
         use Mask::{Empty, Filled, Valid};
         // Cells 2–3, 3–4 hold the sweep; nodes of those cells and the cells beside them are filled.
         assert_eq!(got[..8], [Empty, Empty, Filled, Valid, Filled, Empty, Empty, Empty]);
+    }
+
+    /// Along each axis and across the slices that are looked at together: one point of the sweep among emptiness.
+    #[test]
+    fn one_point_fills_the_cells_around_it() {
+        for place in [[0, 0, 0], [4, 2, 7], [4, 2, 8], [3, 3, 16], [5, 4, 18]] {
+            let lattice = Lattice::aligned([6, 5, 19], DVec3::ZERO, DVec3::ONE).unwrap();
+            let far = |o: usize| (0..3).map(|a| lattice.ijk(o)[a].abs_diff(place[a])).max().unwrap();
+            let samples = (0..lattice.len()).map(|o| if far(o) == 0 { 0.5 } else { -1.0 }).collect();
+            let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
+            let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+            for (o, mask) in masks(&field, &lattice).into_iter().enumerate() {
+                assert_eq!(mask == Mask::Empty, far(o) > 1, "{place:?}: {:?}", lattice.ijk(o));
+            }
+        }
     }
 }
