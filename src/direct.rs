@@ -54,6 +54,14 @@ pub fn luminance(rgb: DVec3) -> f64 {
     rgb.dot(DVec3::new(0.2126, 0.7152, 0.0722))
 }
 
+/// Irradiance that all luminaires would give without obstacles at `p` (local frame) with unit normal `n` (world).
+/// \[Lambert1760\]
+pub fn open_irradiance(scene: &Scene, p: DVec3, n: DVec3) -> DVec3 {
+    let x = scene.lattice().to_world(p);
+    let lights = scene.luminaires().iter().map(|&l| &scene.polygons()[l as usize]);
+    lights.map(|light| light.emission * unoccluded(light, x, n)).sum()
+}
+
 /// No budget is cut below this.
 const LEAST_RAYS: u32 = 8;
 

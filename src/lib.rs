@@ -51,6 +51,7 @@ pub mod gather;
 pub mod sampling;
 pub mod radiance;
 pub mod illumination_grid;
+pub mod irradiance_caching;
 pub mod fitted_grid;
 pub mod smoothing;
 pub mod sweep;

@@ -32,7 +32,9 @@ pub struct RadianceSample {
     pub radiance: Vec3,
     /// Variance of the luminance.
     pub variance: f32,
-    /// Indirect irradiance by either half of the gather rays; 0 without gather.
+    /// Irradiance straight from luminaires.
+    pub direct: Vec3,
+    /// Indirect irradiance by either half of the gather rays; without gather twice the same.
     pub indirect: [Vec3; 2],
     /// The part of `variance` that is theirs.
     pub indirect_variance: f32,
@@ -52,7 +54,7 @@ pub struct RadianceSamples {
 
 impl RadianceSample {
     /// Bytes of a sample in a checkpoint, without its position.
-    pub(crate) const SAVED: usize = 44;
+    pub(crate) const SAVED: usize = 56;
 }
 
 /// Samples as a block: rays, misses, and the numbers of each; a variance of −1 stands for none.
@@ -60,8 +62,8 @@ fn to_block(counts: [u64; 2], samples: &[Option<RadianceSample>]) -> Vec<u8> {
     let numbers = samples.iter().flat_map(|s| {
         let s = s.unwrap_or(RadianceSample { variance: -1.0, ..RadianceSample::default() });
         let [a, b] = s.indirect;
-        let r = s.radiance;
-        [r.x, r.y, r.z, s.variance, a.x, a.y, a.z, b.x, b.y, b.z, s.indirect_variance]
+        let (r, d) = (s.radiance, s.direct);
+        [r.x, r.y, r.z, s.variance, d.x, d.y, d.z, a.x, a.y, a.z, b.x, b.y, b.z, s.indirect_variance]
     });
     counts.into_iter().flat_map(u64::to_le_bytes).chain(numbers.flat_map(f32::to_le_bytes)).collect()
 }
@@ -70,14 +72,15 @@ fn to_block(counts: [u64; 2], samples: &[Option<RadianceSample>]) -> Vec<u8> {
 fn from_block(bytes: &[u8], places: &[(u64, Vec3)], out: &mut [Option<RadianceSample>]) -> [u64; 2] {
     let (counts, numbers) = bytes.split_at(16);
     for ((b, &(_, position)), out) in numbers.as_chunks::<{ RadianceSample::SAVED }>().0.iter().zip(places).zip(out) {
-        let n: [f32; 11] = std::array::from_fn(|i| f32::from_le_bytes(std::array::from_fn(|k| b[4 * i + k])));
+        let n: [f32; 14] = std::array::from_fn(|i| f32::from_le_bytes(std::array::from_fn(|k| b[4 * i + k])));
         let vector = |i: usize| Vec3::new(n[i], n[i + 1], n[i + 2]);
         *out = (n[3] != -1.0).then(|| RadianceSample {
             position,
             radiance: vector(0),
             variance: n[3],
-            indirect: [vector(4), vector(7)],
-            indirect_variance: n[10],
+            direct: vector(4),
+            indirect: [vector(7), vector(10)],
+            indirect_variance: n[13],
         });
     }
     [0, 8].map(|i| u64::from_le_bytes(std::array::from_fn(|k| counts[i + k])))
@@ -126,19 +129,17 @@ impl<T: Tracer> Sampler<'_, T> {
         let index = key * 2 + side.index() as u64;
         let direct = direct_irradiance(scene, tracer, &receiver, self.shadow_rays, (self.seed, Stage::Direct, index));
         counts[0] += direct.rays;
-        let mut halves = [DVec3::ZERO; 2];
-        let (mean, variance) = match self.indirect {
+        let (mean, variance, halves) = match self.indirect {
             Indirect::Map(map) => {
                 let e = map.irradiance(p, isovalue, scratch);
-                (e.mean, e.variance)
+                (e.mean, e.variance, [e.mean; 2])
             }
             Indirect::Gather(cache, rays) => {
                 let g = gathered_irradiance(scene, tracer, cache, &receiver, *rays, (self.seed, index));
-                halves = g.halves;
                 let e = g.estimate;
                 counts[0] += e.rays;
                 counts[1] += e.misses;
-                (e.mean, e.variance)
+                (e.mean, e.variance, g.halves)
             }
         };
         let albedo = scene.surface.albedo.at(isovalue);
@@ -148,6 +149,7 @@ impl<T: Tracer> Sampler<'_, T> {
             // The cache's flats may be a little negative where few photons land.
             radiance: (reflected(albedo, (direct.mean + mean).max(DVec3::ZERO)) + scene.surface.emission).as_vec3(),
             variance: ((direct.variance + variance) * scale * scale) as f32,
+            direct: direct.mean.as_vec3(),
             indirect: halves.map(|h| h.as_vec3()),
             indirect_variance: (variance * scale * scale) as f32,
         })

@@ -11,7 +11,7 @@ use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, local_position, stand_ins};
 use crate::node_set::NodeSet;
-use crate::radiance::{BLOCK, RadianceSample, Sampler, sample_places};
+use crate::radiance::{BLOCK, RadianceSample, RadianceSamples, Sampler, sample_places};
 use crate::scene::Scene;
 use crate::smoothing::{Halves, smooth};
 use crate::tracer::Tracer;
@@ -39,6 +39,13 @@ impl AddAssign for Counts {
         self.misses += o.misses;
         self.samples += o.samples;
         self.without_gradient += o.without_gradient;
+    }
+}
+
+impl From<&RadianceSamples> for Counts {
+    fn from(s: &RadianceSamples) -> Self {
+        let &RadianceSamples { ref samples, rays, misses, without_gradient } = s;
+        Self { rays, misses, samples: samples.len() as u64 - without_gradient, without_gradient }
     }
 }
 
@@ -301,8 +308,7 @@ impl<'a> Beside<'a> {
                 light[n as usize] = BesideLight { radiance, variance };
             }
         }
-        let (rays, misses, without_gradient) = (sampled.rays, sampled.misses, sampled.without_gradient);
-        Counts { rays, misses, samples: own.len() as u64 - without_gradient, without_gradient }
+        Counts::from(&sampled)
     }
 
     /// Gives the points without a level set of their own what makes interpolation come nearest to the light in the cells

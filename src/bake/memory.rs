@@ -2,12 +2,13 @@
 
 use super::bands::{Band, Levels};
 use super::grid_points::STAND_INS;
-use super::{BakeSettings, Engine, MOST_BANDS, StrategyName};
+use super::{BakeSettings, Engine, Interpolation, MOST_BANDS, StrategyName};
 use crate::checkpoint;
 use crate::embree::{Device, GraphTracer};
 use crate::error::{Error, Result};
 use crate::flat;
 use crate::flattened::Side;
+use crate::irradiance_caching;
 use crate::mask::{Mask, masks};
 use crate::node_set::NodeSet;
 use crate::photon::{FlatPhoton, PhotonSettings, SurfacePhoton, trace_photons};
@@ -35,6 +36,8 @@ const SAMPLE: u64 = 12 + 8 + size_of::<Option<RadianceSample>>() as u64;
 
 /// Bytes per scattered sample while Shepard blends them, besides the samples.
 const SHEPARD: u64 = 12 + 16 + 12 + size_of::<RadianceSample>() as u64;
+/// The same while irradiance caching looks at them.
+const CACHING: u64 = 12 + 16 + irradiance_caching::BYTES;
 
 /// Bytes per place beside the grid's points while they are fitted: the wish, and sorted by cells with what cells say.
 const WISH: u64 = 24;
@@ -204,7 +207,14 @@ impl Parts {
         let nodes = settings.strategy == StrategyName::Nodes || settings.engine == Engine::Sweep;
         let (scattered, scattering) = match nodes {
             true => (0, 0),
-            false => (samples * stored * SAMPLE, samples * (SAMPLE + SHEPARD) + points * (FITTED + 17)),
+            false => {
+                let looked_at = match settings.interpolation {
+                    Interpolation::Shepard => samples * SHEPARD,
+                    Interpolation::Fit => samples * SHEPARD + points * FITTED,
+                    Interpolation::Irradiance => samples * CACHING,
+                };
+                (samples * stored * SAMPLE, samples * SAMPLE + looked_at + points * 17)
+            }
         };
         Ok(Self {
             engine: settings.engine,

@@ -9,6 +9,7 @@ use crate::error::{Error, Result};
 use crate::fitted_grid::{Wish, fit};
 use crate::flattened::Side;
 use crate::illumination_grid::{IlluminationGrid, shepard};
+use crate::irradiance_caching::interpolate;
 use crate::mask::Mask;
 use crate::photon::{PhotonSettings, trace_photons};
 use crate::progress::{Clock, Progress, interrupted};
@@ -228,10 +229,8 @@ impl<'a> FieldLight<'a> {
                     let first = band.number * at.len().div_ceil(BLOCK);
                     let place = |n: usize| (own[n] as u64, at[own[n]]);
                     let got = sample_places(&sampler, own.len(), &place, saved(2), first, tick);
+                    counts += Counts::from(&got);
                     own.iter().zip(got.samples).for_each(|(&n, s)| scattered[n] = s);
-                    let (rays, misses, without_gradient) = (got.rays, got.misses, got.without_gradient);
-                    let samples = own.len() as u64 - without_gradient;
-                    counts += Counts { rays, misses, samples, without_gradient };
                 }
                 (Places::Grid(..), None) => {}
             }
@@ -249,10 +248,14 @@ impl<'a> FieldLight<'a> {
                 }
                 _ => {
                     let samples: Vec<RadianceSample> = scattered.into_iter().flatten().collect();
-                    let grid = shepard(&scene.field, lattice, masks, &samples, settings.neighbours, tick);
+                    let blended = || shepard(&scene.field, lattice, masks, &samples, settings.neighbours, tick);
                     match settings.interpolation {
-                        Interpolation::Shepard => grid,
+                        Interpolation::Shepard => blended(),
+                        Interpolation::Irradiance => {
+                            interpolate(scene, side, lattice, masks, &samples, settings.neighbours, tick)
+                        }
                         Interpolation::Fit => {
+                            let grid = blended();
                             let wishes: Vec<Wish> = samples.iter().map(Wish::from).collect();
                             drop(samples);
                             fit(&scene.field, lattice, &wishes, grid, |m| m != Mask::Empty, tick)

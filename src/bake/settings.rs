@@ -71,8 +71,10 @@ pub enum Interpolation {
     /// Modified Shepard: the nearest samples blended, as BB09.
     Shepard,
     /// Least squares: the grid whose interpolation on isosurfaces is nearest to the samples.
-    #[default]
     Fit,
+    /// Irradiance caching: closed-form direct light times the visible share that the samples know, and their indirect light.
+    #[default]
+    Irradiance,
 }
 
 /// What a user may set about a bake, in a scene file's `[bake]` table or by flags of the same names. Unset values come
@@ -123,7 +125,7 @@ pub struct BakeOptions {
     /// Whether light gathered at the grid's points is smoothed over neighbouring ones where that lowers its error
     #[arg(long, value_name = "BOOL")]
     pub smoothing: Option<bool>,
-    /// Nearest samples that Shepard interpolation blends
+    /// Nearest samples that interpolation looks at
     #[arg(long, value_name = "K")]
     pub neighbours: Option<usize>,
     /// How samples become grid values
@@ -326,6 +328,7 @@ impl BakeSettings {
         let gather_rays = o.gather_rays.unwrap_or(gather);
         // What no gather averages needs more photons; bins make them cheap.
         let per_estimate = if gather_rays == 0 && estimator == Estimator::Splat { 1000 } else { 64 };
+        let interpolation = o.interpolation.unwrap_or_default();
         let settings = Self {
             preset,
             engine,
@@ -348,8 +351,8 @@ impl BakeSettings {
             gather_rays,
             cache_shadow_rays: cache,
             smoothing: o.smoothing.unwrap_or(true),
-            neighbours: o.neighbours.unwrap_or(8),
-            interpolation: o.interpolation.unwrap_or_default(),
+            neighbours: o.neighbours.unwrap_or(if interpolation == Interpolation::Irradiance { 16 } else { 8 }),
+            interpolation,
             grid: o.grid.unwrap_or(GridSize::Factor(1)),
             wall_resolution: o.wall_resolution.unwrap_or(wall),
             wall_isovalues: isovalues,
