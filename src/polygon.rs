@@ -156,6 +156,21 @@ impl Polygon {
         (0..n).all(|i| (v[(i + 1) % n] - v[i]).cross(x - v[i]).dot(self.normal) >= 0.0)
     }
 
+    /// Distance of a point of the world.
+    pub fn distance(&self, x: DVec3) -> f64 {
+        let (v, n) = (&self.vertices, self.vertices.len());
+        let height = (x - v[0]).dot(self.normal);
+        if self.contains(x - height * self.normal) {
+            return height.abs();
+        }
+        let to_edge = |i: usize| {
+            let (a, edge) = (v[i], v[(i + 1) % n] - v[i]);
+            let t = ((x - a).dot(edge) / edge.length_squared()).clamp(0.0, 1.0);
+            (x - a - t * edge).length()
+        };
+        (0..n).map(to_edge).fold(f64::INFINITY, f64::min)
+    }
+
     /// Whether texture coordinates cover the polygon exactly.
     pub fn is_parallelogram(&self) -> bool {
         let v = &self.vertices;
@@ -307,6 +322,22 @@ mod tests {
         assert_eq!((s.area(), s.normal()), (2.0, DVec3::Z));
         assert_eq!(s.at([0.5, 1.0]), DVec3::new(1.0, 1.0, 3.0));
         assert_eq!(s.texture(DVec3::new(1.0, 1.0, 3.0)), [0.5, 1.0]);
+    }
+
+    #[test]
+    fn distances_to_face_edge_and_corner() {
+        let p = square();
+        let [a, b, _, d] = p.vertices().try_into().unwrap();
+        let (s, t) = ((b - a).normalize(), (d - a).normalize());
+        let middle = 0.5 * (b + d);
+        for (x, expected) in [
+            (middle + 0.3 * p.normal(), 0.3),
+            (middle - 0.3 * p.normal(), 0.3),
+            (0.5 * (a + d) - 0.3 * s + 0.4 * p.normal(), 0.5),
+            (a - 0.2 * s - 0.2 * t + 0.1 * p.normal(), 0.3),
+        ] {
+            assert!((p.distance(x) - expected).abs() < 1e-12, "{x}: {} {expected}", p.distance(x));
+        }
     }
 
     #[test]

@@ -1,18 +1,20 @@
-//! The fast engine: line sweeps light every node; exact rays fill the points beside the sweep's ends.
+//! The fast engine: line sweeps light every node; exact rays fill the points beside the sweep's ends, and those next to
+//! luminaires.
 
 use super::bands::Band;
-use super::grid_points::Beside;
+use super::grid_points::{Beside, Counts, STAND_INS};
 use super::photon_engine::{Job, STAGES};
 use super::{BakeSettings, Lit, stages};
 use crate::brdf::reflected;
-use crate::checkpoint::Checkpoint;
+use crate::checkpoint::{Checkpoint, Stage};
 use crate::embree::{Device, GraphTracer};
 use crate::error::Result;
 use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
 use crate::mask::Mask;
+use crate::polygon::Polygon;
 use crate::progress::{Clock, Progress};
-use crate::radiance::{Indirect, Sampler};
+use crate::radiance::{Indirect, Sampler, sample_places};
 use crate::radiance_cache::RadianceCache;
 use crate::scene::{Scene, Surface};
 use crate::sweep::{SweptSide, sweep_resumable};
@@ -26,6 +28,10 @@ const STEPS: f64 = 1000.0;
 /// The share of the photon engine's rays that a sample beside the sweep's ends takes: each point there is fitted to samples
 /// of its own and its neighbours'.
 const SHARE: u32 = 8;
+
+/// Points nearer to a luminaire than this many voxels are sampled by exact rays: on its front light falls off within a voxel,
+/// and what lies behind it is lit by lines that a sweep mixes a voxel further.
+const NEAR: f64 = 1.5;
 
 pub(super) fn light(
     Job { number, scene, lattice, masks }: &Job,
@@ -71,17 +77,32 @@ pub(super) fn light(
     let clock = Clock::start();
     let beside = Beside::new(&scene.field, lattice, masks, settings.seed);
     let mut sides = Vec::new();
+    let near = beside_luminaires(scene, masks);
     for (s, white) in swept.sides.iter().zip(white) {
-        let stage = progress.stage("samples", beside.len() as u64);
-        let indirect = Indirect::Gather(&cache, (settings.gather_rays / SHARE).max(2));
-        let (shadow_rays, seed) = ((settings.shadow_rays / SHARE).max(2), settings.seed);
+        let stage = progress.stage("samples", (beside.len() + near.len()) as u64);
+        let seed = settings.seed;
+        let gather = |share: u32| Indirect::Gather(&cache, (settings.gather_rays / share).max(2));
+        let shadow = |share: u32| (settings.shadow_rays / share).max(2);
+        let (indirect, shadow_rays) = (gather(SHARE), shadow(SHARE));
         let sampler = Sampler { scene, tracer: &tracer, indirect: &indirect, side: s.side, shadow_rays, seed };
         let saved = stages(checkpoint, STAGES * number + 4)[s.side.index()];
         let mut light = beside.dark();
         let counts = beside.sample(&sampler, Band::WHOLE, &mut light, saved, &|n| stage.tick(n));
-        stage.end()?;
         lit.count(counts);
-        let grid = swept_grid(masks, outgoing(scene, white), &s.std_error);
+        let (indirect, shadow_rays) = (gather(1), shadow(1));
+        let sampler = Sampler { indirect: &indirect, shadow_rays, ..sampler };
+        // Keys of a point beside; none of these is one.
+        let place = |n: usize| ((STAND_INS * near[n]) as u64, lattice_position(lattice, near[n]));
+        let sampled = sample_places(&sampler, near.len(), &place, Stage::UNSAVED, 0, &|n| stage.tick(n));
+        stage.end()?;
+        lit.count(Counts::from(&sampled));
+        let mut grid = swept_grid(masks, outgoing(scene, white), &s.std_error);
+        for (&o, sample) in near.iter().zip(&sampled.samples) {
+            if let Some(sample) = sample {
+                grid.radiance[o] = sample.radiance.to_array();
+                grid.std_error[o] = sample.variance.sqrt();
+            }
+        }
         sides.push((s.side, beside.fit(grid, &light)));
     }
     lit.fields.push(sides);
@@ -99,6 +120,24 @@ fn outgoing(scene: &Scene, mut white: Vec<[f32; 3]>) -> Vec<[f32; 3]> {
         *x = radiance.as_vec3().to_array();
     });
     white
+}
+
+/// Valid points less than [`NEAR`] voxels from a luminaire.
+fn beside_luminaires(scene: &Scene, masks: &[Mask]) -> Vec<usize> {
+    let lattice = scene.lattice();
+    let reach = NEAR * lattice.spacing().max_element();
+    let lights: Vec<&Polygon> = scene.luminaires().iter().map(|&l| &scene.polygons()[l as usize]).collect();
+    let near = |&o: &usize| {
+        let x = lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)));
+        masks[o] == Mask::Valid && lights.iter().any(|light| light.distance(x) < reach)
+    };
+    (0..masks.len()).into_par_iter().with_min_len(1 << 12).filter(near).collect()
+}
+
+/// A point of the lattice that is swept, in its own frame.
+#[allow(clippy::cast_possible_truncation, reason = "positions are f32")]
+fn lattice_position(lattice: &Lattice, o: usize) -> Vec3 {
+    DVec3::from_array(lattice.ijk(o).map(|i| i as f64)).as_vec3()
 }
 
 /// What a white surface would reflect at valid nodes, NaN elsewhere.

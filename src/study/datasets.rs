@@ -41,7 +41,7 @@ const COLUMNS: [&str; 25] = [
 ];
 
 /// Each data set at its main isovalue: straight from the map, with uniform samples as BB09 and with samples at the nodes;
-/// samples at the nodes with final gather, and the sweep engine; the interpolation floor of direct light at grid factors 1, 2, 3, and of
+/// samples at the nodes with final gather, and the sweep engine (or those of the engine that `base` names); the interpolation floor of direct light at grid factors 1, 2, 3, and of
 /// all light at that of the bakes (1 if their grid is given in points); the reference on triangles against the one on the trilinear surface.
 ///
 /// # Errors
@@ -60,6 +60,9 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
         ("nodes", exact(StrategyName::Nodes, None)),
         ("sweep", BakeOptions { engine: Some(Engine::Sweep), ..BakeOptions::default() }),
     ];
+    let modes =
+        modes.into_iter().filter(|(_, options)| base.engine.is_none_or(|engine| options.engine == Some(engine)));
+    let modes: Vec<(&str, BakeOptions)> = modes.collect();
     for subject in subjects {
         let scene = &subject.scene;
         let c = subject.main_isovalue();

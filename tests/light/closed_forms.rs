@@ -2,6 +2,7 @@
 
 use crate::support::*;
 use glam::DVec3;
+use isolume::bake::{BakeSettings, Engine};
 use isolume::embree::{Device, GraphTracer};
 use isolume::flattened::Side;
 use isolume::luminaire::unoccluded;
@@ -10,7 +11,7 @@ use isolume::photon::Photons;
 use isolume::photon_map::{EstimateSettings, PhotonMap};
 use isolume::polygon::Polygon;
 use isolume::radiance::{Indirect, sample_radiance};
-use isolume::scene::{Scene, Surface};
+use isolume::scene::{Boundary, Scene, Surface, cornell_box};
 use isolume::stats::Moments;
 use std::f64::consts::PI;
 
@@ -312,4 +313,20 @@ fn occlusion_by_an_infinite_wall() {
         println!("k = {k}: {taken:.6}, expected {expected}");
         assert!((taken - expected).abs() < 1e-3);
     }
+}
+
+/// The ceiling above a lamp that hangs closer below it than a voxel is dark: what lines bring to points a voxel lower must not
+/// reach it. Below a thousandth of the light in front of the lamp.
+#[test]
+fn the_ceiling_above_a_lamp_is_dark() {
+    let planes = field(lattice([33; 3], DVec3::ZERO, DVec3::ONE), 0.1, 1.1, |x| x.z + 0.1 * x.x);
+    let polygons = cornell_box(planes.lattice(), 0.0).unwrap();
+    let scene = Scene::new(planes, grey(0.75, Side::Lower), Boundary::Open, polygons).unwrap();
+    let bake = run(&scene, &BakeSettings { engine: Engine::Sweep, ..at_nodes(1) });
+    let above = |x: DVec3| x.z == 1.0 && (x.x - 0.5).abs().max((x.y - 0.5).abs()) < 0.19;
+    let found: Vec<f64> =
+        valid(&bake, &scene).into_iter().filter(|&(_, x, ..)| above(x)).map(|(.., radiance, _)| radiance).collect();
+    let worst = found.iter().fold(0.0, |a: f64, &b| a.max(b));
+    println!("{worst:.1e} at the brightest of {} points", found.len());
+    assert!(found.len() > 100 && worst < 1e-3, "{worst}");
 }
