@@ -5,15 +5,17 @@
 
 Per scene: radiance at the vertices against `isolume reference` by z-test (Šidák over all vertices), against a bake by
 `isolume compare` with two Mitsuba references, and what Mitsuba's `sdfgrid` traces per second beside `isolume`'s engine.
-Needs scripts/peers/requirements.txt and an LLVM that Mitsuba accepts (DRJIT_LIBLLVM_PATH).
+Needs scripts/peers/requirements.txt and LLVM 16 or later (the newest in /usr/lib, or DRJIT_LIBLLVM_PATH).
 Exit code 1 if a test fails.
 """
 
 import argparse
+import glob
 import json
 import math
 import os
 import pathlib
+import re
 import subprocess
 import sys
 import time
@@ -22,6 +24,13 @@ import numpy as np
 import mitsuba as mi
 import nrrd
 
+# LLVM before 16 ends the process at an instruction that it does not know.
+found = {int(re.search(r"(?:-|so\.)(\d+)", f)[1]): f for f in glob.glob("/usr/lib/*/libLLVM[-.]*[0-9]*") if re.search(r"(?:-|so\.)(\d+)", f)}
+if "DRJIT_LIBLLVM_PATH" not in os.environ:
+    if max(found, default=0) < 16:
+        print("Mitsuba 3: skipped, since there is no LLVM 16 or later; install libllvm19 or set DRJIT_LIBLLVM_PATH")
+        sys.exit(0)
+    os.environ["DRJIT_LIBLLVM_PATH"] = found[max(found)]
 mi.set_variant("llvm_ad_rgb")
 
 import drjit as dr  # noqa: E402
