@@ -4,7 +4,7 @@ use super::arrive;
 use super::directions::{Layout, Shear};
 use super::ends::Ends;
 use super::flats::{Arrivals, Flats, Incoming};
-use super::grid::{Geometry, NORMAL_SCALE, Planes, Source, transposed, untransposed};
+use super::grid::{Geometry, NORMAL_SCALE, Planes, Source};
 use super::half::Half4;
 use super::pack::{LANES, Light, Pack, Plan, Way};
 use super::simd::{Isa, prefetch};
@@ -70,25 +70,19 @@ impl Pass<'_> {
         incoming: &mut Incoming,
         tick: &mut dyn FnMut() -> bool,
     ) -> (Planes, bool) {
-        let dims = self.geometry.dims;
         let mut e = super::grid::black(b.len());
         let split = lines.partition_point(|s| !s.layout.transposed);
         let mut complete = true;
-        for (transpose, some) in [(false, &lines[..split]), (true, &lines[split..])] {
-            if some.is_empty() {
-                continue;
-            }
-            if transpose {
-                e.iter_mut().for_each(|e| *e = transposed(e, dims));
-            }
+        // Darkness is the same in both orders.
+        for (transposed, some) in [(true, &lines[split..]), (false, &lines[..split])] {
             for shear in some {
                 complete = complete && tick();
                 if complete {
                     self.family(side, shear, lines.len(), (b, scale), &mut e, flats, incoming);
                 }
             }
-            if transpose {
-                e.iter_mut().for_each(|e| *e = untransposed(e, dims));
+            if transposed && !some.is_empty() {
+                e.iter_mut().for_each(|e| *e = self.geometry.untransposed(e));
             }
         }
         self.normalise(lines, &mut e);
@@ -107,6 +101,9 @@ impl Pass<'_> {
             .into_par_iter()
             .enumerate()
             .for_each(|(row, (e0, e1, e2))| {
+                if !self.geometry.lit[row * COSINES..][..e0.len()].contains(&true) {
+                    return;
+                }
                 let mut sum = [0f32; COSINES];
                 self.isa.cosines(&omega, n.each_ref().map(|n| &n[row * COSINES..][..e0.len()]), &mut sum);
                 for e in [e0, e1, e2] {

@@ -186,6 +186,29 @@ impl<'a> Geometry<'a> {
         &self.awake[side.index()][usize::from(layout.transposed)]
     }
 
+    /// Light of the lit nodes from y, z, x order back to x, y, z; the others are black.
+    pub(super) fn untransposed(&self, from: &[f32]) -> Vec<f32> {
+        let [nx, ny, nz] = self.dims;
+        let blocks = &self.lit_blocks[0];
+        let mut to = vec![0.0; from.len()];
+        // Columns of as many rows as a cache line holds are read whole.
+        const ROWS: usize = 64;
+        to.par_chunks_mut(ROWS * nx).enumerate().for_each(|(chunk, out)| {
+            let first = chunk * ROWS;
+            let rows = out.len() / nx;
+            let mut bits = blocks.rows[first..first + rows].iter().fold(0, |all, bits| all | bits);
+            while bits != 0 {
+                let a = bits.trailing_zeros() as usize * blocks.size;
+                bits &= bits - 1;
+                for x in a..(a + blocks.size).min(nx) {
+                    let column = &from[x * ny * nz + first..][..rows];
+                    out.chunks_exact_mut(nx).zip(column).for_each(|(line, value)| line[x] = *value);
+                }
+            }
+        });
+        to
+    }
+
     /// Calls `visit` with the lit nodes of a row along x.
     #[inline(always)]
     pub(super) fn lit_nodes(&self, row: usize, mut visit: impl FnMut(usize)) {
@@ -326,32 +349,29 @@ pub(super) fn transposed<T: Copy + Default + Send + Sync>(from: &[T], [nx, ny, n
     to
 }
 
-/// y, z, x order back to x, y, z; `dims` are still those of x, y, z.
-pub(super) fn untransposed<T: Copy + Default + Send + Sync>(from: &[T], [nx, ny, nz]: [usize; 3]) -> Vec<T> {
-    let mut to = vec![T::default(); from.len()];
-    let rows = 64.min(ny * nz);
-    to.par_chunks_mut(rows * nx).enumerate().for_each(|(chunk, out)| {
-        for x in 0..nx {
-            let column = &from[x * ny * nz + chunk * rows..];
-            for (row, line) in out.chunks_exact_mut(nx).enumerate() {
-                line[x] = column[row];
-            }
-        }
-    });
-    to
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::field::Sweep;
+    use crate::volume::{Lattice, Samples, Volume};
 
+    /// Lit nodes in a corner, across blocks of rows, and in a row of their own.
     #[test]
-    fn transposition_is_undone() {
-        let dims = [19, 7, 5];
-        let from: Vec<f32> = (0..19 * 7 * 5).map(|i| i as f32).collect();
+    fn transposition_is_undone_where_nodes_are_lit() {
+        let dims = [67, 9, 11];
+        let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::ONE).unwrap();
+        let inside = |[x, y, z]: [usize; 3]| x < 4 && y < 5 || (x > 60 && z > 8) || (y == 7 && z == 3);
+        let h = |o: usize| if inside(lattice.ijk(o)) { 0.5 + 1e-3 * (o % 7) as f32 } else { -9.0 + (o % 3) as f32 };
+        let samples = (0..lattice.len()).map(h).collect();
+        let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
+        let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+        let geometry = Geometry::new(&field);
+        let from: Vec<f32> =
+            geometry.lit.iter().enumerate().map(|(o, lit)| if *lit { 1.0 + o as f32 } else { 0.0 }).collect();
+        assert!(geometry.lit.iter().filter(|lit| **lit).count() > 200);
         let to = transposed(&from, dims);
-        // (x, y, z) = (17, 3, 4).
-        assert_eq!(to[(17 * 5 + 4) * 7 + 3], from[(4 * 7 + 3) * 19 + 17]);
-        assert_eq!(untransposed(&to, dims), from);
+        // (x, y, z) = (2, 3, 4).
+        assert_eq!(to[(2 * 11 + 4) * 9 + 3], from[(4 * 9 + 3) * 67 + 2]);
+        assert_eq!(geometry.untransposed(&to), from);
     }
 }
