@@ -120,27 +120,43 @@ pub fn shepard(
     neighbours: usize,
     tick: &(dyn Fn(u64) -> bool + Sync),
 ) -> IlluminationGrid {
-    let axes = field.lattice().axes();
-    // Distances in the world; positions relative to Ω's corner keep f32 fine-grained.
-    let points: Vec<Vec3> = samples.par_iter().map(|s| (axes * s.position.as_dvec3()).as_vec3()).collect();
-    let grid = PointGrid::new(&points, 2.0);
+    let grid = point_grid(field, samples);
     let sorted: Vec<RadianceSample> = grid.numbers().par_iter().map(|&n| samples[n as usize]).collect();
+    from_nearest(lattice, masks, (&grid, neighbours), tick, |_, _, found| blend(found, &sorted))
+}
+
+/// The samples' places in the world, relative to Ω's corner so that f32 stays fine-grained, for searches.
+pub(crate) fn point_grid(field: &Field, samples: &[RadianceSample]) -> PointGrid {
+    let axes = field.lattice().axes();
+    let places: Vec<Vec3> = samples.par_iter().map(|s| (axes * s.position.as_dvec3()).as_vec3()).collect();
+    PointGrid::new(&places, 2.0)
+}
+
+/// A grid of what `value` says of each point that `masks` say holds light, radiance and standard error, from its number, its place
+/// as in [`point_grid`], and the so many samples nearest to it, as (squared distance, slot). `tick` as in [`shepard`].
+pub(crate) fn from_nearest(
+    lattice: &Lattice,
+    masks: &[Mask],
+    (grid, neighbours): (&PointGrid, usize),
+    tick: &(dyn Fn(u64) -> bool + Sync),
+    value: impl Fn(usize, Vec3, &[(f32, u32)]) -> ([f32; 3], f32) + Sync,
+) -> IlluminationGrid {
     let step = lattice.axes();
-    const ROW: usize = 4096;
+    const CHUNK: usize = 4096;
     let mut out: Vec<([f32; 3], f32)> = vec![([0.0; 3], 0.0); lattice.len()];
-    out.par_chunks_mut(ROW).enumerate().for_each(|(chunk, out)| {
+    out.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, out)| {
         if !tick(0) {
             return;
         }
         let mut found = Neighbours::default();
-        for (n, value) in out.iter_mut().enumerate() {
-            let o = chunk * ROW + n;
+        for (n, out) in out.iter_mut().enumerate() {
+            let o = chunk * CHUNK + n;
             if masks[o] == Mask::Empty {
                 continue;
             }
-            let q = (step * DVec3::from_array(lattice.ijk(o).map(|i| i as f64))).as_vec3();
-            grid.nearest(q, neighbours, f32::INFINITY, |_| true, &mut found);
-            *value = blend(found.found(), &sorted);
+            let place = (step * DVec3::from_array(lattice.ijk(o).map(|i| i as f64))).as_vec3();
+            grid.nearest(place, neighbours, f32::INFINITY, |_| true, &mut found);
+            *out = value(o, place, found.found());
         }
         tick(out.len() as u64);
     });

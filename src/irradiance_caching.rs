@@ -9,10 +9,9 @@
 use crate::brdf::reflected;
 use crate::direct::{luminance, open_irradiance};
 use crate::flattened::Side;
-use crate::illumination_grid::IlluminationGrid;
+use crate::illumination_grid::{IlluminationGrid, from_nearest, point_grid};
 use crate::linear_fit::Moments;
 use crate::mask::{Mask, local_position};
-use crate::nearest::{Neighbours, PointGrid};
 use crate::radiance::RadianceSample;
 use crate::scene::Scene;
 use crate::volume::Lattice;
@@ -61,53 +60,31 @@ pub fn interpolate(
     tick: &(dyn Fn(u64) -> bool + Sync),
 ) -> IlluminationGrid {
     let field = &scene.field;
-    let axes = field.lattice().axes();
     let points = masks.iter().filter(|&&m| m != Mask::Empty).count();
     let neighbours = neighbours.max((UNIT_BALL * samples.len() as f64 / points.max(1) as f64) as usize);
-    // Distances in the world; positions relative to Ω's corner keep f32 fine-grained.
-    let places: Vec<Vec3> = samples.par_iter().map(|s| (axes * s.position.as_dvec3()).as_vec3()).collect();
-    let grid = PointGrid::new(&places, 2.0);
-    let known = |&n: &u32| Known::new(scene, side, places[n as usize], &samples[n as usize]);
-    let known: Vec<Known> = grid.numbers().par_iter().map(known).collect();
-    drop(places);
-    const CHUNK: usize = 1024;
-    let mut out: Vec<([f32; 3], f32)> = vec![([0.0; 3], 0.0); lattice.len()];
-    out.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, out)| {
-        if !tick(0) {
-            return;
-        }
-        let mut found = Neighbours::default();
-        for (n, value) in out.iter_mut().enumerate() {
-            let o = chunk * CHUNK + n;
-            if masks[o] == Mask::Empty {
-                continue;
-            }
-            let p = local_position(field, lattice, o);
-            let place = (axes * p).as_vec3();
-            grid.nearest(place, neighbours, f32::INFINITY, |_| true, &mut found);
-            let around = Around::new(place, found.found(), &known);
-            let normal = scene.normal(p, side);
-            let direct = normal.map_or_else(|| around.direct(), |n| around.share() * open_irradiance(scene, p, n));
-            let indirect = around.indirect(normal.unwrap_or_default().as_vec3());
-            let albedo = scene.surface.albedo.at(field.value(p).clamp(0.0, 1.0));
-            let radiance = reflected(albedo, (direct + indirect).max(DVec3::ZERO)) + scene.surface.emission;
-            *value = (radiance.as_vec3().to_array(), around.std_error());
-        }
-        tick(out.len() as u64);
-    });
-    let (radiance, std_error) = out.into_iter().unzip();
-    IlluminationGrid { radiance, std_error, mask: masks.to_vec() }
+    let grid = point_grid(field, samples);
+    let known: Vec<Known> = grid.numbers().par_iter().map(|&n| Known::new(scene, side, &samples[n as usize])).collect();
+    from_nearest(lattice, masks, (&grid, neighbours), tick, |o, place, found| {
+        let p = local_position(field, lattice, o);
+        let around = Around::new(place, found, &known);
+        let normal = scene.normal(p, side);
+        let direct = normal.map_or_else(|| around.direct(), |n| around.share() * open_irradiance(scene, p, n));
+        let indirect = around.indirect(normal.unwrap_or_default().as_vec3());
+        let albedo = scene.surface.albedo.at(field.value(p).clamp(0.0, 1.0));
+        let radiance = reflected(albedo, (direct + indirect).max(DVec3::ZERO)) + scene.surface.emission;
+        (radiance.as_vec3().to_array(), around.std_error())
+    })
 }
 
 impl Known {
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-    fn new(scene: &Scene, side: Side, place: Vec3, sample: &RadianceSample) -> Self {
+    fn new(scene: &Scene, side: Side, sample: &RadianceSample) -> Self {
         let p = sample.position.as_dvec3();
         let normal = scene.normal(p, side).unwrap_or_default();
         let open = open_irradiance(scene, p, normal);
         let [a, b] = sample.indirect;
         Self {
-            place,
+            place: (scene.lattice().axes() * p).as_vec3(),
             normal: normal.as_vec3(),
             share: sample.direct / open.as_vec3().max(Vec3::splat(f32::MIN_POSITIVE)),
             open: luminance(open) as f32,

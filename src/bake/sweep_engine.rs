@@ -11,7 +11,7 @@ use crate::embree::{Device, GraphTracer};
 use crate::error::Result;
 use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
-use crate::mask::Mask;
+use crate::mask::{Mask, local_position};
 use crate::polygon::Polygon;
 use crate::progress::{Clock, Progress};
 use crate::radiance::{Indirect, Sampler, sample_places};
@@ -92,7 +92,7 @@ pub(super) fn light(
         let (indirect, shadow_rays) = (gather(1), shadow(1));
         let sampler = Sampler { indirect: &indirect, shadow_rays, ..sampler };
         // Keys of a point beside; none of these is one.
-        let place = |n: usize| ((STAND_INS * near[n]) as u64, lattice_position(lattice, near[n]));
+        let place = |n: usize| ((STAND_INS * near[n]) as u64, local_position(&scene.field, lattice, near[n]).as_vec3());
         let sampled = sample_places(&sampler, near.len(), &place, Stage::UNSAVED, 0, &|n| stage.tick(n));
         stage.end()?;
         lit.count(Counts::from(&sampled));
@@ -128,16 +128,10 @@ fn beside_luminaires(scene: &Scene, masks: &[Mask]) -> Vec<usize> {
     let reach = NEAR * lattice.spacing().max_element();
     let lights: Vec<&Polygon> = scene.luminaires().iter().map(|&l| &scene.polygons()[l as usize]).collect();
     let near = |&o: &usize| {
-        let x = lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)));
+        let x = lattice.to_world(local_position(&scene.field, lattice, o));
         masks[o] == Mask::Valid && lights.iter().any(|light| light.distance(x) < reach)
     };
     (0..masks.len()).into_par_iter().with_min_len(1 << 12).filter(near).collect()
-}
-
-/// A point of the lattice that is swept, in its own frame.
-#[allow(clippy::cast_possible_truncation, reason = "positions are f32")]
-fn lattice_position(lattice: &Lattice, o: usize) -> Vec3 {
-    DVec3::from_array(lattice.ijk(o).map(|i| i as f64)).as_vec3()
 }
 
 /// What a white surface would reflect at valid nodes, NaN elsewhere.

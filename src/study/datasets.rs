@@ -41,8 +41,9 @@ const COLUMNS: [&str; 25] = [
 ];
 
 /// Each data set at its main isovalue: straight from the map, with uniform samples as BB09 and with samples at the nodes;
-/// samples at the nodes with final gather, and the sweep engine (or those of the engine that `base` names); the interpolation floor of direct light at grid factors 1, 2, 3, and of
-/// all light at that of the bakes (1 if their grid is given in points); the reference on triangles against the one on the trilinear surface.
+/// samples at the nodes with final gather, and the sweep engine (or those of the engine that `base` names); the
+/// interpolation floor of direct light at grid factors 1, 2, 3, and of all light at that of the bakes (1 if their grid is given
+/// in points); the reference on triangles against the one on the trilinear surface.
 ///
 /// # Errors
 /// As bakes, references and tables.
