@@ -219,6 +219,55 @@ fn furnaces() {
 }
 
 #[test]
+fn a_furnace_at_the_line_where_surface_and_walls_meet() {
+    // Above an oblique plane that cuts the walls, which reflect all: the radiance is 1 there, too. There is no floor, so
+    // that a path that starts below the plane is dark.
+    let rho = 0.5;
+    let volume = Generator::from_name("linear:0.5,0.2,-1").unwrap().sample([17; 3]).unwrap();
+    let field = Field::new(&volume, Sweep::new(-0.9, 0.6).unwrap()).unwrap();
+    let lattice = field.lattice().clone();
+    let corner = |i: [usize; 3]| lattice.to_world(lattice.far() * DVec3::from_array(i.map(|i| i as f64)));
+    let centre = lattice.to_world(lattice.far() * 0.5);
+    let wall = |(axis, end): (usize, usize)| {
+        let point = |u: usize, v: usize| {
+            let mut p = [end; 3];
+            (p[(axis + 1) % 3], p[(axis + 2) % 3]) = (u, v);
+            corner(p)
+        };
+        let mut v = vec![point(0, 0), point(1, 0), point(1, 1), point(0, 1)];
+        if (v[1] - v[0]).cross(v[2] - v[0]).dot(centre - v[0]) < 0.0 {
+            v.reverse();
+        }
+        Polygon::new("wall", v, DVec3::ONE, DVec3::ZERO).unwrap()
+    };
+    let walls = [(0, 0), (0, 1), (1, 0), (1, 1), (2, 1)].map(wall).to_vec();
+    let surface = Surface { albedo: DVec3::splat(rho).into(), emission: DVec3::splat(1.0 - rho), ..Surface::default() };
+    let scene = Scene::new(field, surface, Boundary::Open, walls).unwrap();
+    let c = scene.field.sweep().isovalue(-0.1);
+    let (device, far) = (device(), lattice.far());
+    let mesh = SurfaceMesh::extract(&scene, c, 1).unwrap();
+    let graph = GraphTracer::new(&device, &scene).unwrap();
+    let triangles = SurfaceTracer::new(&device, &scene, c, 1).unwrap();
+    let edge = |v: &usize| (0..3).any(|a| mesh.local[*v][a] == 0.0 || mesh.local[*v][a] == far[a]);
+    let vertices: Vec<usize> = (0..mesh.local.len()).filter(edge).collect();
+    assert!(vertices.len() > 30, "{} vertices", vertices.len());
+    let level = normal_quantile(sidak(0.01, 2 * vertices.len()));
+    let mut paths = (PathTracer::new(&scene, &graph), PathTracer::new(&scene, &triangles));
+    for v in vertices {
+        let at = receiver(&scene, mesh.local[v], c, Side::Lower).unwrap();
+        let mut moments = [isolume::stats::Moments::default(); 2];
+        for i in 0..16 {
+            moments[0].push(paths.0.outgoing(&at, 64, (3, v as u64 * 16 + i)).x);
+            moments[1].push(paths.1.outgoing(&at, 64, (3, v as u64 * 16 + i)).x);
+        }
+        for (m, name) in moments.iter().zip(["graph", "triangles"]) {
+            let z = (m.mean() - 1.0) / m.std_error().max(1e-6);
+            assert!(z.abs() < 1.6 * level, "{name}, vertex {v} at {}: {} ± {}", mesh.local[v], m.mean(), m.std_error());
+        }
+    }
+}
+
+#[test]
 fn a_rectangle_of_light() {
     // Known answers of the design: the light at z = 1 facing down, above an empty part of the volume.
     let v = [(-0.25, -0.25), (-0.25, 0.25), (0.25, 0.25), (0.25, -0.25)];

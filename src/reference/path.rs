@@ -107,7 +107,10 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
         loop {
             self.rays += 1;
             let Some(hit) = self.tracer.intersect(&ray) else { return total };
-            let Some((receiver, albedo, emission)) = landing(self.scene, &ray, hit) else { return total };
+            let Some((mut receiver, albedo, emission)) = landing(self.scene, &ray, hit) else { return total };
+            if touches(self.scene, &ray, hit) {
+                receiver.departure = ray.departure;
+            }
             total += weight * emission;
             let survival = (weight * albedo).max_element() / weight.max_element();
             if !(survival > 0.0) {
@@ -122,6 +125,16 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
             ray = self.scene.ray(receiver.position, direction, ray.isovalue, receiver.departure);
         }
     }
+}
+
+/// Whether a ray from a level set meets a polygon where it starts, within the rounding of f32 coordinates. What leaves the
+/// polygon there starts on the level set, too: it must not begin behind it. (The polygon itself is no obstacle if it is met
+/// from its front only.)
+fn touches(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> bool {
+    let Target::Polygon(id) = hit.target else { return false };
+    let on_surface = matches!(ray.departure, Departure::Surface(_) | Departure::Companion(..));
+    let rounding = 16.0 * f32::EPSILON * ray.origin.abs().max_element().max(1.0);
+    on_surface && !scene.polygons()[id as usize].opaque_back && hit.t * ray.direction.length() <= rounding
 }
 
 /// A picture of hyperplane `isovalue` by `samples` paths per pixel; luminaires are seen.
