@@ -117,6 +117,36 @@ fn swept_occlusion_agrees_with_exact_rays() {
     }
 }
 
+/// Level sets that run into all of Ω's faces: what nodes on a face see of them, half a voxel from the nearest lines.
+#[test]
+fn nodes_on_faces_see_as_much_as_exact_rays() {
+    let lattice = Lattice::aligned([41; 3], DVec3::ZERO, DVec3::splat(1.0 / 40.0)).unwrap();
+    let gyroid = |x: DVec3| {
+        let [(sx, cx), (sy, cy), (sz, cz)] = (x * 9.0 + 0.4).to_array().map(f64::sin_cos);
+        sx * cy + sy * cz + sz * cx
+    };
+    let surface = Surface { albedo: DVec3::ZERO.into(), emission: DVec3::ONE, ..Surface::default() };
+    let scene = Scene::new(field(lattice, (-1.0, 1.0), gyroid), surface, Boundary::Open, Vec::new()).unwrap();
+    let device = Device::new(1).unwrap();
+    let tracer = GraphTracer::new(&device, &scene).unwrap();
+    let got = run(&scene, ONE_BOUNCE);
+    let mut rng = Rng::stream(2, Stage::Test, 0);
+    let mut off = |among: &[usize]| {
+        let some: Vec<usize> = (0..150).map(|_| among[(rng.unit() * among.len() as f64) as usize]).collect();
+        let exact: Vec<f64> = some.par_iter().map(|&o| exact_occlusion(&tracer, &scene, o, 1024)).collect();
+        let error = || some.iter().zip(&exact).map(|(&o, x)| f64::from(got.sides[0].irradiance[o][1]) / PI - x);
+        (rms(error()), error().sum::<f64>() / some.len() as f64)
+    };
+    let (within, _) = off(&nodes(&scene, 3));
+    let all = nodes(&scene, 0);
+    for (axis, end) in (0..3).flat_map(|axis| [(axis, 0), (axis, 40)]) {
+        let face: Vec<usize> = all.iter().copied().filter(|&o| scene.lattice().ijk(o)[axis] == end).collect();
+        let (rms, bias) = off(&face);
+        println!("axis {axis} at {end}: RMS {rms:.4}, bias {bias:.4}, within {within:.4}");
+        assert!(rms < 2.0 * within && bias.abs() < 0.01, "axis {axis} at {end}: RMS {rms}, bias {bias}");
+    }
+}
+
 #[test]
 fn integrating_sphere() {
     // Inside a sphere of any radius the reflected light of a small source is the same everywhere: ρΦ/(4πR²(1−ρ)).

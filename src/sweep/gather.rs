@@ -37,6 +37,24 @@ type RowLight = [Vec<f32>; 3];
 /// The irradiance of a row of nodes, a slice per channel.
 type Row<'a> = [&'a mut [f32]; 3];
 
+/// A row of nodes: its slice, its place along v, its irradiance.
+struct Nodes<'a> {
+    k: usize,
+    j: usize,
+    e: Row<'a>,
+}
+
+/// By how many lines the cell of lines around node `j` of `n` is to be moved into Ω: on Ω's faces the light is linear
+/// beyond the last two lines. 0 if there is only one.
+fn inwards(j: usize, n: usize) -> isize {
+    match j {
+        _ if n == 2 => 0,
+        0 => 1,
+        j if j == n - 1 => -1,
+        _ => 0,
+    }
+}
+
 /// What a task needs beside its rows.
 pub(super) struct Workspace {
     pack: Pack,
@@ -106,8 +124,10 @@ impl Pass<'_> {
                 }
                 let mut sum = [0f32; COSINES];
                 self.isa.cosines(&omega, n.each_ref().map(|n| &n[row * COSINES..][..e0.len()]), &mut sum);
+                // What goes on linearly beyond the last lines may fall below 0.
                 for e in [e0, e1, e2] {
-                    e.iter_mut().zip(&sum).for_each(|(e, s)| *e *= if *s > 0.0 { half / s } else { 0.0 });
+                    let scaled = |(e, s): (&mut f32, &f32)| *e = if *s > 0.0 { (*e * half / s).max(0.0) } else { 0.0 };
+                    e.iter_mut().zip(&sum).for_each(scaled);
                 }
             });
     }
@@ -142,9 +162,10 @@ impl Pass<'_> {
         let first = plan.first[1].min(family.walls.rows.0);
         let last = (plan.first[1] + plan.count[1] as isize).max(family.walls.rows.1);
         let count = (last - first + 1).unsigned_abs();
-        let mut rows: Vec<(Vec<(usize, Row)>, Arrivals)> = (0..count).map(|_| Default::default()).collect();
-        for (k, j, row) in self.rows(&plan, e) {
-            rows[(j as isize - plan.shift[1][k].0 - first).unsigned_abs()].0.push((k, row));
+        let mut rows: Vec<(Vec<Nodes>, Arrivals)> = (0..count).map(|_| Default::default()).collect();
+        for (k, j, e) in self.rows(&plan, e) {
+            let q = j as isize - plan.shift[1][k].0 + inwards(j, plan.shear.layout.dims[1]);
+            rows[(q - first).unsigned_abs()].0.push(Nodes { k, j, e });
         }
         let size = count.div_ceil(TASKS * rayon::current_num_threads());
         rows.par_chunks_mut(size).enumerate().for_each(|(task, rows)| {
@@ -174,7 +195,7 @@ impl Pass<'_> {
     }
 
     /// Rows q = `first` … of lines: their light to the nodes between each and the one before, and to walls.
-    fn rows_of_lines(&self, family: &Family, first: isize, rows: &mut [(Vec<(usize, Row)>, Arrivals)]) {
+    fn rows_of_lines(&self, family: &Family, first: isize, rows: &mut [(Vec<Nodes>, Arrivals)]) {
         let plan = family.plan;
         let size = plan.shear.layout.dims[2] * plan.width;
         let mut work = self
@@ -194,11 +215,10 @@ impl Pass<'_> {
             self.row_of_lines(family, q, &mut work, n % 2, Some(arrivals));
             let (this, before) = (&work.light[n % 2], &work.light[1 - n % 2]);
             for row in 0..nodes.len() {
-                if let Some((k, e)) = nodes.get(row + 1) {
-                    self.prefetch(family, (*k, q), e);
+                if let Some(next) = nodes.get(row + 1) {
+                    self.prefetch(family, next);
                 }
-                let (k, e) = &mut nodes[row];
-                self.accumulate(family, (*k, q), [this, before], e);
+                self.accumulate(family, [this, before], &mut nodes[row]);
             }
         }
         self.workspaces.lock().expect("no thread panics").push(work);
@@ -237,32 +257,28 @@ impl Pass<'_> {
     }
 
     /// Brings what [`Self::accumulate`] reads and adds to into the cache.
-    fn prefetch(&self, family: &Family, (k, q): (usize, isize), e: &Row) {
+    fn prefetch(&self, family: &Family, nodes: &Nodes) {
         let layout = &family.plan.shear.layout;
-        let j = (q + family.plan.shift[1][k].0).unsigned_abs();
-        let at = k * layout.stride[1] + j * layout.stride[0];
-        e.iter().for_each(|e| prefetch(e));
+        let at = nodes.k * layout.stride[1] + nodes.j * layout.stride[0];
+        nodes.e.iter().for_each(|e| prefetch(e));
         self.geometry.normals(layout).iter().for_each(|n| prefetch(&n[at..][..layout.dims[0]]));
     }
 
-    /// Adds what lines q and q − 1 brought to a row of nodes in slice k: each node takes its four nearest lines by
-    /// bilinear weights, normalised at Ω's faces, times the cosine of its own normal.
-    fn accumulate(&self, family: &Family, (k, q): (usize, isize), light: [&RowLight; 2], e: &mut Row) {
+    /// Adds what a row of lines and the one before it brought to a row of nodes: each node takes its four nearest lines by
+    /// bilinear weights, times the cosine of its own normal.
+    fn accumulate(&self, family: &Family, light: [&RowLight; 2], nodes: &mut Nodes) {
         let plan = family.plan;
         let layout = &plan.shear.layout;
         let [nu, nv, _] = layout.dims;
-        let (whole, fv) = plan.shift[1][k];
-        let j = (q + whole).unsigned_abs();
-        // Lines beyond Ω's faces do not exist: their neighbour counts alone.
-        let (near, far, fv) = match j {
-            0 => (0, 0, 0.0),
-            j if j == nv - 1 => (1, 1, 0.0),
-            _ => (0, 1, fv),
-        };
+        let Nodes { k, j, e } = nodes;
+        let (k, j) = (*k, *j);
+        let fv = plan.shift[1][k].1 + inwards(j, nv) as f32;
+        // Of a single row of lines, all.
+        let fv = if nv > 2 { fv } else { j as f32 };
         let (whole, fu) = plan.shift[0][k];
         let line0 = (-whole - plan.first[0]).unsigned_abs();
         let light: [[&[f32]; 3]; 2] =
-            [near, far].map(|r| std::array::from_fn(|c| &light[r][c][k * plan.width..][..plan.width]));
+            light.map(|light| std::array::from_fn(|c| &light[c][k * plan.width..][..plan.width]));
         let at = k * layout.stride[1] + j * layout.stride[0];
         let normals = self.geometry.normals(layout);
         let n = [0, 1, 2].map(|a| &normals[a][at..][..nu]);
@@ -300,13 +316,18 @@ pub(super) fn accumulate_row(
     (a, b): (usize, usize),
 ) {
     let nu = n[0].len();
-    // Ω's faces: one column of lines.
-    for (i, line) in [(0, line0), (nu - 1, line0 + nu - 2)] {
+    // Ω's faces: the light goes on as between the last two columns of lines; of a single one it is the same everywhere.
+    let faces = if nu > 2 {
+        [(0, line0, line0 + 1, -fu), (nu - 1, line0 + nu - 2, line0 + nu - 3, fu - 1.0)]
+    } else {
+        [(0, line0, line0, 0.0), (1, line0, line0, 0.0)]
+    };
+    for (i, last, inner, f) in faces {
         if a <= i && i < b {
             let cos = omega[0] * f32::from(n[0][i]) + omega[1] * f32::from(n[1][i]) + omega[2] * f32::from(n[2][i]);
             let cos = cos.abs();
             for c in 0..3 {
-                let (near, far) = (light[0][c][line], light[1][c][line]);
+                let [near, far] = [0, 1].map(|r| (1.0 - f) * light[r][c][last] + f * light[r][c][inner]);
                 e[c][i] += cos * ((1.0 - fv) * near + fv * far);
             }
         }

@@ -528,7 +528,8 @@ impl Pack {
                 let value = self.h[row][lane];
                 let mut rgb = [0f32; 3];
                 if value.is_finite() {
-                    let forward = self.h[row + 1][lane] < self.h[row - 1][lane];
+                    // Beyond the first and the last slice there is nothing to compare with.
+                    let forward = self.h[(row + 1).min(rows - 2)][lane] < self.h[(row - 1).max(1)][lane];
                     let d = usize::from(!forward);
                     let (j, t) = (self.next[d][row][lane] as usize, self.h_next[d][row][lane]);
                     if j < ends {

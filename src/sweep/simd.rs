@@ -374,7 +374,8 @@ mod avx512 {
                 unsafe { _mm512_loadu_si512(x.as_ptr().cast()) }
             };
             let h = load(&pack.h[row]);
-            let forward = _mm512_cmp_ps_mask::<_CMP_LT_OQ>(load(&pack.h[row + 1]), load(&pack.h[row - 1]));
+            let (after, before) = (&pack.h[(row + 1).min(rows - 2)], &pack.h[(row - 1).max(1)]);
+            let forward = _mm512_cmp_ps_mask::<_CMP_LT_OQ>(load(after), load(before));
             let active = _mm512_cmp_ps_mask::<_CMP_LT_OQ>(_mm512_abs_ps(h), infinity);
             let j = _mm512_mask_mov_epi32(links(&pack.next[1][row]), forward, links(&pack.next[0][row]));
             let t = _mm512_mask_mov_ps(load(&pack.h_next[1][row]), forward, load(&pack.h_next[0][row]));
@@ -540,7 +541,7 @@ mod tests {
         for lane in 0..LANES {
             for row in (1..49).filter(|r| r % 11 != 7) {
                 let value = h(row, lane);
-                let forward = h(row + 1, lane) < h(row - 1, lane);
+                let forward = h((row + 1).min(48), lane) < h((row - 1).max(1), lane);
                 let next = if forward {
                     (row + 1..50).find(|&r| h(r, lane) >= value)
                 } else {
