@@ -36,7 +36,7 @@ use crate::scene::{Boundary, Scene};
 use flats::Flats;
 use gather::Pass;
 use glam::DVec3;
-use grid::{Geometry, Planes};
+use grid::{Geometry, Planes, Spare};
 use half::Half4;
 use monitor::Monitor;
 use rayon::prelude::*;
@@ -202,7 +202,17 @@ pub fn sweep_resumable(
         state.counts.valid = geometry.valid.iter().filter(|v| **v).count() as u64;
         state.counts.masked = geometry.valid.len() as u64 - state.counts.valid;
     }
-    let run = Run { scene, settings, geometry: &geometry, inside: &inside, sides: &sides, isa: Isa::detect(), saved };
+    let spare = Spare::default();
+    let run = Run {
+        scene,
+        settings,
+        geometry: &geometry,
+        inside: &inside,
+        sides: &sides,
+        isa: Isa::detect(),
+        saved,
+        spare: &spare,
+    };
     let mut stopped = false;
     while state.done < replicates && !stopped {
         let r = state.done;
@@ -210,9 +220,12 @@ pub fn sweep_resumable(
         let (light, complete) = run.replicate(&mut state, passes.take(), &mut flats, &progress);
         stopped = !complete;
         if complete || r == 0 {
-            state.add(light, &flats, scene);
+            // Direct light needs as much as passes with these planes, and no more.
+            spare.clear();
+            spare.keep(state.add(light, &flats, scene));
         }
     }
+    spare.clear();
     if !stopped {
         saved.save(0, || state.bytes(None));
     }
@@ -269,6 +282,7 @@ struct Run<'a> {
     sides: &'a [Side],
     isa: Isa,
     saved: Stage<'a>,
+    spare: &'a Spare,
 }
 
 /// Direct and indirect irradiance of one replicate, per side; the latter is missing if it was stopped.
@@ -294,7 +308,7 @@ impl Run<'_> {
         let number = state.done as u64;
         let (direct, complete) = direct::direct(
             self.scene,
-            (self.geometry, self.isa),
+            (self.geometry, self.isa, self.spare),
             flats,
             self.sides,
             (s.seed, number, points),
@@ -311,9 +325,9 @@ impl Run<'_> {
         let (b, unit) = if late > 0 {
             let share = 1.0 / state.done as f32;
             flats.take(&state.flats, share);
-            self.reflect(flats, &[(state.total.light.as_slice(), [share; 3])])
+            self.reflect(flats, &[(state.total.light.as_slice(), [share; 3])], Vec::new())
         } else {
-            self.reflect(flats, &[(direct.as_slice(), [1.0; 3])])
+            self.reflect(flats, &[(direct.as_slice(), [1.0; 3])], Vec::new())
         };
         Ok(Passes { direct, b, unit, monitor: Monitor::default(), late, bounce: 0 })
     }
@@ -356,6 +370,7 @@ impl Run<'_> {
             inside: self.inside,
             primary: self.sides[0],
             isa: self.isa,
+            spare: self.spare,
             workspaces: Mutex::default(),
         };
         let fixed = !self.settings.settles();
@@ -397,7 +412,7 @@ impl Run<'_> {
             }
             if stopped {
                 // Half a pass is not kept, and may be as large as what is.
-                indirect.clear();
+                self.spare.keep(indirect.drain(..));
                 self.saved.save(0, || state.bytes(Some((&now, flats))));
                 state.see(&now);
                 return ([now.direct, Vec::new()], false);
@@ -409,21 +424,27 @@ impl Run<'_> {
             now.late += usize::from(late && !fixed);
             let scale = if fixed { [1.0; 3] } else { now.monitor.push(self.mean(&indirect)) };
             flats.reflect(scale, true);
-            now.b.clear();
             if now.late == LATE || bounce == s.max_bounces {
                 break;
             }
-            (now.b, now.unit) = self.reflect(flats, &[(now.direct.as_slice(), [1.0; 3]), (&indirect, scale)]);
-            indirect.clear();
+            let old = std::mem::take(&mut now.b);
+            (now.b, now.unit) = self.reflect(flats, &[(now.direct.as_slice(), [1.0; 3]), (&indirect, scale)], old);
+            self.spare.keep(indirect.drain(..));
         }
         state.see(&now);
         ([now.direct, indirect], true)
     }
 
     /// B = Le + ρ/π Σ scale · irradiance of the sides, filled where no surface is, as lines read it; packs the flats too.
-    /// `light`: one or two sets of irradiance, each with its scale. Returns what all was multiplied by.
+    /// `light`: one or two sets of irradiance, each with its scale; `old`: memory of the same form. Returns what all was
+    /// multiplied by.
     #[allow(clippy::cast_possible_truncation, reason = "albedo and emission")]
-    fn reflect(&self, flats: &mut Flats, light: &[(&[Planes], [f32; 3])]) -> (Vec<Vec<Half4>>, f32) {
+    fn reflect(
+        &self,
+        flats: &mut Flats,
+        light: &[(&[Planes], [f32; 3])],
+        old: Vec<Vec<Half4>>,
+    ) -> (Vec<Vec<Half4>>, f32) {
         let surface = &self.scene.surface;
         let over_pi =
             |albedo: DVec3| -> [f32; 3] { std::array::from_fn(|c| (albedo[c] / std::f64::consts::PI) as f32) };
@@ -444,9 +465,10 @@ impl Run<'_> {
         }
         let unit = half::scale(most);
         flats.pack(unit);
+        let mut old = old.into_iter();
         let b = (0..sides).map(|s| {
             let n = light[0].0[s][0].len();
-            let mut b = vec![[0; 4]; n];
+            let mut b = old.next().unwrap_or_else(|| vec![[0; 4]; n]);
             b.par_chunks_mut(1 << 12).enumerate().for_each(|(chunk, b)| {
                 let range = chunk << 12..(chunk << 12) + b.len();
                 let lit = &self.geometry.lit[range.clone()];

@@ -3,7 +3,7 @@
 
 use super::directions::Layout;
 use super::flats::{Flats, capped};
-use super::grid::{Blocks, Geometry, Planes};
+use super::grid::{Blocks, Geometry, Planes, Spare};
 use super::pack::LANES;
 use super::segments::Segments;
 use super::simd::Isa;
@@ -220,7 +220,7 @@ fn points(light: &Polygon, seed: u64, index: u64, number: u32, count: usize) -> 
 #[allow(clippy::cast_possible_truncation, reason = "irradiance is f32")]
 pub(super) fn direct(
     scene: &Scene,
-    (geometry, isa): (&Geometry, Isa),
+    (geometry, isa, spare): (&Geometry, Isa, &Spare),
     flats: &mut Flats,
     sides: &[Side],
     (seed, index, count): (u64, u64, usize),
@@ -228,7 +228,7 @@ pub(super) fn direct(
 ) -> (Vec<Planes>, bool) {
     let n = geometry.h.len();
     let lattice = scene.lattice();
-    let mut planes: Vec<Planes> = sides.iter().map(|_| super::grid::black(n)).collect();
+    let mut planes: Vec<Planes> = sides.iter().map(|_| spare.black(n)).collect();
     flats.textures.iter_mut().flatten().for_each(|t| t.direct.fill(0.0));
     let [nx, ny, _] = geometry.dims;
     let corners: Vec<DVec3> = (0..8)
@@ -245,7 +245,7 @@ pub(super) fn direct(
         let blockers = Blockers::new(scene, number, &corners);
         // Σ V g and Σ g of every node and side.
         let per = sides.len();
-        let mut sums: Vec<[f32; 2]> = vec![[0.0; 2]; per * n];
+        let mut sums: Vec<[f32; 2]> = (0..per * n).into_par_iter().with_min_len(1 << 14).map(|_| [0.0; 2]).collect();
         let place = [Side::Lower, Side::Higher].map(|s| sides.iter().position(|x| *x == s).unwrap_or(0));
         for &world in &points {
             if !tick() {

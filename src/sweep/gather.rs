@@ -4,7 +4,7 @@ use super::arrive;
 use super::directions::{Layout, Shear};
 use super::ends::Ends;
 use super::flats::{Arrivals, Flats, Incoming};
-use super::grid::{Geometry, NORMAL_SCALE, Planes, Source};
+use super::grid::{Geometry, NORMAL_SCALE, Planes, Source, Spare};
 use super::half::Half4;
 use super::pack::{LANES, Light, Pack, Plan, Way};
 use super::simd::{Isa, prefetch};
@@ -24,7 +24,8 @@ pub(super) struct Pass<'a> {
     pub primary: Side,
     /// The instruction set of the hot loops.
     pub isa: Isa,
-    /// Buffers to reuse.
+    /// Memory to use again.
+    pub spare: &'a Spare,
     pub workspaces: Mutex<Vec<Workspace>>,
 }
 
@@ -88,7 +89,7 @@ impl Pass<'_> {
         incoming: &mut Incoming,
         tick: &mut dyn FnMut() -> bool,
     ) -> (Planes, bool) {
-        let mut e = super::grid::black(b.len());
+        let mut e = self.spare.black(b.len());
         let split = lines.partition_point(|s| !s.layout.transposed);
         let mut complete = true;
         // Darkness is the same in both orders.
@@ -100,7 +101,7 @@ impl Pass<'_> {
                 }
             }
             if transposed && !some.is_empty() {
-                e.iter_mut().for_each(|e| *e = self.geometry.untransposed(e));
+                e = self.geometry.untransposed(e, self.spare);
             }
         }
         self.normalise(lines, &mut e);

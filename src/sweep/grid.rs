@@ -7,6 +7,7 @@ use crate::field::Field;
 use crate::flattened::Side;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
+use std::sync::Mutex;
 
 /// Normals are stored in units of 1/32767.
 pub(super) const NORMAL_SCALE: f32 = 32767.0;
@@ -17,9 +18,39 @@ const OVERSHOOT: f32 = 0.1;
 /// Red, green and blue, a plane each, so that neighbouring lines load neighbouring numbers.
 pub(super) type Planes = [Vec<f32>; 3];
 
-/// `n` black values.
-pub(super) fn black(n: usize) -> Planes {
-    std::array::from_fn(|_| vec![0.0; n])
+/// Planes to be used again: taking memory from the system and giving it back costs more than a pass over it, and memory
+/// that is read before it is written twice as much, with all threads waiting.
+#[derive(Default)]
+pub(super) struct Spare {
+    planes: Mutex<Vec<Vec<f32>>>,
+}
+
+impl Spare {
+    /// Black planes of `n` nodes.
+    pub(super) fn black(&self, n: usize) -> Planes {
+        std::array::from_fn(|_| self.plane(n))
+    }
+
+    /// A black plane of `n` nodes.
+    fn plane(&self, n: usize) -> Vec<f32> {
+        match self.planes.lock().expect("no thread panics").pop() {
+            Some(mut plane) if plane.len() == n => {
+                plane.par_chunks_mut(1 << 14).for_each(|chunk| chunk.fill(0.0));
+                plane
+            }
+            _ => (0..n).into_par_iter().with_min_len(1 << 14).map(|_| 0.0).collect(),
+        }
+    }
+
+    /// Takes planes that are no longer needed.
+    pub(super) fn keep(&self, planes: impl IntoIterator<Item = Planes>) {
+        self.planes.lock().expect("no thread panics").extend(planes.into_iter().flatten());
+    }
+
+    /// Gives all back to the system.
+    pub(super) fn clear(&self) {
+        self.planes.lock().expect("no thread panics").clear();
+    }
 }
 
 /// What every pass reads: h and the receiver normals towards the lower side, in both memory orders.
@@ -187,10 +218,19 @@ impl<'a> Geometry<'a> {
     }
 
     /// Light of the lit nodes from y, z, x order back to x, y, z; the others are black.
-    pub(super) fn untransposed(&self, from: &[f32]) -> Vec<f32> {
+    pub(super) fn untransposed(&self, planes: Planes, spare: &Spare) -> Planes {
+        planes.map(|from| {
+            let mut to = spare.plane(from.len());
+            self.untranspose(&from, &mut to);
+            spare.planes.lock().expect("no thread panics").push(from);
+            to
+        })
+    }
+
+    /// As [`Self::untransposed`], into black.
+    fn untranspose(&self, from: &[f32], to: &mut [f32]) {
         let [nx, ny, nz] = self.dims;
         let blocks = &self.lit_blocks[0];
-        let mut to = vec![0.0; from.len()];
         // Columns of as many rows as a cache line holds are read whole.
         const ROWS: usize = 64;
         to.par_chunks_mut(ROWS * nx).enumerate().for_each(|(chunk, out)| {
@@ -206,7 +246,6 @@ impl<'a> Geometry<'a> {
                 }
             }
         });
-        to
     }
 
     /// Calls `visit` with the lit nodes of a row along x.
@@ -372,6 +411,10 @@ mod tests {
         let to = transposed(&from, dims);
         // (x, y, z) = (2, 3, 4).
         assert_eq!(to[(2 * 11 + 4) * 9 + 3], from[(4 * 9 + 3) * 67 + 2]);
-        assert_eq!(geometry.untransposed(&to), from);
+        let spare = Spare::default();
+        // What a plane held before is forgotten.
+        spare.keep([std::array::from_fn(|_| vec![3.0; from.len()])]);
+        let got = geometry.untransposed(std::array::from_fn(|_| to.clone()), &spare);
+        got.iter().for_each(|plane| assert_eq!(plane, &from));
     }
 }

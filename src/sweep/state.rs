@@ -49,9 +49,9 @@ impl State {
         }
     }
 
-    /// Adds a replicate and what it left on the flats.
-    pub(super) fn add(&mut self, light: [Vec<Planes>; 2], flats: &Flats, scene: &Scene) {
-        self.total.add(light, scene);
+    /// Adds a replicate and what it left on the flats. Returns the planes that are free.
+    pub(super) fn add(&mut self, light: [Vec<Planes>; 2], flats: &Flats, scene: &Scene) -> Vec<Planes> {
+        let spare = self.total.add(light, scene);
         let radiance = || flats.textures.iter().map(|t| t.as_ref().map(|t| &t.radiance));
         if self.done == 0 {
             self.flats = radiance().map(Option::<&Vec<f32>>::cloned).collect();
@@ -63,6 +63,7 @@ impl State {
             }
         }
         self.done += 1;
+        spare
     }
 
     /// Takes note of how far a replicate came.

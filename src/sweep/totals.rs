@@ -38,14 +38,14 @@ impl Totals {
         self.nodes
     }
 
-    /// Takes the direct and indirect irradiance of a replicate, or the direct one alone.
+    /// Takes the direct and indirect irradiance of a replicate, or the direct one alone. Returns the planes it does not keep.
     #[allow(clippy::cast_possible_truncation, reason = "albedo")]
-    pub(super) fn add(&mut self, [mut direct, indirect]: [Vec<Planes>; 2], scene: &Scene) {
-        direct.truncate(self.sides.len());
+    pub(super) fn add(&mut self, [mut direct, indirect]: [Vec<Planes>; 2], scene: &Scene) -> Vec<Planes> {
+        let mut spare = direct.split_off(self.sides.len());
         for (sum, new) in direct.iter_mut().flatten().zip(indirect.iter().flatten()) {
             sum.par_iter_mut().zip(new).with_min_len(1 << 12).for_each(|(s, n)| *s += n);
         }
-        drop(indirect);
+        spare.extend(indirect);
         let new = direct;
         self.count += 1.0;
         let luminance = |albedo: DVec3| -> [f32; 3] {
@@ -64,7 +64,7 @@ impl Totals {
         }
         if self.light.is_empty() {
             self.light = new;
-            return;
+            return spare;
         }
         // (x − mean of those before)² (n − 1)/n.
         let (before, share) = (1.0 / (self.count - 1.0), (self.count - 1.0) / self.count);
@@ -78,6 +78,8 @@ impl Totals {
         for (s, n) in self.light.iter_mut().flatten().zip(new.iter().flatten()) {
             s.par_iter_mut().zip(n).with_min_len(1 << 12).for_each(|(s, n)| *s += n);
         }
+        spare.extend(new);
+        spare
     }
 
     #[allow(clippy::cast_possible_truncation, reason = "a factor of at most 1")]
