@@ -87,6 +87,11 @@ impl Flat {
         self.corner + u * self.edges[0] + v * self.edges[1]
     }
 
+    /// Whether the texture's parallelogram is all of it.
+    pub fn is_parallelogram(&self) -> bool {
+        self.outline.is_none()
+    }
+
     /// World area of the texture's parallelogram.
     pub fn area(&self) -> f64 {
         self.edges[0].cross(self.edges[1]).length()

@@ -1,22 +1,24 @@
 //! The radiance that a gather ray finds where it lands: reflected light cached at the lattice's nodes, per side, and on
 //! flats as (u, v, c) textures. Direct light by shadow rays plus photons without their first landings. \[Christensen99\]
 
+mod flats;
 mod pools;
 
 use crate::brdf::reflected;
 use crate::checkpoint;
 use crate::direct::{Receiver, direct_irradiance};
 use crate::field::Field;
-use crate::flat::{self, FlatTexture, Texel};
+use crate::flat::{self, FlatTexture};
 use crate::flattened::{Departure, Side, Target};
 use crate::mask::{Mask, masks, stand_ins};
 use crate::nearest::Neighbours;
 use crate::node_set::NodeSet;
-use crate::photon::{FlatPhoton, Photons, SurfacePhoton};
+use crate::photon::{Photons, SurfacePhoton};
 use crate::photon_map::{EstimateSettings, PhotonMap};
 use crate::rng::Stage;
 use crate::scene::Scene;
 use crate::tracer::Tracer;
+use flats::{ByFlat, fill_flat};
 use glam::DVec3;
 use pools::Pools;
 use rayon::prelude::*;
@@ -385,165 +387,4 @@ impl<T: Tracer> Fill<'_, T> {
         }
         if count > 0.0 { (sum / count).as_vec3().to_array() } else { [f32::NAN; 3] }
     }
-}
-
-/// Direct light at texel centres and photons of later landings, on so many times the flat's area, smoothed little for
-/// gathers and more for pictures.
-fn fill_flat<T: Tracer>(
-    scene: &Scene,
-    tracer: &T,
-    number: usize,
-    photons: impl Iterator<Item = FlatPhoton>,
-    areas: f64,
-    settings: &CacheSettings,
-    rays: &AtomicU64,
-) -> (Option<FlatTexture>, Option<FlatTexture>) {
-    let Some(flat) = flat::flat(scene, number).filter(|f| !f.albedo.black()) else { return (None, None) };
-    let dims = flat.resolution(settings.flat_resolution, settings.isovalue_resolution);
-    let centres = FlatTexture::black(dims);
-    let lattice = scene.lattice();
-    let parts = flat.texels(dims);
-    let part = |i: usize| parts[i % parts.len()];
-    let direct: Vec<DVec3> = (0..centres.texels.len())
-        .into_par_iter()
-        .with_min_len(256)
-        .map(|i| {
-            let c = centres.centre(i)[2];
-            if part(i).covered == 0.0 {
-                return DVec3::ZERO;
-            }
-            #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
-            let receiver = Receiver {
-                position: lattice.to_index(flat.at(part(i).at)).as_vec3(),
-                normal: flat.normal,
-                isovalue: c as f32,
-                departure: flat.departure,
-            };
-            let key = (settings.seed, Stage::Cache, !(((number as u64) << 40) | i as u64));
-            let direct = direct_irradiance(scene, tracer, &receiver, settings.flat_shadow_rays, key);
-            rays.fetch_add(direct.rays, Ordering::Relaxed);
-            direct.mean
-        })
-        .collect();
-    let (power, count) = flat_power(dims, &parts, photons);
-    let texel = areas * flat.area() / (dims[0] * dims[1]) as f64 / dims[2] as f64;
-    let density: Vec<DVec3> = power.into_iter().map(|p| p / texel).collect();
-    let covered: f64 = parts.iter().map(|p| p.covered).sum();
-    let per_texel = count as f64 / (covered * dims[2] as f64);
-    let whole = parts.iter().all(|p| p.covered == 1.0);
-    let texture = |kernel: Kernel, least: f64| {
-        let passes = kernel.passes(per_texel);
-        let indirect = if whole {
-            smooth_twice(&density, dims, passes)
-        } else {
-            // Texels beyond the outline take part of a neighbour's photons; their covered area tells how much.
-            let area = smooth((0..density.len()).map(|i| DVec3::splat(part(i).covered)).collect(), dims, passes);
-            let power = smooth(density.clone(), dims, passes);
-            power.iter().zip(area).map(|(p, a)| *p / a.x.max(1e-9)).collect()
-        };
-        let light = (0..density.len()).map(|n| {
-            let from = n - n % parts.len() + part(n).source;
-            reflected(flat.albedo.at(centres.centre(n)[2]), (direct[from] + indirect[from]).max(DVec3::splat(least)))
-        });
-        Some(FlatTexture { dims, texels: light.map(|l| l.as_vec3().to_array()).collect() })
-    };
-    // A texture to be averaged is not clamped at 0: that would brighten what few photons reach.
-    (texture(GATHERED, f64::NEG_INFINITY), texture(SHOWN, 0.0))
-}
-
-/// Photons sorted by flat, in their order.
-struct ByFlat<'a> {
-    photons: &'a [FlatPhoton],
-    order: Vec<u32>,
-    start: Vec<usize>,
-}
-
-impl<'a> ByFlat<'a> {
-    fn new(photons: &'a [FlatPhoton], flats: usize) -> Self {
-        let mut start = vec![0; flats + 1];
-        photons.iter().for_each(|p| start[p.flat as usize + 1] += 1);
-        (0..flats).for_each(|n| start[n + 1] += start[n]);
-        let (mut order, mut next) = (vec![0; photons.len()], start.clone());
-        for (n, p) in (0..).zip(photons) {
-            let at = &mut next[p.flat as usize];
-            order[*at] = n;
-            *at += 1;
-        }
-        Self { photons, order, start }
-    }
-
-    fn flat(&self, n: usize) -> impl Iterator<Item = FlatPhoton> {
-        self.order[self.start[n]..self.start[n + 1]].iter().map(|&i| self.photons[i as usize])
-    }
-}
-
-/// Power per texel of photons that were reflected before, and how many they are.
-fn flat_power(dims: [usize; 3], parts: &[Texel], photons: impl Iterator<Item = FlatPhoton>) -> (Vec<DVec3>, u64) {
-    let bins = FlatTexture::black(dims);
-    let (mut power, mut count) = (vec![DVec3::ZERO; bins.texels.len()], 0);
-    for p in photons.filter(|p| p.bounces > 0) {
-        let texel = bins.texel(p.uvc);
-        let isovalue = texel / parts.len();
-        power[isovalue * parts.len() + parts[texel % parts.len()].source] += p.power.as_dvec3();
-        count += 1;
-    }
-    (power, count)
-}
-
-/// How far photons on a flat are smoothed: a kernel that shrinks as they grow in number.
-struct Kernel {
-    /// Photons that it should hold.
-    photons: f64,
-    /// Most passes of ¼ ½ ¼ along u and v; c gets half of them, since there are fewer texels along it.
-    most: f64,
-}
-
-const GATHERED: Kernel = Kernel { photons: 300.0, most: 2.0 };
-const SHOWN: Kernel = Kernel { photons: 2000.0, most: 16.0 };
-
-impl Kernel {
-    /// Passes of ¼ ½ ¼ along u, v and c for so many photons per texel: the kernel is (2√π σ)³ texels worth, with σ² of half
-    /// the passes.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
-    fn passes(&self, photons_per_texel: f64) -> [usize; 3] {
-        let texels = self.photons / photons_per_texel.max(1e-9);
-        let sigma = (texels * 2f64.sqrt()).cbrt() / (2.0 * std::f64::consts::PI.sqrt());
-        let along = (2.0 * sigma * sigma).clamp(1.0, self.most);
-        let n = |x: f64| x.round().max(1.0) as usize;
-        [n(along), n(along), n(0.5 * along)]
-    }
-}
-
-/// Smooths by a 2D kernel × a 1D kernel in c that keep flux, twice: what the first smoothing took away is smoothed and put
-/// back, so that the bias left is of fourth order in their width. \[Tukey77\]
-fn smooth_twice(image: &[DVec3], dims: [usize; 3], passes: [usize; 3]) -> Vec<DVec3> {
-    let once = smooth(image.to_vec(), dims, passes);
-    let lost = smooth(image.iter().zip(&once).map(|(i, s)| *i - *s).collect(), dims, passes);
-    once.iter().zip(&lost).map(|(s, l)| *s + *l).collect()
-}
-
-/// Passes of ¼ ½ ¼ along each axis.
-fn smooth(mut image: Vec<DVec3>, dims: [usize; 3], passes: [usize; 3]) -> Vec<DVec3> {
-    for (axis, &count) in passes.iter().enumerate() {
-        for _ in 0..count {
-            image = smooth_along(&image, dims, axis);
-        }
-    }
-    image
-}
-
-/// ¼ ½ ¼ along one axis, the missing quarter folded back at the ends (flux is kept).
-fn smooth_along(image: &[DVec3], dims: [usize; 3], axis: usize) -> Vec<DVec3> {
-    let stride = [1, dims[0], dims[0] * dims[1]][axis];
-    let n = dims[axis];
-    (0..image.len())
-        .into_par_iter()
-        .with_min_len(4096)
-        .map(|i| {
-            let at = i / stride % n;
-            let before = if at > 0 { image[i - stride] } else { image[i] };
-            let after = if at + 1 < n { image[i + stride] } else { image[i] };
-            0.25 * before + 0.5 * image[i] + 0.25 * after
-        })
-        .collect()
 }

@@ -1,0 +1,408 @@
+//! What flats show, as textures: direct light of every texel, and the density of photons of later landings on that part of
+//! it that light reaches.
+
+use super::CacheSettings;
+use crate::brdf::reflected;
+use crate::direct::{Receiver, direct_irradiance};
+use crate::flat::{self, Flat, FlatTexture, Texel};
+use crate::flattened::Side;
+use crate::photon::FlatPhoton;
+use crate::rng::Stage;
+use crate::scene::Scene;
+use crate::tracer::Tracer;
+use glam::DVec3;
+use rayon::prelude::*;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// Direct light of texels and photons of later landings, on so many times the flat's area, smoothed little for gathers and
+/// more for pictures.
+pub(super) fn fill_flat<T: Tracer>(
+    scene: &Scene,
+    tracer: &T,
+    number: usize,
+    photons: impl Iterator<Item = FlatPhoton>,
+    areas: f64,
+    settings: &CacheSettings,
+    rays: &AtomicU64,
+) -> (Option<FlatTexture>, Option<FlatTexture>) {
+    let Some(flat) = flat::flat(scene, number).filter(|f| !f.albedo.black()) else { return (None, None) };
+    let dims = flat.resolution(settings.flat_resolution, settings.isovalue_resolution);
+    let centres = FlatTexture::black(dims);
+    let lattice = scene.lattice();
+    let parts = flat.texels(dims);
+    let solid = Solid::new(scene, number, &flat);
+    let Landings { powers, counts } = Landings::new(dims, &parts, photons, solid.as_ref());
+    let open = solid.and_then(|s| Open::new(&s, dims));
+    let outer = |i: usize| open.as_ref().is_none_or(|o| o.outer[i]);
+    let direct: Vec<Option<DVec3>> = (0..centres.texels.len())
+        .into_par_iter()
+        .with_min_len(256)
+        .map(|i| {
+            let part = parts[i % parts.len()];
+            let place = match &open {
+                _ if part.covered == 0.0 => None,
+                Some(open) if open.outer[i] => open.at[i],
+                _ => Some(part.at),
+            };
+            let c = centres.centre(i)[2];
+            #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
+            let receiver = Receiver {
+                position: lattice.to_index(flat.at(place?)).as_vec3(),
+                normal: flat.normal,
+                isovalue: c as f32,
+                departure: flat.departure,
+            };
+            let key = (settings.seed, Stage::Cache, !(((number as u64) << 40) | i as u64));
+            let direct = direct_irradiance(scene, tracer, &receiver, settings.flat_shadow_rays, key);
+            rays.fetch_add(direct.rays, Ordering::Relaxed);
+            Some(direct.mean)
+        })
+        .collect();
+    let direct = widened(&direct, dims, &outer);
+    let texel = areas * flat.area() / (dims[0] * dims[1]) as f64 / dims[2] as f64;
+    let densities = powers.map(|power| power.into_iter().map(|p| p / texel).collect::<Vec<DVec3>>());
+    // Of each texel, the outer part and that within solids.
+    let share = |i: usize| open.as_ref().map_or(1.0, |o| o.shares[i]);
+    let covered = |i: usize| parts[i % parts.len()].covered;
+    let outside: Vec<f64> = (0..direct.len()).map(|i| covered(i) * share(i)).collect();
+    let within: Vec<f64> = (0..direct.len()).map(|i| covered(i) * (1.0 - share(i))).collect();
+    let shares = [outside, within];
+    let texture = |kernel: Kernel, least: f64| {
+        let light = |n: usize| {
+            let per_texel = counts[n] as f64 / shares[n].iter().sum::<f64>().max(1.0);
+            smooth_twice(&densities[n], &shares[n], dims, kernel.passes(per_texel))
+        };
+        let indirect = [Some(light(0)), (counts[1] > 0).then(|| light(1))];
+        let texels = (0..direct.len()).map(|n| {
+            let from = n - n % parts.len() + parts[n % parts.len()].source;
+            let indirect = indirect[usize::from(!outer(n))].as_ref().map_or(DVec3::ZERO, |i| i[from]);
+            reflected(flat.albedo.at(centres.centre(n)[2]), (direct[from] + indirect).max(DVec3::splat(least)))
+        });
+        Some(FlatTexture { dims, texels: texels.map(|l| l.as_vec3().to_array()).collect() })
+    };
+    // A texture to be averaged is not clamped at 0: that would brighten what few photons reach.
+    (texture(GATHERED, f64::NEG_INFINITY), texture(SHOWN, 0.0))
+}
+
+/// Where on a flat solids stand: light reaches a wall on Ω's faces where the level set's outer side is, and a cap where the
+/// solid is that it closes.
+struct Solid<'a> {
+    scene: &'a Scene,
+    flat: &'a Flat,
+    /// Light is where h < c, not where h ≥ c.
+    below: bool,
+}
+
+impl<'a> Solid<'a> {
+    /// `None` for flats that are no parallelograms, and in scenes of several fields: those count as open everywhere.
+    fn new(scene: &'a Scene, number: usize, flat: &'a Flat) -> Option<Self> {
+        let cap = number >= scene.polygons().len();
+        let below = (scene.surface.outside == Side::Lower) != cap;
+        (scene.fields() == 1 && flat.is_parallelogram()).then_some(Self { scene, flat, below })
+    }
+
+    /// h at texture coordinates; `None` beyond Ω and where there is none.
+    fn height(&self, uv: [f64; 2]) -> Option<f64> {
+        let lattice = self.scene.lattice();
+        let p = lattice.to_index(self.flat.at(uv));
+        let within = p.cmpge(DVec3::splat(-1e-6)).all() && p.cmple(lattice.far() + 1e-6).all();
+        within.then(|| self.scene.field.value(p)).filter(|h| !h.is_nan())
+    }
+
+    /// The share of isovalues from `lo` to `hi` at which a place of that height is open.
+    fn open(&self, height: Option<f64>, [lo, hi]: [f64; 2]) -> f64 {
+        let Some(h) = height else { return 1.0 };
+        let above = ((hi - h) / (hi - lo)).clamp(0.0, 1.0);
+        if self.below { above } else { 1.0 - above }
+    }
+
+    /// Whether a place of that height is open at isovalue `c`.
+    fn is_open(&self, height: Option<f64>, c: f64) -> bool {
+        height.is_none_or(|h| (h < c) == self.below)
+    }
+}
+
+/// Places along each edge of a texel that are asked whether they are open.
+const PLACES: usize = 4;
+
+/// The part of each texel that light reaches.
+struct Open {
+    /// Its share, [0, 1].
+    shares: Vec<f64>,
+    /// Where it is, at the texel's middle isovalue; `None` if nowhere.
+    at: Vec<Option<[f64; 2]>>,
+    /// Texels that have such a part, and those around them, which are looked up together. The others hold what light there
+    /// is within solids.
+    outer: Vec<bool>,
+}
+
+impl Open {
+    /// `None` if all is open.
+    fn new(solid: &Solid, [nu, nv, nc]: [usize; 3]) -> Option<Self> {
+        let place = |texel: usize, n: usize| {
+            let at = |i: usize, n: usize, of: usize| (i as f64 + (n as f64 + 0.5) / PLACES as f64) / of as f64;
+            [at(texel % nu, n % PLACES, nu), at(texel / nu, n / PLACES, nv)]
+        };
+        let heights: Vec<[Option<f64>; PLACES * PLACES]> = (0..nu * nv)
+            .into_par_iter()
+            .with_min_len(64)
+            .map(|texel| std::array::from_fn(|n| solid.height(place(texel, n))))
+            .collect();
+        let (shares, at): (Vec<f64>, Vec<Option<[f64; 2]>>) = (0..nu * nv * nc)
+            .into_par_iter()
+            .with_min_len(1024)
+            .map(|i| {
+                let (texel, isovalue) = (i % (nu * nv), (i / (nu * nv)) as f64);
+                let range = [isovalue / nc as f64, (isovalue + 1.0) / nc as f64];
+                let heights = &heights[texel];
+                let share = heights.iter().map(|&h| solid.open(h, range)).sum::<f64>() / heights.len() as f64;
+                let middle = (isovalue + 0.5) / nc as f64;
+                let open = (0..heights.len()).filter(|&n| solid.is_open(heights[n], middle));
+                let open: Vec<[f64; 2]> = open.map(|n| place(texel, n)).collect();
+                (share, central(&open))
+            })
+            .unzip();
+        let outer = |i: usize| around(i, [nu, nv, nc]).any(|j| shares[j] > 0.0);
+        let outer = (0..shares.len()).map(outer).collect();
+        shares.iter().any(|&s| s < 1.0).then_some(Self { shares, at, outer })
+    }
+}
+
+/// The one of some places that is nearest to their centroid.
+fn central(places: &[[f64; 2]]) -> Option<[f64; 2]> {
+    let n = places.len() as f64;
+    let mean = [0, 1].map(|a| places.iter().map(|p| p[a]).sum::<f64>() / n);
+    let away = |p: &[f64; 2]| (p[0] - mean[0]).powi(2) + (p[1] - mean[1]).powi(2);
+    places.iter().copied().min_by(|p, q| away(p).total_cmp(&away(q)))
+}
+
+/// Photons sorted by flat, in their order.
+pub(super) struct ByFlat<'a> {
+    photons: &'a [FlatPhoton],
+    order: Vec<u32>,
+    start: Vec<usize>,
+}
+
+impl<'a> ByFlat<'a> {
+    pub(super) fn new(photons: &'a [FlatPhoton], flats: usize) -> Self {
+        let mut start = vec![0; flats + 1];
+        photons.iter().for_each(|p| start[p.flat as usize + 1] += 1);
+        (0..flats).for_each(|n| start[n + 1] += start[n]);
+        let (mut order, mut next) = (vec![0; photons.len()], start.clone());
+        for (n, p) in (0..).zip(photons) {
+            let at = &mut next[p.flat as usize];
+            order[*at] = n;
+            *at += 1;
+        }
+        Self { photons, order, start }
+    }
+
+    pub(super) fn flat(&self, n: usize) -> impl Iterator<Item = FlatPhoton> {
+        self.order[self.start[n]..self.start[n + 1]].iter().map(|&i| self.photons[i as usize])
+    }
+}
+
+/// Photons on a flat that were reflected before: those outside solids, and those within.
+struct Landings {
+    /// Power per texel.
+    powers: [Vec<DVec3>; 2],
+    /// How many they are.
+    counts: [u64; 2],
+}
+
+impl Landings {
+    fn new(
+        dims: [usize; 3],
+        parts: &[Texel],
+        photons: impl Iterator<Item = FlatPhoton>,
+        solid: Option<&Solid>,
+    ) -> Self {
+        let bins = FlatTexture::black(dims);
+        let mut all = Self { powers: [(); 2].map(|()| vec![DVec3::ZERO; bins.texels.len()]), counts: [0; 2] };
+        for p in photons.filter(|p| p.bounces > 0) {
+            let texel = bins.texel(p.uvc);
+            let isovalue = texel / parts.len();
+            let [u, v, c] = p.uvc.map(f64::from);
+            let n = usize::from(solid.is_some_and(|s| !s.is_open(s.height([u, v]), c)));
+            all.powers[n][isovalue * parts.len() + parts[texel % parts.len()].source] += p.power.as_dvec3();
+            all.counts[n] += 1;
+        }
+        all
+    }
+}
+
+/// How far photons on a flat are smoothed: a kernel that shrinks as they grow in number.
+struct Kernel {
+    /// Photons that it should hold.
+    photons: f64,
+    /// Most passes of ¼ ½ ¼ along u and v; c gets half of them, since there are fewer texels along it.
+    most: f64,
+}
+
+const GATHERED: Kernel = Kernel { photons: 300.0, most: 2.0 };
+const SHOWN: Kernel = Kernel { photons: 2000.0, most: 16.0 };
+
+impl Kernel {
+    /// Passes of ¼ ½ ¼ along u, v and c for so many photons per texel: the kernel is (2√π σ)³ texels worth, with σ² of half
+    /// the passes.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
+    fn passes(&self, photons_per_texel: f64) -> [usize; 3] {
+        let texels = self.photons / photons_per_texel.max(1e-9);
+        let sigma = (texels * 2f64.sqrt()).cbrt() / (2.0 * std::f64::consts::PI.sqrt());
+        let along = (2.0 * sigma * sigma).clamp(1.0, self.most);
+        let n = |x: f64| x.round().max(1.0) as usize;
+        [n(along), n(along), n(0.5 * along)]
+    }
+}
+
+/// What `image` holds per `share`, smoothed by a 2D kernel × a 1D kernel in c that keep flux, twice: what the first smoothing
+/// took away is smoothed and put back, so that the bias left is of fourth order in their width \[Tukey77\]. Texels of which
+/// there is little are so spoken for by those around them.
+fn smooth_twice(image: &[DVec3], shares: &[f64], dims: [usize; 3], passes: [usize; 3]) -> Vec<DVec3> {
+    let area = smooth(shares.iter().map(|&s| DVec3::splat(s)).collect(), dims, passes);
+    let mean = |image: Vec<DVec3>| -> Vec<DVec3> {
+        smooth(image, dims, passes).iter().zip(&area).map(|(i, a)| *i / a.x.max(1e-9)).collect()
+    };
+    let once = mean(image.to_vec());
+    let lost = mean((0..image.len()).map(|n| image[n] - once[n] * shares[n]).collect());
+    once.iter().zip(&lost).map(|(s, l)| *s + *l).collect()
+}
+
+/// Texel `i` and those around it.
+fn around(i: usize, [nu, nv, nc]: [usize; 3]) -> impl Iterator<Item = usize> {
+    let beside = |i: usize, n: usize| i.saturating_sub(1)..(i + 2).min(n);
+    let (u, v, c) = (beside(i % nu, nu), beside(i / nu % nv, nv), beside(i / (nu * nv), nc));
+    c.flat_map(move |c| {
+        let u = u.clone();
+        v.clone().flat_map(move |v| u.clone().map(move |u| (c * nv + v) * nu + u))
+    })
+}
+
+/// Unknown texels become the mean of the `outer` ones around them that are known, or black.
+fn widened(image: &[Option<DVec3>], dims: [usize; 3], outer: &(dyn Fn(usize) -> bool + Sync)) -> Vec<DVec3> {
+    let mean = |i: usize| {
+        let known = around(i, dims).filter(|&j| outer(j)).filter_map(|j| image[j]);
+        let (sum, count) = known.fold((DVec3::ZERO, 0.0), |(sum, n), x| (sum + x, n + 1.0));
+        if count > 0.0 { sum / count } else { DVec3::ZERO }
+    };
+    (0..image.len()).into_par_iter().with_min_len(1024).map(|i| image[i].unwrap_or_else(|| mean(i))).collect()
+}
+
+/// Passes of ¼ ½ ¼ along each axis.
+fn smooth(mut image: Vec<DVec3>, dims: [usize; 3], passes: [usize; 3]) -> Vec<DVec3> {
+    for (axis, &count) in passes.iter().enumerate() {
+        for _ in 0..count {
+            image = smooth_along(&image, dims, axis);
+        }
+    }
+    image
+}
+
+/// ¼ ½ ¼ along one axis, the missing quarter folded back at the ends (flux is kept).
+fn smooth_along(image: &[DVec3], dims: [usize; 3], axis: usize) -> Vec<DVec3> {
+    let stride = [1, dims[0], dims[0] * dims[1]][axis];
+    let n = dims[axis];
+    (0..image.len())
+        .into_par_iter()
+        .with_min_len(4096)
+        .map(|i| {
+            let at = i / stride % n;
+            let before = if at > 0 { image[i - stride] } else { image[i] };
+            let after = if at + 1 < n { image[i + stride] } else { image[i] };
+            0.25 * before + 0.5 * image[i] + 0.25 * after
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::{Field, Sweep};
+    use crate::flattened::{FlattenedHit, FlattenedRay};
+    use crate::rng::Rng;
+    use crate::scene::{Boundary, Surface, cornell_box};
+    use crate::volume::{Lattice, Samples, Volume};
+    use glam::Vec3;
+
+    struct Nothing;
+
+    impl Tracer for Nothing {
+        fn intersect(&self, _: &FlattenedRay) -> Option<FlattenedHit> {
+            None
+        }
+        fn occluded(&self, _: &FlattenedRay) -> bool {
+            false
+        }
+    }
+
+    /// Photons as dense everywhere on that part of the floor where h < c: it shows the same irradiance up to the line where
+    /// surfaces stand on it.
+    #[test]
+    fn density_does_not_fall_off_where_surfaces_stand_on_walls() {
+        let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::splat(0.125)).unwrap();
+        let h = |o: usize| {
+            let [i, j, k] = lattice.ijk(o).map(|x| x as f32 / 8.0);
+            (3.0 * i).sin() * (2.0 * j + 0.3).cos() + 0.2 * k
+        };
+        let volume = Volume::new("h", lattice.clone(), Samples::F32((0..lattice.len()).map(h).collect())).unwrap();
+        let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+        let walls = cornell_box(field.lattice(), 0.0).unwrap();
+        let floor = walls.iter().position(|p| p.name == "z_min").unwrap();
+        // No luminaire: nothing is direct.
+        let walls = walls.into_iter().filter(|p| p.emission == DVec3::ZERO).collect();
+        let scene = Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap();
+        let flat = flat::flat(&scene, floor).unwrap();
+        let solid = Solid::new(&scene, floor, &flat).unwrap();
+        let (irradiance, count) = (3.0, 400_000);
+        let power = Vec3::splat((irradiance * flat.area() / count as f64) as f32);
+        let number = u32::try_from(floor).unwrap();
+        let photons: Vec<FlatPhoton> = (0..count)
+            .map(|i| {
+                let mut rng = Rng::stream(1, Stage::Test, i as u64);
+                let uvc = [(); 3].map(|()| rng.unit() as f32);
+                FlatPhoton { flat: number, uvc, power, bounces: 1 }
+            })
+            .filter(|p| solid.is_open(solid.height([f64::from(p.uvc[0]), f64::from(p.uvc[1])]), f64::from(p.uvc[2])))
+            .collect();
+        assert!(photons.len() > 100_000 && photons.len() < 300_000, "{}", photons.len());
+        let settings = CacheSettings {
+            node_shadow_rays: 1,
+            flat_shadow_rays: 1,
+            flat_resolution: 24,
+            isovalue_resolution: 12,
+            seed: 1,
+        };
+        let fill = |photons: &[FlatPhoton]| {
+            fill_flat(&scene, &Nothing, floor, photons.iter().copied(), 1.0, &settings, &AtomicU64::new(0)).0.unwrap()
+        };
+        let texture = fill(&photons);
+        let expected = reflected(flat.albedo.at(0.5), DVec3::splat(irradiance)).x;
+        // Where it is open, and within 0.03 of the surface.
+        let (mut all, mut beside) = (crate::stats::Moments::default(), crate::stats::Moments::default());
+        for i in 0..40_000 {
+            let mut rng = Rng::stream(2, Stage::Test, i);
+            let [u, v, c] = [(); 3].map(|()| rng.unit());
+            let gap = c - solid.height([u, v]).unwrap();
+            if gap > 0.0 {
+                let x = texture.lookup([u, v, c]).x / expected;
+                all.push(x);
+                if gap < 0.03 {
+                    beside.push(x);
+                }
+            }
+        }
+        println!("all {:.4}, beside surfaces {:.4} of {}", all.mean(), beside.mean(), beside.count());
+        assert!(beside.count() > 500 && (beside.mean() - 1.0).abs() < 0.02 && (all.mean() - 1.0).abs() < 0.01);
+        // Light within a solid is shown where all is solid, and nowhere else.
+        let places = (0..400).map(|n| [f64::from(n % 20), f64::from(n / 20)].map(|x| (x + 0.5) / 20.0));
+        let place = places.max_by(|p, q| solid.height(*p).unwrap().total_cmp(&solid.height(*q).unwrap())).unwrap();
+        assert!(solid.height(place).unwrap() > 0.9, "a solid at all isovalues but the highest");
+        let [u, v] = place.map(|x| x as f32);
+        let within = photons.iter().map(|p| FlatPhoton { uvc: [u, v, 0.2 + 0.6 * p.uvc[2]], ..*p });
+        let lit = fill(&photons.iter().copied().chain(within).collect::<Vec<_>>());
+        let deep = [place[0], place[1], 0.4];
+        assert!(lit.lookup(deep).x > 3.0 * expected && texture.lookup(deep).x == 0.0, "{}", lit.lookup(deep));
+        let open = Open::new(&solid, texture.dims).unwrap();
+        assert!((0..texture.texels.len()).filter(|&i| open.outer[i]).all(|i| texture.texels[i] == lit.texels[i]));
+    }
+}
