@@ -4,8 +4,9 @@
 use super::CacheSettings;
 use crate::brdf::reflected;
 use crate::direct::{Receiver, direct_irradiance};
+use crate::field::Field;
 use crate::flat::{self, Flat, FlatTexture, Texel};
-use crate::flattened::Side;
+use crate::flattened::{Side, split_face};
 use crate::photon::FlatPhoton;
 use crate::rng::Stage;
 use crate::scene::Scene;
@@ -84,42 +85,48 @@ pub(super) fn fill_flat<T: Tracer>(
     (texture(GATHERED, f64::NEG_INFINITY), texture(SHOWN, 0.0))
 }
 
-/// Where on a flat solids stand: light reaches a wall on Ω's faces where the level set's outer side is, and a cap where the
-/// solid is that it closes.
+/// Where on a flat solids stand: light reaches a wall on Ω's faces where the level sets' outer sides are, and a cap where
+/// the solid is that it closes.
 struct Solid<'a> {
     scene: &'a Scene,
     flat: &'a Flat,
-    /// Light is where h < c, not where h ≥ c.
-    below: bool,
+    /// The field whose cap this is: the scene's own, or a companion's.
+    capped: Option<Option<u8>>,
 }
 
+/// The isovalues at which light reaches a place: above the first and up to the second.
+type Opening = [f64; 2];
+
 impl<'a> Solid<'a> {
-    /// `None` for flats that are no parallelograms, and in scenes of several fields: those count as open everywhere.
+    /// `None` for flats that are no parallelograms, which count as open everywhere.
     fn new(scene: &'a Scene, number: usize, flat: &'a Flat) -> Option<Self> {
-        let cap = number >= scene.polygons().len();
-        let below = (scene.surface.outside == Side::Lower) != cap;
-        (scene.fields() == 1 && flat.is_parallelogram()).then_some(Self { scene, flat, below })
+        let cap = number.checked_sub(scene.polygons().len());
+        let capped = cap.map(|n| split_face(scene.numbered_face(n).0).0);
+        flat.is_parallelogram().then_some(Self { scene, flat, capped })
     }
 
-    /// h at texture coordinates; `None` beyond Ω and where there is none.
-    fn height(&self, uv: [f64; 2]) -> Option<f64> {
-        let lattice = self.scene.lattice();
-        let p = lattice.to_index(self.flat.at(uv));
-        let within = p.cmpge(DVec3::splat(-1e-6)).all() && p.cmple(lattice.far() + 1e-6).all();
-        within.then(|| self.scene.field.value(p)).filter(|h| !h.is_nan())
+    /// What all fields around a place leave open.
+    fn opening(&self, uv: [f64; 2]) -> Opening {
+        let p = self.scene.lattice().to_index(self.flat.at(uv));
+        let mut open = [f64::NEG_INFINITY, f64::INFINITY];
+        let mut close = |number: Option<u8>, field: &Field, p: DVec3, outside: Side| {
+            let within = p.cmpge(DVec3::splat(-1e-6)).all() && p.cmple(field.lattice().far() + 1e-6).all();
+            let h = if within { field.value(p) } else { f64::NAN };
+            let below = (outside == Side::Lower) != (self.capped == Some(number));
+            // NaN: nothing is there.
+            open = if below { [open[0].max(h), open[1]] } else { [open[0], open[1].min(h)] };
+        };
+        close(None, &self.scene.field, p, self.scene.surface.outside);
+        for (n, c) in (0..).zip(self.scene.companions()) {
+            close(Some(n), &c.member.field, c.to_index(p), c.member.surface.outside);
+        }
+        open
     }
+}
 
-    /// The share of isovalues from `lo` to `hi` at which a place of that height is open.
-    fn open(&self, height: Option<f64>, [lo, hi]: [f64; 2]) -> f64 {
-        let Some(h) = height else { return 1.0 };
-        let above = ((hi - h) / (hi - lo)).clamp(0.0, 1.0);
-        if self.below { above } else { 1.0 - above }
-    }
-
-    /// Whether a place of that height is open at isovalue `c`.
-    fn is_open(&self, height: Option<f64>, c: f64) -> bool {
-        height.is_none_or(|h| (h < c) == self.below)
-    }
+/// Whether light reaches a place at isovalue `c`.
+fn is_open([above, up_to]: Opening, c: f64) -> bool {
+    c > above && c <= up_to
 }
 
 /// Places along each edge of a texel that are asked whether they are open.
@@ -139,25 +146,34 @@ struct Open {
 impl Open {
     /// `None` if all is open.
     fn new(solid: &Solid, [nu, nv, nc]: [usize; 3]) -> Option<Self> {
+        const MOST: usize = PLACES * PLACES;
+        // The last place is the centre.
         let place = |texel: usize, n: usize| {
-            let at = |i: usize, n: usize, of: usize| (i as f64 + (n as f64 + 0.5) / PLACES as f64) / of as f64;
-            [at(texel % nu, n % PLACES, nu), at(texel / nu, n / PLACES, nv)]
+            let offset = |i: usize| if n == MOST { 0.5 } else { (i as f64 + 0.5) / PLACES as f64 };
+            [
+                ((texel % nu) as f64 + offset(n % PLACES)) / nu as f64,
+                ((texel / nu) as f64 + offset(n / PLACES)) / nv as f64,
+            ]
         };
-        let heights: Vec<[Option<f64>; PLACES * PLACES]> = (0..nu * nv)
+        let openings: Vec<[Opening; MOST + 1]> = (0..nu * nv)
             .into_par_iter()
             .with_min_len(64)
-            .map(|texel| std::array::from_fn(|n| solid.height(place(texel, n))))
+            .map(|texel| std::array::from_fn(|n| solid.opening(place(texel, n))))
             .collect();
         let (shares, at): (Vec<f64>, Vec<Option<[f64; 2]>>) = (0..nu * nv * nc)
             .into_par_iter()
             .with_min_len(1024)
             .map(|i| {
                 let (texel, isovalue) = (i % (nu * nv), (i / (nu * nv)) as f64);
-                let range = [isovalue / nc as f64, (isovalue + 1.0) / nc as f64];
-                let heights = &heights[texel];
-                let share = heights.iter().map(|&h| solid.open(h, range)).sum::<f64>() / heights.len() as f64;
+                let [lo, hi] = [isovalue / nc as f64, (isovalue + 1.0) / nc as f64];
+                let (places, centre) = (&openings[texel][..MOST], openings[texel][MOST]);
+                let open = |[above, up_to]: Opening| (hi.min(up_to) - lo.max(above)).max(0.0) / (hi - lo);
+                let share = places.iter().map(|&p| open(p)).sum::<f64>() / MOST as f64;
                 let middle = (isovalue + 0.5) / nc as f64;
-                let open = (0..heights.len()).filter(|&n| solid.is_open(heights[n], middle));
+                if is_open(centre, middle) {
+                    return (share, Some(place(texel, MOST)));
+                }
+                let open = (0..MOST).filter(|&n| is_open(places[n], middle));
                 let open: Vec<[f64; 2]> = open.map(|n| place(texel, n)).collect();
                 (share, central(&open))
             })
@@ -223,7 +239,7 @@ impl Landings {
             let texel = bins.texel(p.uvc);
             let isovalue = texel / parts.len();
             let [u, v, c] = p.uvc.map(f64::from);
-            let n = usize::from(solid.is_some_and(|s| !s.is_open(s.height([u, v]), c)));
+            let n = usize::from(solid.is_some_and(|s| !is_open(s.opening([u, v]), c)));
             all.powers[n][isovalue * parts.len() + parts[texel % parts.len()].source] += p.power.as_dvec3();
             all.counts[n] += 1;
         }
@@ -317,7 +333,7 @@ fn smooth_along(image: &[DVec3], dims: [usize; 3], axis: usize) -> Vec<DVec3> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::{Field, Sweep};
+    use crate::field::Sweep;
     use crate::flattened::{FlattenedHit, FlattenedRay};
     use crate::rng::Rng;
     use crate::scene::{Boundary, Surface, cornell_box};
@@ -362,7 +378,7 @@ mod tests {
                 let uvc = [(); 3].map(|()| rng.unit() as f32);
                 FlatPhoton { flat: number, uvc, power, bounces: 1 }
             })
-            .filter(|p| solid.is_open(solid.height([f64::from(p.uvc[0]), f64::from(p.uvc[1])]), f64::from(p.uvc[2])))
+            .filter(|p| is_open(solid.opening([f64::from(p.uvc[0]), f64::from(p.uvc[1])]), f64::from(p.uvc[2])))
             .collect();
         assert!(photons.len() > 100_000 && photons.len() < 300_000, "{}", photons.len());
         let settings = CacheSettings {
@@ -382,7 +398,7 @@ mod tests {
         for i in 0..40_000 {
             let mut rng = Rng::stream(2, Stage::Test, i);
             let [u, v, c] = [(); 3].map(|()| rng.unit());
-            let gap = c - solid.height([u, v]).unwrap();
+            let gap = c - solid.opening([u, v])[0];
             if gap > 0.0 {
                 let x = texture.lookup([u, v, c]).x / expected;
                 all.push(x);
@@ -395,8 +411,8 @@ mod tests {
         assert!(beside.count() > 500 && (beside.mean() - 1.0).abs() < 0.02 && (all.mean() - 1.0).abs() < 0.01);
         // Light within a solid is shown where all is solid, and nowhere else.
         let places = (0..400).map(|n| [f64::from(n % 20), f64::from(n / 20)].map(|x| (x + 0.5) / 20.0));
-        let place = places.max_by(|p, q| solid.height(*p).unwrap().total_cmp(&solid.height(*q).unwrap())).unwrap();
-        assert!(solid.height(place).unwrap() > 0.9, "a solid at all isovalues but the highest");
+        let place = places.max_by(|p, q| solid.opening(*p)[0].total_cmp(&solid.opening(*q)[0])).unwrap();
+        assert!(solid.opening(place)[0] > 0.9, "a solid at all isovalues but the highest");
         let [u, v] = place.map(|x| x as f32);
         let within = photons.iter().map(|p| FlatPhoton { uvc: [u, v, 0.2 + 0.6 * p.uvc[2]], ..*p });
         let lit = fill(&photons.iter().copied().chain(within).collect::<Vec<_>>());
