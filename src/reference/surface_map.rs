@@ -1,6 +1,6 @@
 //! A photon map of one isosurface in 3D: irradiance per area of mesh and walls, and final gather from it. \[Jensen01\]
 
-use super::path::PathTracer;
+use super::path::{PathTracer, touches};
 use crate::brdf::reflected;
 use crate::direct::Receiver;
 use crate::field::Field;
@@ -180,11 +180,14 @@ impl SurfaceMap {
             let ray = scene.ray(receiver.position, direction, receiver.isovalue, receiver.departure);
             paths.rays += 1;
             let Some(hit) = tracer.intersect(&ray) else { continue };
-            let Some((landed, albedo, emission)) = landing(scene, &ray, hit) else { continue };
+            let Some((mut landed, albedo, emission)) = landing(scene, &ray, hit) else { continue };
             sum += emission;
             if albedo != DVec3::ZERO {
                 let distance = (scene.lattice().axes() * ray.direction.as_dvec3()).length() * f64::from(hit.t);
                 let (mapped, radius) = self.irradiance(scene, &landed, &mut scratch);
+                if touches(scene, &ray, hit) {
+                    landed.departure = ray.departure;
+                }
                 let indirect = if distance < radius { paths.indirect_once(&landed, &mut rng) } else { mapped };
                 sum += reflected(albedo, paths.direct_once(&landed, &mut rng) + indirect);
             }
