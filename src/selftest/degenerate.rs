@@ -165,7 +165,8 @@ fn inputs() -> Vec<Input> {
         },
         Input {
             surface: Surface { outside: crate::flattened::Side::Higher, both_sides: true, ..Surface::default() },
-            ..input("both sides, outside higher")
+            // Bumps upside down: what is higher is what light reaches.
+            ..with("both sides, outside higher", |i, x| 98.6 - bumps(i, x))
         },
         Input { boundary: Boundary::Capped, margin: 0.2, ..input("capped") },
         Input { boundary: Boundary::Capped, expect: Expect::Refusal("margin"), ..input("capped without a margin") },
