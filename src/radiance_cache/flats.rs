@@ -32,8 +32,10 @@ pub(super) fn fill_flat<T: Tracer>(
     let lattice = scene.lattice();
     let parts = flat.texels(dims);
     let solid = Solid::new(scene, number, &flat);
+    let open = solid.as_ref().and_then(|s| Open::new(s, dims));
+    // Where no solid stands, none holds photons.
+    let solid = solid.filter(|_| open.is_some());
     let Landings { powers, counts } = Landings::new(dims, &parts, photons, solid.as_ref());
-    let open = solid.and_then(|s| Open::new(&s, dims));
     let outer = |i: usize| open.as_ref().is_none_or(|o| o.outer[i]);
     let direct: Vec<Option<DVec3>> = (0..centres.texels.len())
         .into_par_iter()

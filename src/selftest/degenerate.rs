@@ -168,6 +168,12 @@ fn inputs() -> Vec<Input> {
             // Bumps upside down: what is higher is what light reaches.
             ..with("both sides, outside higher", |i, x| 98.6 - bumps(i, x))
         },
+        // Nothing lights the inside of bumps.
+        Input {
+            surface: Surface { outside: crate::flattened::Side::Higher, both_sides: true, ..Surface::default() },
+            expect: Expect::Any,
+            ..input("both sides, outside within solids")
+        },
         Input { boundary: Boundary::Capped, margin: 0.2, ..input("capped") },
         Input { boundary: Boundary::Capped, expect: Expect::Refusal("margin"), ..input("capped without a margin") },
     ]

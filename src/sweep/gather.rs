@@ -266,7 +266,7 @@ impl Pass<'_> {
     }
 
     /// Adds what a row of lines and the one before it brought to a row of nodes: each node takes its four nearest lines by
-    /// bilinear weights, times the cosine of its own normal.
+    /// bilinear weights, which go on linearly on Ω's faces ([`inwards`]), times the cosine of its own normal.
     fn accumulate(&self, family: &Family, light: [&RowLight; 2], nodes: &mut Nodes) {
         let plan = family.plan;
         let layout = &plan.shear.layout;
