@@ -125,6 +125,17 @@ fn main() {
         sample_radiance(&scene, &tracer, &gather, at, Side::Lower, rays, 1, unsaved, &|_| true)
     };
     let samples: Vec<RadianceSample> = sampled(&some, 16).samples.into_iter().flatten().collect();
+    // As many as BB09 took, around nodes with a surface of the sweep.
+    let many: Vec<RadianceSample> = (0..10_000_000u64)
+        .map(|n| {
+            let hash =
+                |n: u64| (n.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ n >> 7).wrapping_mul(0xbf58_476d_1ce4_e5b9) >> 40;
+            let unit = |axis| hash(4 * n + axis) as f32 / (1 << 24) as f32;
+            let near = nodes[(unit(3) * nodes.len() as f32) as usize % nodes.len()];
+            let position = (near + Vec3::new(unit(0), unit(1), unit(2)) - 0.5).clamp(Vec3::ZERO, Vec3::splat(100.0));
+            RadianceSample { position, radiance: position, ..RadianceSample::default() }
+        })
+        .collect();
     let wishes: Vec<Wish> = samples.iter().map(Wish::from).collect();
     let start = shepard(&scene.field, lattice, &masks, &samples, 8, &|_| true);
     // Noise of its own for each half.
@@ -181,6 +192,7 @@ fn main() {
             }),
         ),
         ("shepard", Box::new(|| drop(black_box(shepard(&scene.field, lattice, &masks, &samples, 8, &|_| true))))),
+        ("shepard, 10^7", Box::new(|| drop(black_box(shepard(&scene.field, lattice, &masks, &many, 8, &|_| true))))),
         (
             "fit",
             Box::new(|| {

@@ -121,7 +121,8 @@ pub fn shepard(
     tick: &(dyn Fn(u64) -> bool + Sync),
 ) -> IlluminationGrid {
     let grid = point_grid(field, samples);
-    let sorted: Vec<RadianceSample> = grid.numbers().par_iter().map(|&n| samples[n as usize]).collect();
+    let light = |&n: &u32| (samples[n as usize].radiance, samples[n as usize].variance);
+    let sorted: Vec<(Vec3, f32)> = grid.numbers().par_iter().map(light).collect();
     from_nearest(lattice, masks, (&grid, neighbours), tick, |_, _, found| blend(found, &sorted))
 }
 
@@ -143,30 +144,30 @@ pub(crate) fn from_nearest(
 ) -> IlluminationGrid {
     let step = lattice.axes();
     const CHUNK: usize = 4096;
-    let mut out: Vec<([f32; 3], f32)> = vec![([0.0; 3], 0.0); lattice.len()];
-    out.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, out)| {
+    let (mut radiance, mut std_error) = (vec![[0.0; 3]; lattice.len()], vec![0.0; lattice.len()]);
+    let chunks = radiance.par_chunks_mut(CHUNK).zip(std_error.par_chunks_mut(CHUNK));
+    chunks.enumerate().with_max_len(1).for_each(|(chunk, (radiance, std_error))| {
         if !tick(0) {
             return;
         }
         let mut found = Neighbours::default();
-        for (n, out) in out.iter_mut().enumerate() {
+        for n in 0..radiance.len() {
             let o = chunk * CHUNK + n;
             if masks[o] == Mask::Empty {
                 continue;
             }
             let place = (step * DVec3::from_array(lattice.ijk(o).map(|i| i as f64))).as_vec3();
             grid.nearest(place, neighbours, f32::INFINITY, |_| true, &mut found);
-            *out = value(o, place, found.found());
+            (radiance[n], std_error[n]) = value(o, place, found.found());
         }
-        tick(out.len() as u64);
+        tick(radiance.len() as u64);
     });
-    let (radiance, std_error) = out.into_iter().unzip();
     IlluminationGrid { radiance, std_error, mask: masks.to_vec() }
 }
 
-/// Shepard's mean of (squared distance, slot) entries, and its standard error.
+/// Shepard's mean of (squared distance, slot) entries of (radiance, variance), and its standard error.
 #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-fn blend(found: &[(f32, u32)], samples: &[RadianceSample]) -> ([f32; 3], f32) {
+fn blend(found: &[(f32, u32)], samples: &[(Vec3, f32)]) -> ([f32; 3], f32) {
     let Some(farthest) = found.iter().map(|e| e.0).reduce(f32::max) else { return ([0.0; 3], 0.0) };
     let radius = f64::from(farthest).sqrt() * (1.0 + 1e-6);
     let (mut sum, mut weights, mut variance) = (DVec3::ZERO, 0.0, 0.0);
@@ -174,9 +175,9 @@ fn blend(found: &[(f32, u32)], samples: &[RadianceSample]) -> ([f32; 3], f32) {
         // A sample on the point itself takes all the weight that f64 can hold.
         let d = f64::from(d2).sqrt().max(1e-9 * radius);
         let w = if found.len() == 1 { 1.0 } else { ((radius - d) / (radius * d)).powi(2) * radius * radius };
-        let s = &samples[slot as usize];
-        sum += w * s.radiance.as_dvec3();
-        variance += w * w * f64::from(s.variance);
+        let (radiance, own) = samples[slot as usize];
+        sum += w * radiance.as_dvec3();
+        variance += w * w * f64::from(own);
         weights += w;
     }
     ((sum / weights).as_vec3().to_array(), (variance.sqrt() / weights) as f32)

@@ -68,13 +68,9 @@ impl PointGrid {
     /// Sorts `points` (at most 2³² − 1) into cells of `per_cell` points on average over their bounding box.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "cell numbers are clamped to the grid")]
     pub fn new(points: &[Vec3], per_cell: f32) -> Self {
-        let (mut lo, mut hi) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
-        for &p in points {
-            (lo, hi) = (lo.min(p), hi.max(p));
-        }
-        if points.is_empty() {
-            (lo, hi) = (Vec3::ZERO, Vec3::ZERO);
-        }
+        let bounds = |[lo, hi]: [Vec3; 2], [a, b]: [Vec3; 2]| [lo.min(a), hi.max(b)];
+        let some = points.par_iter().with_min_len(1 << 12).map(|&p| [p, p]).reduce_with(bounds);
+        let [lo, hi] = some.unwrap_or_default();
         let extent = (hi - lo).max(Vec3::splat((hi - lo).max_element() * 1e-3)).max(Vec3::splat(1e-30));
         let size = (extent.x as f64 * extent.y as f64 * extent.z as f64 * f64::from(per_cell)
             / points.len().max(1) as f64)
@@ -87,24 +83,67 @@ impl PointGrid {
             size,
             dims,
             starts: vec![0; dims.iter().product::<usize>() + 1],
-            points: vec![Vec3::ZERO; points.len()],
-            numbers: vec![0; points.len()],
+            // By all threads: the first touch of memory takes longer than the sorting.
+            points: points.par_iter().with_min_len(1 << 14).map(|_| Vec3::ZERO).collect(),
+            numbers: points.par_iter().with_min_len(1 << 14).map(|_| 0).collect(),
         };
-        let cells: Vec<u32> = points.par_iter().map(|&p| grid.index(grid.cell(p))).collect();
-        for &c in &cells {
-            grid.starts[c as usize + 1] += 1;
-        }
-        for i in 1..grid.starts.len() {
-            grid.starts[i] += grid.starts[i - 1];
-        }
-        let mut next = grid.starts.clone();
-        for (number, &c) in cells.iter().enumerate() {
-            let slot = next[c as usize];
-            next[c as usize] += 1;
-            grid.points[slot as usize] = points[number];
-            grid.numbers[slot as usize] = number as u32;
-        }
+        grid.sort(points);
         grid
+    }
+
+    /// Counting sort in two steps, each of which stays in the cache: into slabs of cells by runs of points, then within each slab.
+    #[allow(clippy::cast_possible_truncation, reason = "points are numbered in 32 bits")]
+    fn sort(&mut self, points: &[Vec3]) {
+        const RUN: usize = 1 << 16;
+        const SLABS: usize = 256;
+        let cells = self.starts.len() - 1;
+        let per_slab = cells.div_ceil(SLABS);
+        // Of each run (cell, number) slab by slab, and where each slab ends.
+        let run = |(run, points): (usize, &[Vec3])| {
+            let cells: Vec<u32> = points.iter().map(|&p| self.index(self.cell(p))).collect();
+            let mut ends = [0u32; SLABS + 1];
+            cells.iter().for_each(|&c| ends[c as usize / per_slab + 1] += 1);
+            for s in 0..SLABS {
+                ends[s + 1] += ends[s];
+            }
+            let mut sorted = vec![(0u32, 0u32); points.len()];
+            for (n, &c) in cells.iter().enumerate() {
+                let next = &mut ends[c as usize / per_slab];
+                sorted[*next as usize] = (c, (run * RUN + n) as u32);
+                *next += 1;
+            }
+            (sorted, ends)
+        };
+        let runs: Vec<_> = points.par_chunks(RUN).enumerate().map(run).collect();
+        let of = |slab: usize| {
+            runs.iter().map(move |(sorted, ends)| {
+                let start = if slab == 0 { 0 } else { ends[slab - 1] };
+                &sorted[start as usize..ends[slab] as usize]
+            })
+        };
+        let mut slabs = Vec::with_capacity(SLABS);
+        let (mut before, mut places, mut numbers) = (0, &mut self.points[..], &mut self.numbers[..]);
+        for (slab, starts) in self.starts[1..].chunks_mut(per_slab).enumerate() {
+            let count = of(slab).map(<[_]>::len).sum();
+            let here = (places.split_off_mut(..count), numbers.split_off_mut(..count));
+            slabs.push((before, starts, here.0.expect("as many places"), here.1.expect("as many numbers")));
+            before += count;
+        }
+        slabs.into_par_iter().enumerate().for_each(|(slab, (before, ends, places, numbers))| {
+            let first = (slab * per_slab) as u32;
+            let mut next = vec![0u32; ends.len() + 1];
+            of(slab).flatten().for_each(|(c, _)| next[(c - first) as usize + 1] += 1);
+            for c in 0..ends.len() {
+                next[c + 1] += next[c];
+                ends[c] = before as u32 + next[c + 1];
+            }
+            for &(c, number) in of(slab).flatten() {
+                let slot = &mut next[(c - first) as usize];
+                places[*slot as usize] = points[number as usize];
+                numbers[*slot as usize] = number;
+                *slot += 1;
+            }
+        });
     }
 
     /// Original numbers in slot order: sort the payload by it, and slots index the payload.
@@ -224,6 +263,27 @@ mod tests {
                 assert_eq!(found, all, "query {i}");
             }
         }
+    }
+
+    /// More points than one run holds, in cells of which many are empty.
+    #[test]
+    fn every_point_is_in_its_cell_in_the_order_of_its_number() {
+        let mut rng = Rng::stream(2, Stage::Test, 0);
+        let mut point = || Vec3::new(rng.unit() as f32, rng.unit() as f32, 30.0 * rng.unit().powi(9) as f32);
+        let points: Vec<Vec3> = (0..200_000).map(|_| point()).collect();
+        let grid = PointGrid::new(&points, 2.0);
+        assert_eq!((grid.starts[0], grid.starts[grid.starts.len() - 1]), (0, 200_000));
+        for (cell, range) in grid.starts.windows(2).enumerate() {
+            let slots = range[0] as usize..range[1] as usize;
+            assert!(grid.numbers[slots.clone()].is_sorted_by(|a, b| a < b));
+            for slot in slots {
+                assert_eq!(grid.points[slot], points[grid.numbers[slot] as usize]);
+                assert_eq!(grid.index(grid.cell(grid.points[slot])) as usize, cell);
+            }
+        }
+        let mut numbers = grid.numbers;
+        numbers.sort_unstable();
+        assert!(numbers.into_iter().eq(0..200_000));
     }
 
     #[test]

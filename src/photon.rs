@@ -172,6 +172,7 @@ pub fn trace_photons<T: Tracer>(
     let trace = |round: usize| -> Vec<Photons> {
         (round.min(chunks)..chunks.min(round + ROUND))
             .into_par_iter()
+            .with_max_len(1)
             .map(|chunk| {
                 let mut out = Photons::default();
                 let range = chunk as u64 * CHUNK..((chunk as u64 + 1) * CHUNK).min(settings.count);

@@ -209,7 +209,7 @@ pub fn sample_places<T: Tracer>(
 ) -> RadianceSamples {
     let (rays, misses) = (AtomicU64::new(0), AtomicU64::new(0));
     let mut samples = vec![None; count];
-    samples.par_chunks_mut(BLOCK).enumerate().for_each(|(n, out)| {
+    samples.par_chunks_mut(BLOCK).enumerate().with_max_len(1).for_each(|(n, out)| {
         if !tick(0) {
             return;
         }

@@ -319,7 +319,7 @@ impl<T: Tracer> Fill<'_, T> {
         };
         let points = self.scene.lattice().len();
         let rows = self.stored.split(&mut nodes, ROW);
-        rows.into_par_iter().enumerate().for_each(|(row, out)| {
+        rows.into_par_iter().enumerate().with_max_len(1).for_each(|(row, out)| {
             if !(self.tick)(0) {
                 return;
             }

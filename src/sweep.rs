@@ -22,6 +22,7 @@ mod grid;
 mod half;
 mod monitor;
 mod pack;
+mod runs;
 mod segments;
 #[allow(unsafe_code, reason = "vector instructions: measured to pay, chosen at run time")]
 mod simd;

@@ -153,7 +153,7 @@ impl<'a> GridPoints<'a> {
         let first = band.number * blocks(self.lattice);
         let rows = grid.radiance.par_chunks_mut(BLOCK).zip(grid.std_error.par_chunks_mut(BLOCK));
         let rows = rows.zip(grid.mask.par_chunks_mut(BLOCK)).zip(halves);
-        let counts = rows.enumerate().map(|(block, (((radiance, std_error), mask), halves))| {
+        let counts = rows.enumerate().with_max_len(1).map(|(block, (((radiance, std_error), mask), halves))| {
             let start = block * BLOCK;
             let range = start..start + radiance.len();
             let own: Vec<usize> = self.set.members(range).filter(|&o| band.holds(self.isovalue(o))).collect();

@@ -106,6 +106,7 @@ impl<'a> PhotonDensity<'a> {
         let [nx, ny, nz] = density.dims;
         let rows: Vec<(Vec<u32>, Vec<Bin>)> = (0..ny * nz)
             .into_par_iter()
+            .with_max_len(16)
             .map(|row| {
                 let mut bins = Vec::new();
                 let end = |i| {

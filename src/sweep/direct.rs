@@ -33,20 +33,15 @@ struct Fan {
     /// First line and their number along u and v, numbered by where they meet the lattice's plane.
     first: [isize; 2],
     count: [usize; 2],
-    /// [row][slice][line].
-    seen: Vec<u8>,
 }
+
+/// What the lines of a fan see: [row][slice][line].
+type Seen = Vec<u8>;
 
 impl Fan {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
-    fn new(
-        (geometry, isa, sides): (&Geometry, Isa, &[Side]),
-        y: DVec3,
-        start: f32,
-        axis: usize,
-        up: bool,
-    ) -> Option<Self> {
-        let layout = Layout::new(geometry.dims, axis);
+    fn new(dims: [usize; 3], y: DVec3, axis: usize, up: bool) -> Option<Self> {
+        let layout = Layout::new(dims, axis);
         let [u, v, a] = layout.axes;
         let source = [y[u], y[v], y[a]];
         let last = layout.dims[2] as f64 - 1.0;
@@ -60,17 +55,12 @@ impl Fan {
         let slices = (k0 as usize, (plane - k0).abs() as usize + 1);
         let first = [0, 1].map(|x| (source[x] - depth.abs()).floor() as isize);
         let count = [0, 1].map(|x| ((source[x] + depth.abs()).ceil() as isize - first[x] + 1).unsigned_abs());
-        let seen = vec![0u8; count[0] * count[1] * slices.1];
-        let mut fan = Self { layout, source, depth, slices, first, count, seen };
-        let mut seen = std::mem::take(&mut fan.seen);
-        let h = geometry.h(&layout);
-        let awake: Vec<&Blocks> = sides.iter().map(|s| geometry.awake(&layout, *s)).collect();
-        seen.par_chunks_mut(count[0] * slices.1).enumerate().for_each_init(
-            || [const { Vec::new() }; 3],
-            |scratch, (row, out)| fan.march(isa, h, &awake, start, row, scratch, out),
-        );
-        fan.seen = seen;
-        Some(fan)
+        Some(Self { layout, source, depth, slices, first, count })
+    }
+
+    /// Bytes of a row of lines.
+    fn row(&self) -> usize {
+        self.count[0] * self.slices.1
     }
 
     #[inline]
@@ -85,7 +75,7 @@ impl Fan {
         &self,
         isa: Isa,
         h: &[f32],
-        awake: &[&Blocks],
+        awake: [Option<&Blocks>; 2],
         start: f32,
         row: usize,
         [most, least, mixed]: &mut [Vec<f32>; 3],
@@ -94,6 +84,7 @@ impl Fan {
         let [nu, nv, _] = self.layout.dims;
         let [sv, sa] = self.layout.stride;
         let np = self.count[0];
+        out.fill(0);
         most.clear();
         least.clear();
         most.resize(np, start);
@@ -109,7 +100,7 @@ impl Fan {
             let j = (v as usize).min(nv - 2);
             let fv = (v - j as f64) as f32;
             let Some((n0, n1)) =
-                awake.iter().filter_map(|a| a.extent((k * sa + j * sv) / nu, sv / nu, nu)).reduce(join)
+                awake.iter().flatten().filter_map(|a| a.extent((k * sa + j * sv) / nu, sv / nu, nu)).reduce(join)
             else {
                 continue;
             };
@@ -136,7 +127,7 @@ impl Fan {
     /// The share of the four lines around local `x` that see the source at their own isovalue there: lower, higher side.
     #[inline]
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the fan")]
-    fn visibility(&self, x: [f64; 3]) -> Option<[f32; 2]> {
+    fn visibility(&self, seen: &Seen, x: [f64; 3]) -> Option<[f32; 2]> {
         let [u, v, a] = self.layout.axes;
         let inverse = self.depth / (x[a] - self.source[2]);
         let p = self.source[0] + (x[u] - self.source[0]) * inverse - self.first[0] as f64;
@@ -144,7 +135,7 @@ impl Fan {
         let step = (x[a] as usize).abs_diff(self.slices.0);
         let (i, j) = ((p as usize).min(self.count[0] - 2), (q as usize).min(self.count[1] - 2));
         let (f, g) = ((p - i as f64) as f32, (q - j as f64) as f32);
-        let at = |dj: usize| &self.seen[((j + dj) * self.slices.1 + step) * self.count[0] + i..][..2];
+        let at = |dj: usize| &seen[((j + dj) * self.slices.1 + step) * self.count[0] + i..][..2];
         let (near, far) = (at(0), at(1));
         let mut sum = [0f32; 3];
         let lines =
@@ -156,6 +147,25 @@ impl Fan {
         }
         (sum[0] > 0.0).then(|| [sum[1] / sum[0], sum[2] / sum[0]])
     }
+}
+
+/// Marches along all lines of the fans of one point, side by side: the rows of one fan alone are too few for threads to share
+/// well.
+fn march((geometry, isa, sides): (&Geometry, Isa, &[Side]), start: f32, fans: &[Option<Fan>; 6], seen: &mut [Seen; 6]) {
+    let mut rows = Vec::new();
+    for (fan, seen) in fans.iter().zip(seen) {
+        let Some(fan) = fan else { continue };
+        seen.resize(fan.count[1] * fan.row(), 0);
+        rows.extend(seen.chunks_exact_mut(fan.row()).enumerate().map(|(row, out)| (fan, row, out)));
+    }
+    rows.into_par_iter().with_max_len(8).for_each_init(
+        || [const { Vec::new() }; 3],
+        |scratch, (fan, row, out)| {
+            let awake: [Option<&Blocks>; 2] =
+                std::array::from_fn(|s| Some(geometry.awake(&fan.layout, *sides.get(s)?)));
+            fan.march(isa, geometry.h(&fan.layout), awake, start, row, scratch, out);
+        },
+    );
 }
 
 /// The least range that holds two.
@@ -231,6 +241,7 @@ pub(super) fn direct(
     let mut planes: Vec<Planes> = sides.iter().map(|_| spare.black(n)).collect();
     flats.textures.iter_mut().flatten().for_each(|t| t.direct.fill(0.0));
     let [nx, ny, _] = geometry.dims;
+    let mut seen: [Seen; 6] = Default::default();
     let corners: Vec<DVec3> = (0..8)
         .map(|c| lattice.to_world(lattice.far() * DVec3::from_array([c & 1, c >> 1 & 1, c >> 2].map(f64::from))))
         .collect();
@@ -255,13 +266,13 @@ pub(super) fn direct(
             let inside = (0..3).all(|a| y[a] >= 0.0 && y[a] <= lattice.far()[a]);
             let start = if inside { scene.field.value(y) as f32 } else { f32::NEG_INFINITY };
             let start = if start.is_nan() { f32::NEG_INFINITY } else { start };
-            let fans: [Option<Fan>; 6] =
-                std::array::from_fn(|f| Fan::new((geometry, isa, sides), y, start, f % 3, f >= 3));
+            let fans: [Option<Fan>; 6] = std::array::from_fn(|f| Fan::new(geometry.dims, y, f % 3, f >= 3));
+            march((geometry, isa, sides), start, &fans, &mut seen);
             let axes = lattice.axes();
             let step = axes.x_axis.as_vec3();
             let facing = light.normal().as_vec3();
-            let fans = &fans;
-            sums.par_chunks_mut(per * nx).enumerate().for_each(|(row, sums)| {
+            let (fans, seen) = (&fans, &seen);
+            sums.par_chunks_mut(per * nx).enumerate().with_max_len(32).for_each(|(row, sums)| {
                 let (j, k) = (row % ny, row / ny);
                 let begin = DVec3::new(0.0, j as f64, k as f64);
                 let start = (world - lattice.to_world(begin)).as_vec3();
@@ -279,8 +290,9 @@ pub(super) fn direct(
                     let size = (x[0] - y.x).abs();
                     let axis =
                         if across[1] >= size && across[1] >= across[0] { 2 } else { usize::from(across[0] >= size) };
-                    let Some(fan) = &fans[axis + if x[axis] > y[axis] { 3 } else { 0 }] else { return };
-                    let Some(v) = fan.visibility(x) else { return };
+                    let f = axis + if x[axis] > y[axis] { 3 } else { 0 };
+                    let Some(fan) = &fans[f] else { return };
+                    let Some(v) = fan.visibility(&seen[f], x) else { return };
                     let s = usize::from(cos_x < 0.0);
                     let open = blockers.polygons.is_empty() || !blockers.block(number, None, y, DVec3::from_array(x));
                     let [seen, all] = &mut sums[i * per + place[s]];
@@ -373,7 +385,7 @@ fn walls(
         let corners: Vec<DVec3> = [[0., 0.], [1., 0.], [0., 1.], [1., 1.]].map(|uv| flat.at(uv)).to_vec();
         let blockers = Blockers::new(scene, number, &corners);
         let [nu, nv, _] = texture.dims;
-        texture.direct.par_chunks_mut(3 * nc).enumerate().for_each(|(texel, out)| {
+        texture.direct.par_chunks_mut(3 * nc).enumerate().with_max_len(32).for_each(|(texel, out)| {
             let (i, j) = (texel % nu, texel / nu);
             let place = |a: f64, b: f64| flat.at([(i as f64 + a) / nu as f64, (j as f64 + b) / nv as f64]);
             let e = unoccluded(light, place(0.5, 0.5), flat.normal);

@@ -32,11 +32,6 @@ impl Layout {
         let node = axes.map(|a| [1, nx, nx * ny][a]);
         Self { axes, dims: axes.map(|a| [nx, ny, nz][a]), stride, node, transposed }
     }
-
-    /// Whether the slowest axis of memory is that of the slices.
-    pub(super) fn slices_outermost(&self) -> bool {
-        self.stride[1] >= self.stride[0]
-    }
 }
 
 /// Parallel lines on the sheared unit lattice: line (p, q) meets slice τ at (p + offset + slope·τ) in (u, v).

@@ -7,6 +7,7 @@ use super::flats::{Arrivals, Flats, Incoming};
 use super::grid::{Geometry, NORMAL_SCALE, Planes, Source, Spare};
 use super::half::Half4;
 use super::pack::{LANES, Light, Pack, Plan, Way};
+use super::runs::Runs;
 use super::simd::{Isa, prefetch};
 use crate::flattened::Side;
 use crate::scene::Scene;
@@ -29,21 +30,14 @@ pub(super) struct Pass<'a> {
     pub workspaces: Mutex<Vec<Workspace>>,
 }
 
-/// Tasks per thread that the rows of lines of a family are split into. Every task reads one row more than it owns.
-const TASKS: usize = 4;
-
 /// The radiance that the samples of a row of lines meet: [channel][slice][line].
 type RowLight = [Vec<f32>; 3];
 
 /// The irradiance of a row of nodes, a slice per channel.
 type Row<'a> = [&'a mut [f32]; 3];
 
-/// A row of nodes: its slice, its place along v, its irradiance.
-struct Nodes<'a> {
-    k: usize,
-    j: usize,
-    e: Row<'a>,
-}
+/// Rows of nodes in memory, each of which one row of lines of a family adds to.
+type Rows<'a> = Vec<Mutex<Row<'a>>>;
 
 /// By how many lines the cell of lines around node `j` of `n` is to be moved into Ω: on Ω's faces the light is linear
 /// beyond the last two lines. 0 if there is only one.
@@ -56,10 +50,12 @@ fn inwards(j: usize, n: usize) -> isize {
     }
 }
 
-/// What a task needs beside its rows.
+/// What a thread needs beside its rows.
 pub(super) struct Workspace {
     pack: Pack,
     light: [RowLight; 2],
+    /// Slice and place along v of the rows of nodes beside a row of lines.
+    nodes: Vec<[usize; 2]>,
 }
 
 /// What one family of lines reads.
@@ -92,18 +88,25 @@ impl Pass<'_> {
         let mut e = self.spare.black(b.len());
         let split = lines.partition_point(|s| !s.layout.transposed);
         let mut complete = true;
+        // Walls receive what one family brought while the next is under way.
+        let mut arrivals = Vec::new();
         // Darkness is the same in both orders.
         for (transposed, some) in [(true, &lines[split..]), (false, &lines[..split])] {
+            let Some(any) = some.first() else { continue };
+            let rows = node_rows(&mut e, any.layout.dims[0]);
             for shear in some {
                 complete = complete && tick();
                 if complete {
-                    self.family(side, shear, lines.len(), (b, scale), &mut e, flats, incoming);
+                    let lit = (flats, &mut *incoming, arrivals);
+                    arrivals = self.family(side, shear, lines.len(), (b, scale), &rows, lit);
                 }
             }
-            if transposed && !some.is_empty() {
+            drop(rows);
+            if transposed {
                 e = self.geometry.untransposed(e, self.spare);
             }
         }
+        incoming.receive(&arrivals);
         self.normalise(lines, &mut e);
         (e, complete)
     }
@@ -133,18 +136,16 @@ impl Pass<'_> {
             });
     }
 
-    /// All lines of one family, both ways.
-    #[allow(clippy::too_many_arguments, reason = "one caller")]
+    /// All lines of one family, both ways. `before` is what the last family brought to walls; returns what this one does.
     fn family(
         &self,
         side: Side,
         shear: &Shear,
         lines: usize,
         (b, scale): (&[Half4], f32),
-        e: &mut Planes,
-        flats: &Flats,
-        incoming: &mut Incoming,
-    ) {
+        rows: &Rows,
+        (flats, incoming, before): (&Flats, &mut Incoming, Vec<Arrivals>),
+    ) -> Vec<Arrivals> {
         let sign = if side == Side::Lower { 1.0 } else { -1.0 };
         let plan = Plan::new(*shear, sign);
         let ends = Ends::new(self.scene, flats, shear, self.inside);
@@ -163,64 +164,68 @@ impl Pass<'_> {
         let first = plan.first[1].min(family.walls.rows.0);
         let last = (plan.first[1] + plan.count[1] as isize).max(family.walls.rows.1);
         let count = (last - first + 1).unsigned_abs();
-        let mut rows: Vec<(Vec<Nodes>, Arrivals)> = (0..count).map(|_| Default::default()).collect();
-        for (k, j, e) in self.rows(&plan, e) {
-            let q = j as isize - plan.shift[1][k].0 + inwards(j, plan.shear.layout.dims[1]);
-            rows[(q - first).unsigned_abs()].0.push(Nodes { k, j, e });
-        }
-        let size = count.div_ceil(TASKS * rayon::current_num_threads());
-        rows.par_chunks_mut(size).enumerate().for_each(|(task, rows)| {
-            self.rows_of_lines(&family, first + (task * size) as isize, rows);
-        });
-        let arrivals: Vec<Arrivals> = rows.into_iter().map(|(_, a)| a).collect();
-        incoming.receive(&arrivals);
+        let arrivals: Vec<Mutex<Arrivals>> = (0..count).map(|_| Mutex::default()).collect();
+        let threads = rayon::current_num_threads();
+        let runs = Runs::new(count, threads);
+        let shares = || {
+            let share = |own| self.rows_of_lines(&family, (first, &arrivals), rows, (&runs, own));
+            (0..threads).into_par_iter().with_max_len(1).for_each(share);
+        };
+        rayon::join(shares, || incoming.receive(&before));
+        arrivals.into_iter().map(|a| a.into_inner().expect("no thread panics")).collect()
     }
 
-    /// The rows of nodes that hold light, with their slice and place along v.
-    fn rows<'e>(&'e self, plan: &'e Plan, e: &'e mut Planes) -> impl Iterator<Item = (usize, usize, Row<'e>)> {
+    /// Slice and place along v of the rows of lit nodes between row `q` of lines and the one before.
+    fn nodes(&self, plan: &Plan, q: isize, out: &mut Vec<[usize; 2]>) {
         let layout = &plan.shear.layout;
         let [nu, nv, na] = layout.dims;
-        let inner = if layout.slices_outermost() { nv } else { na };
         let lit = &self.geometry.lit_blocks(layout).rows;
-        let [e0, e1, e2] = e;
-        e0.chunks_exact_mut(nu)
-            .zip(e1.chunks_exact_mut(nu))
-            .zip(e2.chunks_exact_mut(nu))
-            .enumerate()
-            .filter(|(row, _)| lit[*row] != 0)
-            .map(move |(row, ((e0, e1), e2))| {
-                let (outer, inner) = (row / inner, row % inner);
-                let (k, j) = if layout.slices_outermost() { (outer, inner) } else { (inner, outer) };
-                (k, j, [e0, e1, e2])
-            })
+        out.clear();
+        for (k, (whole, _)) in plan.shift[1][..na].iter().enumerate() {
+            let cell = q + whole;
+            let beside = (cell - 1..=cell + 1).filter_map(|j| usize::try_from(j).ok()).filter(|j| *j < nv);
+            let own = beside.filter(|&j| j as isize + inwards(j, nv) == cell);
+            let lit = own.filter(|&j| lit[(k * layout.stride[1] + j * layout.stride[0]) / nu] != 0);
+            out.extend(lit.map(|j| [k, j]));
+        }
     }
 
-    /// Rows q = `first` … of lines: their light to the nodes between each and the one before, and to walls.
-    fn rows_of_lines(&self, family: &Family, first: isize, rows: &mut [(Vec<Nodes>, Arrivals)]) {
+    /// The rows q = `first` … of lines that thread `own` gets: their light to the nodes between each and the one before, and
+    /// to walls. Only for a row that does not follow the thread's last one the one before is walked through again.
+    fn rows_of_lines(
+        &self,
+        family: &Family,
+        (first, arrivals): (isize, &[Mutex<Arrivals>]),
+        rows: &Rows,
+        (runs, own): (&Runs, usize),
+    ) {
         let plan = family.plan;
         let size = plan.shear.layout.dims[2] * plan.width;
-        let mut work = self
-            .workspaces
-            .lock()
-            .expect("no thread panics")
-            .pop()
-            .unwrap_or_else(|| Workspace { pack: Pack::with_rows(0), light: Default::default() });
+        let spare = self.workspaces.lock().expect("no thread panics").pop();
+        let empty = || Workspace { pack: Pack::with_rows(0), light: Default::default(), nodes: Vec::new() };
+        let mut work = spare.unwrap_or_else(empty);
         work.pack.fit(plan.shear.layout.dims[2]);
         work.light.iter_mut().flatten().for_each(|l| l.resize(size, 0.0));
-        // Nodes of the first row need the lines before.
-        if !rows[0].0.is_empty() {
-            self.row_of_lines(family, first - 1, &mut work, 1, None);
-        }
-        for (n, (nodes, arrivals)) in rows.iter_mut().enumerate() {
+        let mut walked = None;
+        while let Some(n) = runs.next(own) {
             let q = first + n as isize;
-            self.row_of_lines(family, q, &mut work, n % 2, Some(arrivals));
-            let (this, before) = (&work.light[n % 2], &work.light[1 - n % 2]);
-            for row in 0..nodes.len() {
-                if let Some(next) = nodes.get(row + 1) {
-                    self.prefetch(family, next);
-                }
-                self.accumulate(family, [this, before], &mut nodes[row]);
+            let mut nodes = std::mem::take(&mut work.nodes);
+            self.nodes(plan, q, &mut nodes);
+            let follows = n > 0 && walked == Some(n - 1);
+            if !follows && !nodes.is_empty() {
+                self.row_of_lines(family, q - 1, &mut work, 1 - n % 2, None);
             }
+            let mut arrivals = arrivals[n].lock().expect("no thread panics");
+            self.row_of_lines(family, q, &mut work, n % 2, Some(&mut arrivals));
+            let light = [&work.light[n % 2], &work.light[1 - n % 2]];
+            for (i, &at) in nodes.iter().enumerate() {
+                if let Some(&next) = nodes.get(i + 1) {
+                    self.prefetch(family, rows, next);
+                }
+                self.accumulate(family, light, rows, at);
+            }
+            work.nodes = nodes;
+            walked = Some(n);
         }
         self.workspaces.lock().expect("no thread panics").push(work);
     }
@@ -258,21 +263,19 @@ impl Pass<'_> {
     }
 
     /// Brings what [`Self::accumulate`] reads and adds to into the cache.
-    fn prefetch(&self, family: &Family, nodes: &Nodes) {
+    fn prefetch(&self, family: &Family, rows: &Rows, [k, j]: [usize; 2]) {
         let layout = &family.plan.shear.layout;
-        let at = nodes.k * layout.stride[1] + nodes.j * layout.stride[0];
-        nodes.e.iter().for_each(|e| prefetch(e));
+        let at = k * layout.stride[1] + j * layout.stride[0];
+        rows[at / layout.dims[0]].lock().expect("no thread panics").iter().for_each(|e| prefetch(e));
         self.geometry.normals(layout).iter().for_each(|n| prefetch(&n[at..][..layout.dims[0]]));
     }
 
     /// Adds what a row of lines and the one before it brought to a row of nodes: each node takes its four nearest lines by
     /// bilinear weights, which go on linearly on Ω's faces ([`inwards`]), times the cosine of its own normal.
-    fn accumulate(&self, family: &Family, light: [&RowLight; 2], nodes: &mut Nodes) {
+    fn accumulate(&self, family: &Family, light: [&RowLight; 2], rows: &Rows, [k, j]: [usize; 2]) {
         let plan = family.plan;
         let layout = &plan.shear.layout;
         let [nu, nv, _] = layout.dims;
-        let Nodes { k, j, e } = nodes;
-        let (k, j) = (*k, *j);
         let fv = plan.shift[1][k].1 + inwards(j, nv) as f32;
         // Of a single row of lines, all.
         let fv = if nv > 2 { fv } else { j as f32 };
@@ -284,7 +287,8 @@ impl Pass<'_> {
         let normals = self.geometry.normals(layout);
         let n = [0, 1, 2].map(|a| &normals[a][at..][..nu]);
         let lit = self.geometry.lit_blocks(layout);
-        let [e0, e1, e2] = e;
+        let mut row = rows[at / nu].lock().expect("no thread panics");
+        let [e0, e1, e2] = &mut *row;
         let mut bits = lit.rows[at / nu];
         while bits != 0 {
             // Runs of lit blocks.
@@ -303,6 +307,13 @@ impl Pass<'_> {
             );
         }
     }
+}
+
+/// Planes as rows of `nu` nodes.
+fn node_rows(e: &mut Planes, nu: usize) -> Rows<'_> {
+    let [e0, e1, e2] = e;
+    let rows = e0.chunks_exact_mut(nu).zip(e1.chunks_exact_mut(nu)).zip(e2.chunks_exact_mut(nu));
+    rows.map(|((e0, e1), e2)| Mutex::new([e0, e1, e2])).collect()
 }
 
 /// Nodes a..b of a row. `line0` is the line (in `light`) just beyond node 0, −1 of which is missing.

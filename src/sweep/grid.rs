@@ -172,13 +172,16 @@ impl<'a> Geometry<'a> {
                 ((g / scale).normalize() * f64::from(NORMAL_SCALE)).to_array().map(|x| x.round() as i16)
             })
             .collect();
-        let valid: Vec<bool> = h.iter().zip(&encoded).map(|(h, n)| (0.0..=1.0).contains(h) && *n != [0; 3]).collect();
+        let on_surface = |(h, n): (&f32, &[i16; 3])| (0.0..=1.0).contains(h) && *n != [0; 3];
+        let valid: Vec<bool> = h.par_iter().zip(&encoded).with_min_len(1 << 14).map(on_surface).collect();
         let near = |at: usize| (-OVERSHOOT..=1.0 + OVERSHOOT).contains(&h[at]) && encoded[at] != [0; 3];
         let mut lit = valid.clone();
         ring(dims, &valid).into_iter().filter(|at| near(*at as usize)).for_each(|at| lit[at as usize] = true);
         // Nodes that are not lit take no light whatever lines bring.
-        let normals: [Vec<i16>; 3] =
-            std::array::from_fn(|a| encoded.iter().zip(&lit).map(|(n, lit)| if *lit { n[a] } else { 0 }).collect());
+        let normals: [Vec<i16>; 3] = std::array::from_fn(|a| {
+            let nodes = encoded.par_iter().zip(&lit).with_min_len(1 << 14);
+            nodes.map(|(n, lit)| if *lit { n[a] } else { 0 }).collect()
+        });
         drop(encoded);
         let normals_transposed = std::array::from_fn(|a| transposed(&normals[a], dims));
         let rings = rings(dims, &lit);
@@ -347,7 +350,12 @@ fn ring([nx, ny, nz]: [usize; 3], known: &[bool]) -> Vec<u32> {
         to
     };
     let wide = along(&along(&along(known, 1, nx), nx, ny), nx * ny, nz);
-    (0..known.len()).filter(|&at| wide[at] && !known[at]).map(|at| at as u32).collect()
+    (0..known.len())
+        .into_par_iter()
+        .with_min_len(1 << 14)
+        .filter(|&at| wide[at] && !known[at])
+        .map(|at| at as u32)
+        .collect()
 }
 
 /// Nodes without light that share a cell with a lit node, then those that share a cell with these.

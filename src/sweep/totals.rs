@@ -103,8 +103,9 @@ impl Totals {
                 irradiance: collect(&self.light[s]),
                 std_error: match spread.next() {
                     Some(m) if done > 1 => m
-                        .iter()
+                        .par_iter()
                         .zip(&geometry.valid)
+                        .with_min_len(1 << 12)
                         .map(|(m, v)| if *v { (together * m * scale / (done - 1) as f32).sqrt() } else { 0.0 })
                         .collect(),
                     _ => Vec::new(),
