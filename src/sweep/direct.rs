@@ -84,7 +84,6 @@ impl Fan {
         let [nu, nv, _] = self.layout.dims;
         let [sv, sa] = self.layout.stride;
         let np = self.count[0];
-        out.fill(0);
         most.clear();
         least.clear();
         most.resize(np, start);
@@ -151,11 +150,12 @@ impl Fan {
 
 /// Marches along all lines of the fans of one point, side by side: the rows of one fan alone are too few for threads to share
 /// well.
-fn march((geometry, isa, sides): (&Geometry, Isa, &[Side]), start: f32, fans: &[Option<Fan>; 6], seen: &mut [Seen; 6]) {
+fn march((geometry, isa, sides): (&Geometry, Isa, &[Side]), start: f32, fans: &[Option<Fan>; 6]) -> [Seen; 6] {
+    // Of the widest fans most lines miss Ω: what they would see stays untouched.
+    let mut seen = fans.each_ref().map(|fan| vec![0; fan.as_ref().map_or(0, |fan| fan.count[1] * fan.row())]);
     let mut rows = Vec::new();
-    for (fan, seen) in fans.iter().zip(seen) {
+    for (fan, seen) in fans.iter().zip(&mut seen) {
         let Some(fan) = fan else { continue };
-        seen.resize(fan.count[1] * fan.row(), 0);
         rows.extend(seen.chunks_exact_mut(fan.row()).enumerate().map(|(row, out)| (fan, row, out)));
     }
     rows.into_par_iter().with_max_len(8).for_each_init(
@@ -166,6 +166,7 @@ fn march((geometry, isa, sides): (&Geometry, Isa, &[Side]), start: f32, fans: &[
             fan.march(isa, geometry.h(&fan.layout), awake, start, row, scratch, out);
         },
     );
+    seen
 }
 
 /// The least range that holds two.
@@ -241,7 +242,6 @@ pub(super) fn direct(
     let mut planes: Vec<Planes> = sides.iter().map(|_| spare.black(n)).collect();
     flats.textures.iter_mut().flatten().for_each(|t| t.direct.fill(0.0));
     let [nx, ny, _] = geometry.dims;
-    let mut seen: [Seen; 6] = Default::default();
     let corners: Vec<DVec3> = (0..8)
         .map(|c| lattice.to_world(lattice.far() * DVec3::from_array([c & 1, c >> 1 & 1, c >> 2].map(f64::from))))
         .collect();
@@ -267,7 +267,7 @@ pub(super) fn direct(
             let start = if inside { scene.field.value(y) as f32 } else { f32::NEG_INFINITY };
             let start = if start.is_nan() { f32::NEG_INFINITY } else { start };
             let fans: [Option<Fan>; 6] = std::array::from_fn(|f| Fan::new(geometry.dims, y, f % 3, f >= 3));
-            march((geometry, isa, sides), start, &fans, &mut seen);
+            let seen = march((geometry, isa, sides), start, &fans);
             let axes = lattice.axes();
             let step = axes.x_axis.as_vec3();
             let facing = light.normal().as_vec3();
