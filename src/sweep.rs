@@ -138,7 +138,7 @@ const LEAST: usize = 16;
 const LATE: usize = 2;
 /// Coarse passes until light has settled, as a rule; only estimates of time rely on it.
 const SETTLING: usize = 6;
-/// The share of a replicate's progress that is direct light.
+/// The share of progress that is direct light.
 pub(crate) const DIRECT_SHARE: f64 = 0.2;
 
 /// Whether sweeps can light a scene.
@@ -214,26 +214,28 @@ pub fn sweep_resumable(
         saved,
         spare: &spare,
     };
-    let mut stopped = false;
+    let mut stopped = !run.direct(&mut state, &mut flats, tick);
     while state.done < replicates && !stopped {
-        let r = state.done;
-        let progress = |x: f64| tick((r as f64 + x) / replicates as f64);
-        let (light, complete) = run.replicate(&mut state, passes.take(), &mut flats, &progress);
+        let done = state.done as f64;
+        let progress = |x: f64| tick(DIRECT_SHARE + (1.0 - DIRECT_SHARE) * (done + x) / replicates as f64);
+        let (indirect, complete) = run.replicate(&mut state, passes.take(), &mut flats, &progress);
         stopped = !complete;
-        if complete || r == 0 {
-            // Direct light needs as much as passes with these planes, and no more.
-            spare.clear();
-            spare.keep(state.add(light, &flats, scene));
+        if complete {
+            spare.keep(state.add(indirect, &flats, scene));
         }
     }
     spare.clear();
+    if state.done == 0 {
+        // What there is.
+        state.flats = flats.textures.iter().map(|t| t.as_ref().map(|t| t.radiance.clone())).collect();
+    }
     if !stopped {
-        saved.save(0, || state.bytes(None));
+        saved.save(0, || state.bytes(None, &flats));
     }
     let State { done, total, flats: sums, bounces, residual, counts } = state;
     let flats = flats.textures.iter().zip(sums).map(|(texture, sum)| {
         texture.as_ref().zip(sum).map(|(t, mut sum)| {
-            sum.iter_mut().for_each(|x| *x /= done as f32);
+            sum.iter_mut().for_each(|x| *x /= done.max(1) as f32);
             t.export(&sum)
         })
     });
@@ -286,51 +288,59 @@ struct Run<'a> {
     spare: &'a Spare,
 }
 
-/// Direct and indirect irradiance of one replicate, per side; the latter is missing if it was stopped.
-type Light = [Vec<Planes>; 2];
-
 impl Run<'_> {
-    /// Direct light of one replicate, on the flats too, and what it makes nodes reflect; the direct light if `progress`
-    /// stopped it.
-    fn begin(
-        &self,
-        state: &mut State,
-        flats: &mut Flats,
-        progress: &dyn Fn(f64) -> bool,
-    ) -> Result<Passes, Vec<Planes>> {
+    /// Direct light of all replicates, on the flats too: each has luminaire points of its own, and what bounces is their mean, so
+    /// that no replicate spreads the light of few points. False if `tick` stopped it.
+    fn direct(&self, state: &mut State, flats: &mut Flats, tick: &(dyn Fn(f64) -> bool + Sync)) -> bool {
         let s = self.settings;
+        let replicates = s.replicates.max(1);
         let points = s.light_points.max(1);
         let lights = points * self.scene.luminaires().len();
-        let mut step = 0;
-        let mut ask = || {
-            step += 1;
-            progress(DIRECT_SHARE * f64::from(step) / lights as f64)
-        };
-        let number = state.done as u64;
-        let (direct, complete) = direct::direct(
-            self.scene,
-            (self.geometry, self.isa, self.spare),
-            flats,
-            self.sides,
-            (s.seed, number, points),
-            &mut ask,
-        );
-        let nothing = flats.open();
-        flats.close(&nothing);
-        flats.reflect([1.0; 3], false);
-        if !complete {
-            return Err(direct);
+        let mut complete = true;
+        let first = state.total.lit;
+        while state.total.lit < replicates && complete {
+            let number = state.total.lit;
+            if self.saved.due() {
+                self.saved.save(0, || state.bytes(None, flats));
+            }
+            let mut step = number * lights;
+            let mut ask = || {
+                step += 1;
+                tick(DIRECT_SHARE * step as f64 / (replicates * lights) as f64)
+            };
+            let common = (self.geometry, self.isa, self.spare);
+            let (direct, all) =
+                direct::direct(self.scene, common, flats, self.sides, (s.seed, number as u64, points), &mut ask);
+            complete = all;
+            if !complete {
+                self.saved.save(0, || state.bytes(None, flats));
+            }
+            if complete || number == 0 {
+                state.counts.shadow_rays += state.counts.valid * lights as u64;
+                self.spare.keep(state.total.add_direct(direct, self.scene));
+            }
         }
-        state.counts.shadow_rays += state.counts.valid * lights as u64;
+        if first < replicates {
+            state.total.average_direct();
+            flats.average_direct(state.total.lit);
+            flats.dim();
+        }
+        complete
+    }
+
+    /// What nodes and flats reflect before the first pass of a replicate.
+    fn begin(&self, state: &State, flats: &mut Flats) -> Passes {
         let late = if self.warm(state) { LATE - 1 } else { 0 };
+        let direct = (state.total.direct.as_slice(), [1.0; 3]);
         let (b, unit) = if late > 0 {
             let share = 1.0 / state.done as f32;
             flats.take(&state.flats, share);
-            self.reflect(flats, &[(state.total.light.as_slice(), [share; 3])], Vec::new())
+            self.reflect(flats, &[direct, (state.total.light.as_slice(), [share; 3])], Vec::new())
         } else {
-            self.reflect(flats, &[(direct.as_slice(), [1.0; 3])], Vec::new())
+            flats.dim();
+            self.reflect(flats, &[direct], Vec::new())
         };
-        Ok(Passes { direct, b, unit, monitor: Monitor::default(), late, bounce: 0 })
+        Passes { b, unit, monitor: Monitor::default(), late, bounce: 0 }
     }
 
     /// Whether a replicate starts from the light of those before instead of from luminaires alone: then its last pass is all
@@ -340,30 +350,24 @@ impl Run<'_> {
         state.done > 0 && self.settings.settles() && state.total.sides().len() == self.sides.len()
     }
 
-    /// Direct light, then bounces: coarse passes until the tail is predictable and small, then finer ones.
-    /// Goes on behind the passes of `from`, whose light the flats hold. False if `progress` stopped it.
+    /// Bounces: coarse passes until the tail is predictable and small, then finer ones. Goes on behind the passes of `from`, whose
+    /// light the flats hold. Returns the indirect irradiance per side, and false if `progress` stopped it.
     fn replicate(
         &self,
         state: &mut State,
         from: Option<Passes>,
         flats: &mut Flats,
         progress: &dyn Fn(f64) -> bool,
-    ) -> (Light, bool) {
+    ) -> (Vec<Planes>, bool) {
         let s = self.settings;
         let number = state.done as u64;
         if from.is_none() && self.saved.due() {
-            self.saved.save(0, || state.bytes(None));
+            self.saved.save(0, || state.bytes(None, flats));
         }
         if let Some(passes) = &from {
             flats.pack(passes.unit);
         }
-        let mut now = match from.map_or_else(|| self.begin(state, flats, progress), Ok) {
-            Ok(passes) => passes,
-            Err(direct) => {
-                self.saved.save(0, || state.bytes(None));
-                return ([direct, Vec::new()], false);
-            }
-        };
+        let mut now = from.unwrap_or_else(|| self.begin(state, flats));
         let mut indirect = Vec::new();
         let pass = Pass {
             scene: self.scene,
@@ -377,7 +381,7 @@ impl Run<'_> {
         let fixed = !self.settings.settles();
         while now.bounce < s.max_bounces {
             if self.saved.due() {
-                self.saved.save(0, || state.bytes(Some((&now, flats))));
+                self.saved.save(0, || state.bytes(Some(&now), flats));
             }
             let settled = now.late > 0 || now.monitor.missing(LATE as i32).is_some_and(|m| m < s.target);
             let bounce = now.bounce + 1;
@@ -403,7 +407,7 @@ impl Run<'_> {
             let mut ask = || {
                 family += 1;
                 let passes = bounce as f64 - 1.0 + f64::from(family) / total as f64;
-                progress(DIRECT_SHARE + (1.0 - DIRECT_SHARE) * passes / (bounce as f64 + more))
+                progress(passes / (bounce as f64 + more))
             };
             let mut stopped = false;
             for (&side, b) in self.sides.iter().zip(&now.b) {
@@ -414,9 +418,9 @@ impl Run<'_> {
             if stopped {
                 // Half a pass is not kept, and may be as large as what is.
                 self.spare.keep(indirect.drain(..));
-                self.saved.save(0, || state.bytes(Some((&now, flats))));
+                self.saved.save(0, || state.bytes(Some(&now), flats));
                 state.see(&now);
-                return ([now.direct, Vec::new()], false);
+                return (Vec::new(), false);
             }
             flats.close(&incoming);
             now.bounce = bounce;
@@ -429,11 +433,12 @@ impl Run<'_> {
                 break;
             }
             let old = std::mem::take(&mut now.b);
-            (now.b, now.unit) = self.reflect(flats, &[(now.direct.as_slice(), [1.0; 3]), (&indirect, scale)], old);
+            (now.b, now.unit) =
+                self.reflect(flats, &[(state.total.direct.as_slice(), [1.0; 3]), (&indirect, scale)], old);
             self.spare.keep(indirect.drain(..));
         }
         state.see(&now);
-        ([now.direct, indirect], true)
+        (indirect, true)
     }
 
     /// B = Le + ρ/π Σ scale · irradiance of the sides, filled where no surface is, as lines read it; packs the flats too.

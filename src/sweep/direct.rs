@@ -226,8 +226,8 @@ fn points(light: &Polygon, seed: u64, index: u64, number: u32, count: usize) -> 
     (first..first + count).map(|i| light.sample(set.point2(i, 0))).collect()
 }
 
-/// Direct irradiance of every node, one set of planes per side in `sides`, and of the flats. `index` tells replicates
-/// apart. `tick` is asked before every point; false stops.
+/// Direct irradiance of every node, one set of planes per side in `sides`; that of the flats is added to theirs at the end. `index`
+/// tells replicates apart. `tick` is asked before every point; false stops.
 #[allow(clippy::cast_possible_truncation, reason = "irradiance is f32")]
 pub(super) fn direct(
     scene: &Scene,
@@ -240,7 +240,6 @@ pub(super) fn direct(
     let n = geometry.h.len();
     let lattice = scene.lattice();
     let mut planes: Vec<Planes> = sides.iter().map(|_| spare.black(n)).collect();
-    flats.textures.iter_mut().flatten().for_each(|t| t.direct.fill(0.0));
     let [nx, ny, _] = geometry.dims;
     let corners: Vec<DVec3> = (0..8)
         .map(|c| lattice.to_world(lattice.far() * DVec3::from_array([c & 1, c >> 1 & 1, c >> 2].map(f64::from))))
@@ -315,6 +314,9 @@ pub(super) fn direct(
                 }
             });
         }
+    }
+    for &number in scene.luminaires() {
+        let points = points(&scene.polygons()[number as usize], seed, index, number, count);
         walls((scene, isa), flats, sides, number, &points, (seed, index));
     }
     (planes, true)

@@ -212,6 +212,19 @@ impl Flats {
         (texture.start + texel * self.isovalues) as u32
     }
 
+    /// Makes sums of direct light over so many replicates their mean.
+    pub(super) fn average_direct(&mut self, replicates: usize) {
+        let share = 1.0 / replicates.max(1) as f32;
+        self.textures.iter_mut().flatten().flat_map(|t| &mut t.direct).for_each(|x| *x *= share);
+    }
+
+    /// Reflects direct light alone.
+    pub(super) fn dim(&mut self) {
+        let nothing = self.open();
+        self.close(&nothing);
+        self.reflect([1.0; 3], false);
+    }
+
     /// Empty sums for a pass.
     pub(super) fn open(&self) -> Incoming {
         let sink = |t: &Texture| {

@@ -13,7 +13,7 @@ use crate::scene::Scene;
 pub(super) struct State {
     /// Replicates that are finished.
     pub done: usize,
-    /// Light of the nodes.
+    /// Light of the nodes; the direct light is that of all replicates before the first of them bounces it.
     pub total: Totals,
     /// Sums of the flats' reflected radiance.
     pub flats: Vec<Option<Vec<f32>>>,
@@ -23,10 +23,8 @@ pub(super) struct State {
     pub counts: SweepCounts,
 }
 
-/// A replicate between two passes. The flats hold the rest of it: their direct light and their radiance.
+/// A replicate between two passes. The flats hold the rest of it, their radiance.
 pub(super) struct Passes {
-    /// Direct irradiance per side.
-    pub direct: Vec<Planes>,
     /// Times `unit`, the B that the next pass reads.
     pub b: Vec<Vec<Half4>>,
     pub unit: f32,
@@ -49,9 +47,9 @@ impl State {
         }
     }
 
-    /// Adds a replicate and what it left on the flats. Returns the planes that are free.
-    pub(super) fn add(&mut self, light: [Vec<Planes>; 2], flats: &Flats, scene: &Scene) -> Vec<Planes> {
-        let spare = self.total.add(light, scene);
+    /// Adds the indirect light of a replicate and what it left on the flats. Returns the planes that are free.
+    pub(super) fn add(&mut self, indirect: Vec<Planes>, flats: &Flats, scene: &Scene) -> Vec<Planes> {
+        let spare = self.total.add(indirect, scene);
         let radiance = || flats.textures.iter().map(|t| t.as_ref().map(|t| &t.radiance));
         if self.done == 0 {
             self.flats = radiance().map(Option::<&Vec<f32>>::cloned).collect();
@@ -81,11 +79,11 @@ impl State {
     }
 
     /// Everything as bytes, with the passes of a replicate that is under way.
-    pub(super) fn bytes(&self, passes: Option<(&Passes, &Flats)>) -> Vec<u8> {
+    pub(super) fn bytes(&self, passes: Option<&Passes>, flats: &Flats) -> Vec<u8> {
         let numbers = |planes: &[Planes]| planes.iter().flatten().map(Vec::len).sum::<usize>();
-        let total = numbers(&self.total.light);
+        let total = numbers(&self.total.direct) + numbers(&self.total.light);
         let spread = self.total.spread.iter().map(Vec::len).sum::<usize>();
-        let under_way = passes.map_or(0, |(p, _)| numbers(&p.direct) + p.b.iter().map(|b| 2 * b.len()).sum::<usize>());
+        let under_way = passes.map_or(0, |p| p.b.iter().map(|b| 2 * b.len()).sum::<usize>());
         // The flats are small beside it.
         let mut out = Writer { bytes: Vec::with_capacity(4 * (total + spread + under_way) + (1 << 16)) };
         out.count(self.done);
@@ -95,13 +93,19 @@ impl State {
         for n in [c.gather_rays, c.shadow_rays, c.families, c.valid, c.masked] {
             out.bytes.extend(n.to_le_bytes());
         }
+        out.count(self.total.lit);
+        if self.total.lit > 0 {
+            out.planes(&self.total.direct);
+            self.total.spread.iter().chain(&self.total.parts).for_each(|s| out.numbers(s));
+            flats.textures.iter().flatten().for_each(|t| out.numbers(&t.direct));
+        }
+        out.count(self.total.light.len());
         if self.done > 0 {
             out.planes(&self.total.light);
-            self.total.spread.iter().chain(&self.total.parts).for_each(|s| out.numbers(s));
             self.flats.iter().flatten().for_each(|f| out.numbers(f));
         }
         out.count(usize::from(passes.is_some()));
-        if let Some((p, flats)) = passes {
+        if let Some(p) = passes {
             out.count(p.bounce);
             out.count(p.late);
             out.numbers(&[p.unit]);
@@ -109,12 +113,8 @@ impl State {
             out.count(p.monitor.means.len());
             let means = p.monitor.means.iter().flatten();
             means.chain(&p.monitor.ratio).chain(&p.monitor.tail).for_each(|&x| out.real(x));
-            out.planes(&p.direct);
             p.b.iter().for_each(|b| out.halves(b));
-            for t in flats.textures.iter().flatten() {
-                out.numbers(&t.direct);
-                out.numbers(&t.radiance);
-            }
+            flats.textures.iter().flatten().for_each(|t| out.numbers(&t.radiance));
         }
         out.bytes
     }
@@ -122,22 +122,23 @@ impl State {
     /// Takes the state back from [`State::bytes`]; the passes of a replicate of `sides` that was under way are returned, and
     /// the flats take what belongs to them. Nothing is changed if the bytes do not fit.
     pub(super) fn restore(&mut self, bytes: &[u8], sides: usize, flats: &mut Flats) -> Option<Passes> {
-        let (state, passes) = self.parse(bytes, sides, flats)?;
-        let stored = std::mem::replace(&mut self.total.light, state.total.light);
-        debug_assert!(stored.is_empty(), "restored once, into a fresh state");
+        let Parsed { state, direct, passes } = self.parse(bytes, sides, flats)?;
+        (self.total.direct, self.total.light) = (state.total.direct, state.total.light);
         (self.total.spread, self.total.parts) = (state.total.spread, state.total.parts);
-        self.total.count = state.done as f32;
+        (self.total.lit, self.total.count) = (state.total.lit, state.done);
+        for (texture, direct) in flats.textures.iter_mut().flatten().zip(direct) {
+            texture.direct = direct;
+        }
         (self.done, self.flats) = (state.done, state.flats);
         (self.bounces, self.residual, self.counts) = (state.bounces, state.residual, state.counts);
         let (passes, light) = passes?;
-        for (texture, [direct, radiance]) in flats.textures.iter_mut().flatten().zip(light) {
-            (texture.direct, texture.radiance) = (direct, radiance);
+        for (texture, radiance) in flats.textures.iter_mut().flatten().zip(light) {
+            texture.radiance = radiance;
         }
         Some(passes)
     }
 
-    #[allow(clippy::type_complexity, reason = "a state, and passes with their flats")]
-    fn parse(&self, bytes: &[u8], sides: usize, flats: &Flats) -> Option<(Self, Option<(Passes, Vec<[Vec<f32>; 2]>)>)> {
+    fn parse(&self, bytes: &[u8], sides: usize, flats: &Flats) -> Option<Parsed> {
         let mut from = Reader { bytes };
         let nodes = self.total.nodes();
         let stored = self.total.sides();
@@ -155,14 +156,23 @@ impl State {
         };
         state.total.spread.clone_from(&self.total.spread);
         state.flats = flats.textures.iter().map(|_| None).collect();
-        if state.done > 0 {
-            state.total.light = from.planes(stored.len(), nodes)?;
+        state.total.lit = from.count()?;
+        let mut direct = Vec::new();
+        if state.total.lit > 0 {
+            state.total.direct = from.planes(sides, nodes)?;
             for spread in &mut state.total.spread {
                 *spread = from.numbers(nodes)?;
             }
-            let parts = if state.total.spread.is_empty() { 0 } else { state.done };
+            let parts = if state.total.spread.is_empty() { 0 } else { state.total.lit };
             let each = state.total.spread.len() * nodes.div_ceil(STRIDE);
             state.total.parts = (0..parts).map(|_| from.numbers(each)).collect::<Option<_>>()?;
+            for t in flats.textures.iter().flatten() {
+                direct.push(from.numbers(t.direct.len())?);
+            }
+        }
+        let bounced = from.count()?;
+        if state.done > 0 {
+            state.total.light = from.planes(bounced.min(stored.len()), nodes)?;
             for (sum, texture) in state.flats.iter_mut().zip(&flats.textures) {
                 if let Some(t) = texture {
                     *sum = Some(from.numbers(t.radiance.len())?);
@@ -178,16 +188,24 @@ impl State {
                 monitor.means.push(from.three()?);
             }
             (monitor.ratio, monitor.tail) = (from.three()?, from.three()?);
-            let direct = from.planes(sides, nodes)?;
             let b = (0..sides).map(|_| from.halves(nodes)).collect::<Option<_>>()?;
             let mut textures = Vec::new();
             for t in flats.textures.iter().flatten() {
-                textures.push([from.numbers(t.direct.len())?, from.numbers(t.radiance.len())?]);
+                textures.push(from.numbers(t.radiance.len())?);
             }
-            passes = Some((Passes { direct, b, unit, monitor, late, bounce }, textures));
+            passes = Some((Passes { b, unit, monitor, late, bounce }, textures));
         }
-        from.bytes.is_empty().then_some((state, passes))
+        from.bytes.is_empty().then_some(Parsed { state, direct, passes })
     }
+}
+
+/// What the bytes of a state tell.
+struct Parsed {
+    state: State,
+    /// Direct light of the flats that reflect.
+    direct: Vec<Vec<f32>>,
+    /// Passes under way, and the radiance of these flats.
+    passes: Option<(Passes, Vec<Vec<f32>>)>,
 }
 
 /// Numbers as little-endian bytes.

@@ -15,19 +15,26 @@ pub(super) const STRIDE: usize = 16;
 pub(super) struct Totals {
     sides: Vec<Side>,
     nodes: usize,
-    /// Irradiance.
+    /// Direct irradiance of all swept sides: the sum over the replicates so far, and the mean once it is that of all.
+    pub(super) direct: Vec<Planes>,
+    /// Replicates in it.
+    pub(super) lit: usize,
+    /// Indirect irradiance.
     pub(super) light: Vec<Planes>,
-    /// Squared deviations of the luminance of ρE/π from its mean. \[Welford62\]
+    /// Squared deviations of the luminance of ρE/π from its mean, of direct and of indirect light: they come from independent
+    /// sets. \[Welford62\]
     pub(super) spread: Vec<Vec<f32>>,
     /// That luminance of each replicate at every [`STRIDE`]th node.
     pub(super) parts: Vec<Vec<f32>>,
-    pub(super) count: f32,
+    /// Replicates in `light`.
+    pub(super) count: usize,
 }
 
 impl Totals {
     pub(super) fn new(sides: &[Side], n: usize, replicates: usize) -> Self {
         let spread = if replicates > 1 { vec![vec![0.0; n]; sides.len()] } else { Vec::new() };
-        Self { sides: sides.to_vec(), nodes: n, light: Vec::new(), spread, parts: Vec::new(), count: 0.0 }
+        let (direct, light, parts) = (Vec::new(), Vec::new(), Vec::new());
+        Self { sides: sides.to_vec(), nodes: n, direct, lit: 0, light, spread, parts, count: 0 }
     }
 
     pub(super) fn sides(&self) -> &[Side] {
@@ -38,81 +45,107 @@ impl Totals {
         self.nodes
     }
 
-    /// Takes the direct and indirect irradiance of a replicate, or the direct one alone. Returns the planes it does not keep.
-    #[allow(clippy::cast_possible_truncation, reason = "albedo")]
-    pub(super) fn add(&mut self, [mut direct, indirect]: [Vec<Planes>; 2], scene: &Scene) -> Vec<Planes> {
-        let mut spare = direct.split_off(self.sides.len());
-        for (sum, new) in direct.iter_mut().flatten().zip(indirect.iter().flatten()) {
-            sum.par_iter_mut().zip(new).with_min_len(1 << 12).for_each(|(s, n)| *s += n);
+    /// Takes the direct irradiance of a replicate. Returns the planes it does not keep.
+    pub(super) fn add_direct(&mut self, new: Vec<Planes>, scene: &Scene) -> Vec<Planes> {
+        self.lit += 1;
+        self.deviate(scene, &new, true);
+        add(&mut self.direct, new)
+    }
+
+    /// Makes the sum of direct light its mean.
+    pub(super) fn average_direct(&mut self) {
+        let share = 1.0 / self.lit.max(1) as f32;
+        for plane in self.direct.iter_mut().flatten() {
+            plane.par_iter_mut().with_min_len(1 << 12).for_each(|x| *x *= share);
         }
-        spare.extend(indirect);
-        let new = direct;
-        self.count += 1.0;
+    }
+
+    /// Takes the indirect irradiance of a replicate, or nothing if there is none. Returns the planes it does not keep.
+    pub(super) fn add(&mut self, mut new: Vec<Planes>, scene: &Scene) -> Vec<Planes> {
+        self.count += 1;
+        if new.is_empty() {
+            return new;
+        }
+        let mut spare = new.split_off(self.sides.len());
+        self.deviate(scene, &new, false);
+        spare.extend(add(&mut self.light, new));
+        spare
+    }
+
+    /// Adds the deviations of the `direct` or indirect light of a replicate that is about to be added.
+    #[allow(clippy::cast_possible_truncation, reason = "albedo")]
+    fn deviate(&mut self, scene: &Scene, new: &[Planes], direct: bool) {
+        if self.spread.is_empty() {
+            return;
+        }
         let luminance = |albedo: DVec3| -> [f32; 3] {
             std::array::from_fn(|c| [0.2126, 0.7152, 0.0722][c] * albedo[c] as f32 / PI)
         };
         let (albedo, h) = (&scene.surface.albedo, scene.field.samples());
         let same = (albedo.stops().len() == 1).then(|| luminance(albedo.at(0.0)));
         let luminance = |i: usize| same.unwrap_or_else(|| luminance(albedo.at(f64::from(h[i]))));
-        if !self.spread.is_empty() {
-            let at = |planes: &Planes, i: usize| {
-                let luminance = luminance(i);
-                (0..3).map(|c| luminance[c] * planes[c][i]).sum::<f32>()
-            };
-            let nodes = (0..self.nodes).step_by(STRIDE);
-            self.parts.push(new.iter().flat_map(|planes| nodes.clone().map(|i| at(planes, i))).collect());
+        let at = |planes: &Planes, i: usize| {
+            let luminance = luminance(i);
+            (0..3).map(|c| luminance[c] * planes[c][i]).sum::<f32>()
+        };
+        let nodes = (0..self.nodes).step_by(STRIDE);
+        let part = new[..self.sides.len()].iter().flat_map(|planes| nodes.clone().map(|i| at(planes, i)));
+        if direct {
+            self.parts.push(part.collect());
+        } else {
+            self.parts[self.count - 1].iter_mut().zip(part).for_each(|(sum, x)| *sum += x);
         }
-        if self.light.is_empty() {
-            self.light = new;
-            return spare;
-        }
+        let (sum, count) = if direct { (&self.direct, self.lit) } else { (&self.light, self.count) };
         // (x − mean of those before)² (n − 1)/n.
-        let (before, share) = (1.0 / (self.count - 1.0), (self.count - 1.0) / self.count);
-        for (spread, (light, new)) in self.spread.iter_mut().zip(self.light.iter().zip(&new)) {
+        let (before, share) = (1.0 / (count - 1) as f32, (count - 1) as f32 / count as f32);
+        for (spread, (sum, new)) in self.spread.iter_mut().zip(sum.iter().zip(new)) {
             spread.par_iter_mut().enumerate().with_min_len(1 << 12).for_each(|(i, m)| {
                 let luminance = luminance(i);
-                let d: f32 = (0..3).map(|c| luminance[c] * (new[c][i] - before * light[c][i])).sum();
+                let d: f32 = (0..3).map(|c| luminance[c] * (new[c][i] - before * sum[c][i])).sum();
                 *m += share * d * d;
             });
         }
-        for (s, n) in self.light.iter_mut().flatten().zip(new.iter().flatten()) {
-            s.par_iter_mut().zip(n).with_min_len(1 << 12).for_each(|(s, n)| *s += n);
-        }
-        spare.extend(new);
-        spare
     }
 
+    /// What `done` replicates gave; of fewer than all the direct light of all that were lit.
     #[allow(clippy::cast_possible_truncation, reason = "a factor of at most 1")]
     pub(super) fn finish(self, geometry: &Geometry, done: usize) -> Vec<SweptSide> {
         let scale = 1.0 / done.max(1) as f32;
-        let together = together(&self.parts) as f32;
-        let collect = |planes: &Planes| -> Vec<[f32; 3]> {
-            let [r, g, b] = planes;
-            (0..r.len())
+        let together = together(&self.parts[..done.min(self.parts.len())]) as f32;
+        let collect = |s: usize| -> Vec<[f32; 3]> {
+            let (direct, light) = (&self.direct[s], self.light.get(s));
+            let node = |i: usize| -> [f32; 3] {
+                std::array::from_fn(|c| direct[c][i] + light.map_or(0.0, |light| scale * light[c][i]))
+            };
+            (0..self.nodes)
                 .into_par_iter()
                 .with_min_len(1 << 12)
-                .map(|i| if geometry.valid[i] { [scale * r[i], scale * g[i], scale * b[i]] } else { [0.0; 3] })
+                .map(|i| if geometry.valid[i] { node(i) } else { [0.0; 3] })
                 .collect()
         };
-        let mut spread = self.spread.into_iter();
-        self.sides
-            .iter()
-            .enumerate()
-            .map(|(s, &side)| SweptSide {
-                side,
-                irradiance: collect(&self.light[s]),
-                std_error: match spread.next() {
-                    Some(m) if done > 1 => m
-                        .par_iter()
-                        .zip(&geometry.valid)
-                        .with_min_len(1 << 12)
-                        .map(|(m, v)| if *v { (together * m * scale / (done - 1) as f32).sqrt() } else { 0.0 })
-                        .collect(),
-                    _ => Vec::new(),
-                },
-            })
-            .collect()
+        let std_error = |m: &Vec<f32>| -> Vec<f32> {
+            let nodes = m.par_iter().zip(&geometry.valid).with_min_len(1 << 12);
+            nodes.map(|(m, v)| if *v { (together * m * scale / (done - 1) as f32).sqrt() } else { 0.0 }).collect()
+        };
+        let sides = self.sides.iter().enumerate().map(|(s, &side)| SweptSide {
+            side,
+            irradiance: collect(s),
+            std_error: self.spread.get(s).filter(|_| done > 1).map(std_error).unwrap_or_default(),
+        });
+        sides.collect()
     }
+}
+
+/// Adds `new` to sums, which may be empty yet. Returns the planes that are free.
+fn add(sums: &mut Vec<Planes>, new: Vec<Planes>) -> Vec<Planes> {
+    if sums.is_empty() {
+        *sums = new;
+        return Vec::new();
+    }
+    for (s, n) in sums.iter_mut().flatten().zip(new.iter().flatten()) {
+        s.par_iter_mut().zip(n).with_min_len(1 << 12).for_each(|(s, n)| *s += n);
+    }
+    new
 }
 
 /// The variance of the mean of replicates over that of as many independent ones; 1 unless they are 4, 8, 16 …
