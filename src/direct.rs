@@ -1,8 +1,7 @@
 //! Direct light at a receiver: closed-form irradiance times the visible share, by shadow rays.
 
 use crate::flattened::{Departure, FlattenedRay};
-use crate::luminaire::{Aim, above_horizon, point_term, unoccluded};
-use crate::polygon::sample_convex;
+use crate::luminaire::{Aim, unoccluded};
 use crate::rng::{Rng, Sobol, Stage};
 use crate::scene::Scene;
 use crate::tracer::Tracer;
@@ -103,12 +102,7 @@ pub fn direct_irradiance<T: Tracer>(
         if open == 0.0 {
             continue;
         }
-        // Points below the horizon would say nothing, and if all were the luminaire would be lost.
-        let part = above_horizon(light, x, receiver.normal);
-        if part.as_ref().is_some_and(|p| p.len() < 3) {
-            continue;
-        }
-        let near = Aim::near(light, x, receiver.normal, open);
+        let Some(aim) = Aim::best(light, x, receiver.normal, open) else { continue };
         let shadow_rays = budget(scene, luminance(light.emission) * open, most);
         // A share of the budget: what unanimous pilots may miss is then the same irradiance everywhere.
         let pilot = (most_pilot * shadow_rays / most.max(1)).max(LEAST_RAYS / 2);
@@ -119,14 +113,7 @@ pub fn direct_irradiance<T: Tracer>(
             if i == pilot && (seen == 0.0 || seen == sum) {
                 break;
             }
-            let u = set.point2(i, 0);
-            let (y, g) = near.as_ref().map_or_else(
-                || {
-                    let y = part.as_ref().map_or_else(|| light.sample(u), |p| sample_convex(p, u));
-                    (y, point_term(x, receiver.normal, y, light.normal()))
-                },
-                |aim| aim.sample(u),
-            );
+            let (y, g) = aim.sample(set.point2(i, 0));
             if g == 0.0 {
                 continue;
             }

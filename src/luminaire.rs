@@ -44,7 +44,7 @@ pub fn unoccluded(polygon: &Polygon, x: DVec3, n: DVec3) -> f64 {
 
 /// The part of `polygon` above the horizon of `x` with normal `n`, as vertices of a convex polygon; `None` if that is all
 /// of it. Fewer than three vertices: nothing is above.
-pub fn above_horizon(polygon: &Polygon, x: DVec3, n: DVec3) -> Option<Vec<DVec3>> {
+fn above_horizon(polygon: &Polygon, x: DVec3, n: DVec3) -> Option<Vec<DVec3>> {
     let v = polygon.vertices();
     let height = |p: DVec3| (p - x).dot(n);
     if v.iter().all(|&p| height(p) >= 0.0) {

@@ -178,13 +178,22 @@ impl Polygon {
     }
 }
 
+/// Area of triangle `i` of the fan of a planar convex polygon.
+fn fan_area(v: &[DVec3], i: usize) -> f64 {
+    0.5 * (v[i + 1] - v[0]).cross(v[i + 2] - v[0]).length()
+}
+
+/// Area of the planar convex polygon `v`; 0 of fewer than three vertices.
+pub fn convex_area(v: &[DVec3]) -> f64 {
+    (0..v.len().saturating_sub(2)).map(|i| fan_area(v, i)).sum()
+}
+
 /// A point uniform over the area of the planar convex polygon `v` of at least three vertices, by its triangle fan.
 pub fn sample_convex(v: &[DVec3], u: [f64; 2]) -> DVec3 {
-    let area = |i: usize| 0.5 * (v[i + 1] - v[0]).cross(v[i + 2] - v[0]).length();
     let last = v.len() - 3;
-    let mut rest = u[0] * (0..=last).map(area).sum::<f64>();
+    let mut rest = u[0] * convex_area(v);
     for i in 0..=last {
-        let area = area(i);
+        let area = fan_area(v, i);
         if rest < area || i == last {
             let [s, t] = crate::warp::triangle([if area > 0.0 { (rest / area).min(1.0) } else { 0.0 }, u[1]]);
             return v[0] + s * (v[i + 1] - v[0]) + t * (v[i + 2] - v[0]);

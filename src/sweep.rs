@@ -13,15 +13,21 @@
 //! inside the volume are refused unless they are luminaires.
 
 mod arrive;
+mod blockers;
 mod direct;
 mod directions;
 mod ends;
+mod fans;
 mod flats;
 mod gather;
 mod grid;
 mod half;
 mod monitor;
+mod near;
+mod open_share;
 mod pack;
+mod points;
+mod reflect;
 mod runs;
 mod segments;
 #[allow(unsafe_code, reason = "vector instructions: measured to pay, chosen at run time")]
@@ -34,13 +40,14 @@ use crate::error::{Error, Result};
 use crate::flat::FlatTexture;
 use crate::flattened::Side;
 use crate::scene::{Boundary, Scene};
+use ends::Standing;
 use flats::Flats;
 use gather::Pass;
-use glam::DVec3;
 use grid::{Geometry, Planes, Spare};
-use half::Half4;
 use monitor::Monitor;
+use points::Points;
 use rayon::prelude::*;
+use reflect::Mirror;
 use simd::Isa;
 use state::{Passes, State};
 use std::sync::Mutex;
@@ -191,8 +198,8 @@ pub fn sweep_resumable(
     tick: &(dyn Fn(f64) -> bool + Sync),
 ) -> Result<SweepResult> {
     supported(scene)?;
-    let inside = ends::inside(scene);
     let geometry = Geometry::new(&scene.field);
+    let mirror = Mirror::new(scene, &geometry);
     let stored = scene.surface.stored_sides();
     let sides = swept_sides(scene);
     let replicates = settings.replicates.max(1);
@@ -208,7 +215,8 @@ pub fn sweep_resumable(
         scene,
         settings,
         geometry: &geometry,
-        inside: &inside,
+        standing: mirror.standing(),
+        mirror,
         sides: &sides,
         isa: Isa::detect(),
         saved,
@@ -221,6 +229,8 @@ pub fn sweep_resumable(
         let (indirect, complete) = run.replicate(&mut state, passes.take(), &mut flats, &progress);
         stopped = !complete;
         if complete {
+            // Planes that were blackened take memory everywhere, fresh ones only where something is lit.
+            spare.clear();
             spare.keep(state.add(indirect, &flats, scene));
         }
     }
@@ -281,7 +291,8 @@ struct Run<'a> {
     scene: &'a Scene,
     settings: &'a SweepSettings,
     geometry: &'a Geometry<'a>,
-    inside: &'a [bool],
+    mirror: Mirror<'a>,
+    standing: Vec<Standing>,
     sides: &'a [Side],
     isa: Isa,
     saved: Stage<'a>,
@@ -309,21 +320,25 @@ impl Run<'_> {
                 tick(DIRECT_SHARE * step as f64 / (replicates * lights) as f64)
             };
             let common = (self.geometry, self.isa, self.spare);
-            let (direct, all) =
-                direct::direct(self.scene, common, flats, self.sides, (s.seed, number as u64, points), &mut ask);
+            let part = Points { seed: s.seed, replicate: number, replicates, count: points };
+            let (direct, all) = direct::direct(self.scene, common, flats, self.sides, part, &mut ask);
             complete = all;
-            if !complete {
+            if complete {
+                state.counts.shadow_rays += state.counts.valid * lights as u64;
+            } else {
                 self.saved.save(0, || state.bytes(None, flats));
             }
+            // Of the first one what there is.
             if complete || number == 0 {
-                state.counts.shadow_rays += state.counts.valid * lights as u64;
                 self.spare.keep(state.total.add_direct(direct, self.scene));
             }
         }
         if first < replicates {
             state.total.average_direct();
             flats.average_direct(state.total.lit);
-            flats.dim();
+        }
+        if !complete {
+            flats.reflect_direct();
         }
         complete
     }
@@ -335,10 +350,10 @@ impl Run<'_> {
         let (b, unit) = if late > 0 {
             let share = 1.0 / state.done as f32;
             flats.take(&state.flats, share);
-            self.reflect(flats, &[direct, (state.total.light.as_slice(), [share; 3])], Vec::new())
+            self.mirror.reflect(flats, &[direct, (state.total.light.as_slice(), [share; 3])], Vec::new())
         } else {
-            flats.dim();
-            self.reflect(flats, &[direct], Vec::new())
+            flats.reflect_direct();
+            self.mirror.reflect(flats, &[direct], Vec::new())
         };
         Passes { b, unit, monitor: Monitor::default(), late, bounce: 0 }
     }
@@ -372,7 +387,7 @@ impl Run<'_> {
         let pass = Pass {
             scene: self.scene,
             geometry: self.geometry,
-            inside: self.inside,
+            standing: &self.standing,
             primary: self.sides[0],
             isa: self.isa,
             spare: self.spare,
@@ -434,73 +449,11 @@ impl Run<'_> {
             }
             let old = std::mem::take(&mut now.b);
             (now.b, now.unit) =
-                self.reflect(flats, &[(state.total.direct.as_slice(), [1.0; 3]), (&indirect, scale)], old);
+                self.mirror.reflect(flats, &[(state.total.direct.as_slice(), [1.0; 3]), (&indirect, scale)], old);
             self.spare.keep(indirect.drain(..));
         }
         state.see(&now);
         (indirect, true)
-    }
-
-    /// B = Le + ρ/π Σ scale · irradiance of the sides, filled where no surface is, as lines read it; packs the flats too.
-    /// `light`: one or two sets of irradiance, each with its scale; `old`: memory of the same form. Returns what all was
-    /// multiplied by.
-    #[allow(clippy::cast_possible_truncation, reason = "albedo and emission")]
-    fn reflect(
-        &self,
-        flats: &mut Flats,
-        light: &[(&[Planes], [f32; 3])],
-        old: Vec<Vec<Half4>>,
-    ) -> (Vec<Vec<Half4>>, f32) {
-        let surface = &self.scene.surface;
-        let over_pi =
-            |albedo: DVec3| -> [f32; 3] { std::array::from_fn(|c| (albedo[c] / std::f64::consts::PI) as f32) };
-        // Of every stop: also a bound for nodes just outside the sweep.
-        let greatest = over_pi(surface.albedo.stops().iter().fold(DVec3::ZERO, |m, s| m.max(s.1)));
-        let by_node: Option<Vec<[f32; 3]>> = (surface.albedo.stops().len() > 1).then(|| {
-            let h = self.geometry.h.par_iter().with_min_len(1 << 12);
-            h.map(|&h| over_pi(surface.albedo.at(f64::from(h)))).collect()
-        });
-        let emission = surface.emission.as_vec3().to_array();
-        let mut most = flats.greatest();
-        let sides = light[0].0.len();
-        for s in 0..sides {
-            for c in 0..3 {
-                let e: f32 = light.iter().map(|(planes, scale)| scale[c] * grid::greatest(&planes[s][c])).sum();
-                most = most.max(emission[c] + greatest[c] * e);
-            }
-        }
-        let unit = half::scale(most);
-        flats.pack(unit);
-        let mut old = old.into_iter();
-        let b = (0..sides).map(|s| {
-            let n = light[0].0[s][0].len();
-            let mut b = old.next().unwrap_or_else(|| vec![[0; 4]; n]);
-            b.par_chunks_mut(1 << 12).enumerate().for_each(|(chunk, b)| {
-                let range = chunk << 12..(chunk << 12) + b.len();
-                let lit = &self.geometry.lit[range.clone()];
-                for c in 0..3 {
-                    let (le, rho) = (unit * emission[c], unit * greatest[c]);
-                    // A second set that is not there counts nothing.
-                    let set = |n: usize| light.get(n).map(|(planes, scale)| (&planes[s][c][range.clone()], scale[c]));
-                    let (first, f) = set(0).expect("at least one set of light");
-                    let (second, g) = set(1).unwrap_or((first, 0.0));
-                    let e = first.iter().zip(second).map(|(a, b)| f * a + g * b);
-                    let nodes = b.iter_mut().zip(e).zip(lit);
-                    if let Some(by_node) = &by_node {
-                        for (((b, e), _), rho) in nodes.zip(&by_node[range.clone()]).filter(|n| *n.0.1) {
-                            b[c] = half::encode(le + unit * rho[c] * e);
-                        }
-                        continue;
-                    }
-                    for ((b, e), lit) in nodes {
-                        b[c] = half::encode(if *lit { le + rho * e } else { 0.0 });
-                    }
-                }
-            });
-            self.geometry.fill(&mut b);
-            b
-        });
-        (b.collect(), unit)
     }
 
     /// Indirect irradiance summed over valid nodes and sides, per channel.

@@ -1,8 +1,8 @@
 //! Points of a luminaire, uniform over the solid angle under which a receiver sees it: what they give is bounded, however
 //! near the luminaire is. Points uniform over the area give cos θ cos θ′/r², which is not.
 
-use super::point_term;
-use crate::polygon::Polygon;
+use super::{above_horizon, point_term};
+use crate::polygon::{Polygon, convex_area, sample_convex};
 use glam::DVec3;
 
 /// Solid angles below this are sampled by area: cancellation would show, and the area's points hardly vary.
@@ -16,7 +16,11 @@ pub struct Aim<'a> {
     polygon: &'a Polygon,
     x: DVec3,
     n: DVec3,
+    /// Sampled by solid angle.
     rectangle: Option<SphericalRectangle>,
+    /// What is sampled by area, if that is not all of it.
+    part: Option<Vec<DVec3>>,
+    area: f64,
 }
 
 impl<'a> Aim<'a> {
@@ -24,32 +28,38 @@ impl<'a> Aim<'a> {
     pub fn new(polygon: &'a Polygon, x: DVec3, n: DVec3) -> Self {
         let in_front = (x - polygon.vertices()[0]).dot(polygon.normal()) > 0.0;
         let rectangle = if in_front { SphericalRectangle::new(polygon, x) } else { None };
-        Self { polygon, x, n, rectangle: rectangle.filter(|r| r.solid_angle > LEAST) }
+        let rectangle = rectangle.filter(|r| r.solid_angle > LEAST);
+        Self { polygon, x, n, rectangle, part: None, area: polygon.area() }
     }
 
-    /// The same where points spread over the area would hardly ever fall on what a receiver next to the luminaire sees of it:
-    /// a rectangle that fills 1 sr and more, and gives `open` > an eighth of that, so that an eighth of the points and more
-    /// lie above the horizon.
-    pub fn near(polygon: &'a Polygon, x: DVec3, n: DVec3, open: f64) -> Option<Self> {
-        let aim = Self::new(polygon, x, n);
+    /// The points that tell most of what `x` sees, where the whole luminaire gives `open` > 0: by solid angle of a rectangle that
+    /// fills 1 sr and more, and gives an eighth of that, so that an eighth of the points and more lie above the horizon; there points
+    /// spread over the area would hardly ever fall on what a receiver sees. Otherwise over the area of the part above the horizon.
+    /// `None` if that has no area.
+    pub fn best(polygon: &'a Polygon, x: DVec3, n: DVec3, open: f64) -> Option<Self> {
+        let mut aim = Self::new(polygon, x, n);
         let fills = aim.rectangle.as_ref().map_or(0.0, |r| r.solid_angle);
-        (fills > NEAR && open > 0.125 * fills).then_some(aim)
+        if fills > NEAR && open > 0.125 * fills {
+            return Some(aim);
+        }
+        aim.rectangle = None;
+        aim.part = above_horizon(polygon, x, n);
+        if let Some(part) = &aim.part {
+            aim.area = convex_area(part);
+        }
+        (aim.area > 0.0).then_some(aim)
     }
 
     /// A point of the luminaire from two uniforms, and the irradiance per unit radiance that it gives: the mean of these is
     /// what the whole luminaire gives.
     #[inline]
     pub fn sample(&self, u: [f64; 2]) -> (DVec3, f64) {
-        match &self.rectangle {
-            Some(r) => {
-                let to = r.sample(u);
-                (self.x + to, r.solid_angle * (to.normalize().dot(self.n)).max(0.0))
-            }
-            None => {
-                let y = self.polygon.sample(u);
-                (y, self.polygon.area() * point_term(self.x, self.n, y, self.polygon.normal()))
-            }
+        if let Some(r) = &self.rectangle {
+            let to = r.sample(u);
+            return (self.x + to, r.solid_angle * (to.normalize().dot(self.n)).max(0.0));
         }
+        let y = self.part.as_ref().map_or_else(|| self.polygon.sample(u), |part| sample_convex(part, u));
+        (y, self.area * point_term(self.x, self.n, y, self.polygon.normal()))
     }
 }
 
@@ -163,7 +173,7 @@ mod tests {
     fn a_few_points_find_what_is_seen_of_a_near_luminaire() {
         let light = rectangle([-0.5, 0.5], [-0.5, 0.5]);
         let (x, h, r) = (DVec3::new(0.1, -0.2, 0.999), 0.001, 0.002);
-        let aim = Aim::near(&light, x, DVec3::Z, unoccluded(&light, x, DVec3::Z)).unwrap();
+        let aim = Aim::best(&light, x, DVec3::Z, unoccluded(&light, x, DVec3::Z)).unwrap();
         let set = Sobol::set(5, Stage::Test, 0);
         let (mut seen, mut all) = (0.0, 0.0);
         for k in 0..128 {
@@ -172,8 +182,7 @@ mod tests {
             seen += if (y - x).truncate().length() < r { g } else { 0.0 };
         }
         assert!((seen / all - r * r / (r * r + h * h)).abs() < 0.05, "{}", seen / all);
-        assert!(Aim::near(&light, DVec3::ZERO, DVec3::Z, 0.5).is_none(), "not near");
-        assert!(Aim::near(&light, x, -DVec3::Z, 0.0).is_none(), "looks away");
+        assert!(Aim::best(&light, x, -DVec3::Z, 0.0).is_none(), "looks away");
     }
 
     #[test]

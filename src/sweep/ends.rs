@@ -28,9 +28,19 @@ struct Met {
     front_plus: bool,
     opaque_back: bool,
     other_face: i32,
-    /// Whether it stands inside Ω: a luminaire that cuts lines.
-    inside: bool,
+    standing: Standing,
     reflects: bool,
+}
+
+/// Where a polygon stands.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Standing {
+    /// Outside Ω or on its faces.
+    Outside,
+    /// Inside Ω: a luminaire that cuts lines.
+    Inside,
+    /// So closely before nodes that these show what is in front of it.
+    Slit,
 }
 
 /// Finds what the lines of one family end on.
@@ -39,7 +49,7 @@ pub(super) struct Ends {
 }
 
 impl Ends {
-    pub(super) fn new(scene: &Scene, flats: &Flats, shear: &Shear, inside: &[bool]) -> Self {
+    pub(super) fn new(scene: &Scene, flats: &Flats, shear: &Shear, standing: &[Standing]) -> Self {
         let lattice = scene.lattice();
         let [u, v, a] = shear.layout.axes;
         let [e, f, g] = [u, v, a].map(|x| lattice.axes().col(x));
@@ -79,7 +89,7 @@ impl Ends {
                     front_plus: along < 0.0,
                     opaque_back: p.opaque_back,
                     other_face: p.other_face,
-                    inside: inside[i],
+                    standing: standing[i],
                     reflects: flats.textures[i].is_some(),
                 })
             })
@@ -89,7 +99,7 @@ impl Ends {
 
     /// Whether lines may be cut inside Ω.
     pub(super) fn cut(&self) -> bool {
-        self.met.iter().any(|m| m.inside)
+        self.met.iter().any(|m| m.standing != Standing::Outside)
     }
 
     /// What line (p, q) meets first beyond `from`, towards +τ (`forward`) or −τ; polygon `except` does not
@@ -168,16 +178,23 @@ impl Ends {
         self.met.iter().filter(met).map(move |m| (m.stop(p, q, at(&m.tau, p, q), m.front_plus), !m.front_plus))
     }
 
-    /// The luminaires that cut line (p, q) between `from` and `to`, in order of τ: how each looks from before and behind.
-    pub(super) fn cuts(&self, p: f64, q: f64, from: f64, to: f64, out: &mut Vec<[Stop; 2]>) {
+    /// The luminaires that cut line (p, q) between `from` and `to`, in order of τ: how each looks from before and behind, and the τ
+    /// behind whose slice it cuts. Surfaces between a luminaire and the last slice in front of it are read at the one behind if that is
+    /// nearer, and shows what is in front.
+    pub(super) fn cuts(&self, p: f64, q: f64, from: f64, to: f64, out: &mut Vec<(f64, [Stop; 2])>) {
         out.clear();
-        for m in self.met.iter().filter(|m| m.inside) {
+        for m in self.met.iter().filter(|m| m.standing != Standing::Outside) {
             let tau = at(&m.tau, p, q);
             if tau > from + 1e-6 && tau < to - 1e-6 && m.edges.iter().all(|e| at(e, p, q) >= -m.slack) {
-                out.push([m.stop(p, q, tau, true), m.stop(p, q, tau, false)]);
+                let at = match m.standing {
+                    Standing::Slit if m.front_plus => tau + 0.5,
+                    Standing::Slit => tau - 0.5,
+                    _ => tau,
+                };
+                out.push((at, [m.stop(p, q, tau, true), m.stop(p, q, tau, false)]));
             }
         }
-        out.sort_by(|a, b| a[0].tau.total_cmp(&b[0].tau));
+        out.sort_by(|a, b| a.1[0].tau.total_cmp(&b.1[0].tau));
     }
 }
 

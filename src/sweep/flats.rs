@@ -218,8 +218,8 @@ impl Flats {
         self.textures.iter_mut().flatten().flat_map(|t| &mut t.direct).for_each(|x| *x *= share);
     }
 
-    /// Reflects direct light alone.
-    pub(super) fn dim(&mut self) {
+    /// B of direct light alone.
+    pub(super) fn reflect_direct(&mut self) {
         let nothing = self.open();
         self.close(&nothing);
         self.reflect([1.0; 3], false);

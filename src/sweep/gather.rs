@@ -2,7 +2,7 @@
 
 use super::arrive;
 use super::directions::{Layout, Shear};
-use super::ends::Ends;
+use super::ends::{Ends, Standing};
 use super::flats::{Arrivals, Flats, Incoming};
 use super::grid::{Geometry, NORMAL_SCALE, Planes, Source, Spare};
 use super::half::Half4;
@@ -19,8 +19,8 @@ use std::sync::Mutex;
 pub(super) struct Pass<'a> {
     pub scene: &'a Scene,
     pub geometry: &'a Geometry<'a>,
-    /// Which polygons stand inside Ω.
-    pub inside: &'a [bool],
+    /// Where polygons stand.
+    pub standing: &'a [Standing],
     /// The side that owns lines without samples.
     pub primary: Side,
     /// The instruction set of the hot loops.
@@ -97,8 +97,8 @@ impl Pass<'_> {
             for shear in some {
                 complete = complete && tick();
                 if complete {
-                    let lit = (flats, &mut *incoming, arrivals);
-                    arrivals = self.family(side, shear, lines.len(), (b, scale), &rows, lit);
+                    let walls = (flats, &mut *incoming, arrivals);
+                    arrivals = self.family(side, shear, lines.len(), (b, scale), &rows, walls);
                 }
             }
             drop(rows);
@@ -148,7 +148,7 @@ impl Pass<'_> {
     ) -> Vec<Arrivals> {
         let sign = if side == Side::Lower { 1.0 } else { -1.0 };
         let plan = Plan::new(*shear, sign);
-        let ends = Ends::new(self.scene, flats, shear, self.inside);
+        let ends = Ends::new(self.scene, flats, shear, self.standing);
         let walls = arrive::Walls::new(self, &plan, &ends, flats, side, lines, 1.0 / scale);
         let share = 4.0 * std::f64::consts::PI / (2 * lines) as f64 / f64::from(NORMAL_SCALE * scale);
         let family = Family {

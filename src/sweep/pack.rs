@@ -179,7 +179,7 @@ pub(super) struct Pack {
     pub cuts: Vec<Cut>,
     /// Where in [`Flats::packed`] the ends of lines are, per direction (+, −).
     pub lasts: [[u32; LANES]; 2],
-    scratch: Vec<[Stop; 2]>,
+    scratch: Vec<(f64, [Stop; 2])>,
 }
 
 impl Pack {
@@ -431,9 +431,9 @@ impl Pack {
             let mut scratch = std::mem::take(&mut self.scratch);
             for lane in 0..LANES {
                 ends.cuts(p + lane as f64, q, from[1][lane], from[0][lane], &mut scratch);
-                for &stops in &scratch {
+                for &(at, stops) in &scratch {
                     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a row of the pack")]
-                    let row = stops[0].tau.floor() as usize + 1;
+                    let row = (at.floor() + 1.0) as usize;
                     let places = stops.map(|s| flats.place(Some(s), dither(seed, lane)));
                     self.cuts.push(Cut { row, lane, places });
                 }

@@ -37,12 +37,21 @@ impl Segments {
     };
 
     /// Takes the segment from local `a` to `b` into `lane`, clipped to Ω, with h at its ends; (∞, −∞) if it misses Ω.
+    pub(super) fn set(&mut self, lane: usize, field: &Field, a: DVec3, b: DVec3) {
+        self.place::<false>(lane, field, a, b);
+    }
+
+    /// As [`Segments::set`] to a node, without h at that node itself.
+    pub(super) fn set_before(&mut self, lane: usize, field: &Field, a: DVec3, node: DVec3) {
+        self.place::<true>(lane, field, a, node);
+    }
+
     #[allow(
         clippy::cast_possible_truncation,
         clippy::cast_possible_wrap,
         reason = "values are f32, places in the lattice"
     )]
-    pub(super) fn set(&mut self, lane: usize, field: &Field, a: DVec3, b: DVec3) {
+    fn place<const BEFORE: bool>(&mut self, lane: usize, field: &Field, a: DVec3, b: DVec3) {
         (self.least[lane], self.most[lane], self.count[lane]) = (f32::INFINITY, f32::NEG_INFINITY, 0);
         let far = field.lattice().far();
         let d = b - a;
@@ -61,7 +70,7 @@ impl Segments {
         if !(from <= to) {
             return;
         }
-        for t in [from, to] {
+        for t in &[from, to][..if BEFORE { 1 } else { 2 }] {
             let h = field.value(a + t * d) as f32;
             self.least[lane] = self.least[lane].min(h);
             self.most[lane] = self.most[lane].max(h);
@@ -82,8 +91,14 @@ impl Segments {
             self.stride[i][lane] = strides[x] as i32;
         }
         self.stride[2][lane] = strides[axis] as i32;
-        let (p, q) = (a[axis] + from * d[axis], a[axis] + to * d[axis]);
-        let (first, end) = (p.min(q).ceil().max(0.0) as i32, (p.max(q).floor() as i32).min(dims[axis] as i32 - 1));
+        let (p, q) = (a[axis] + from * d[axis], if BEFORE { b[axis] } else { a[axis] + to * d[axis] });
+        let (mut first, mut end) =
+            (p.min(q).ceil().max(0.0) as i32, (p.max(q).floor() as i32).min(dims[axis] as i32 - 1));
+        if BEFORE && d[axis] > 0.0 {
+            end -= 1;
+        } else if BEFORE {
+            first += 1;
+        }
         (self.first[lane], self.count[lane]) = (first, (end + 1 - first).max(0));
     }
 

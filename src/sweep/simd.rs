@@ -4,8 +4,8 @@
 
 #![allow(clippy::needless_range_loop, reason = "a channel indexes several planes at once")]
 
-use super::direct::march_row;
 use super::ends::Ends;
+use super::fans::march_row;
 use super::flats::Flats;
 use super::gather::{COSINES, accumulate_row, sum_cosines};
 use super::grid::Source;
@@ -134,7 +134,7 @@ impl Isa {
 
 #[cfg(target_arch = "x86_64")]
 mod avx512 {
-    use super::super::direct::{HIGHER, LOWER, SAMPLED};
+    use super::super::fans::{HIGHER, LOWER, SAMPLED};
     use super::super::half::Half4;
     use super::super::pack::{LANES, Light, OUTSIDE, Pack, Way};
     use super::super::segments::Segments;

@@ -99,6 +99,7 @@ impl State {
             self.total.spread.iter().chain(&self.total.parts).for_each(|s| out.numbers(s));
             flats.textures.iter().flatten().for_each(|t| out.numbers(&t.direct));
         }
+        // None where nothing bounces.
         out.count(self.total.light.len());
         if self.done > 0 {
             out.planes(&self.total.light);

@@ -1,0 +1,33 @@
+//! Polygons between a luminaire and its receivers.
+
+use crate::flattened::Departure;
+use crate::polygon::LocalPolygon;
+use crate::scene::Scene;
+use glam::DVec3;
+
+/// What stands between a luminaire and its receivers.
+pub(super) struct Blockers {
+    polygons: Vec<(u32, LocalPolygon)>,
+}
+
+impl Blockers {
+    /// Polygons that can hide luminaire `light` from a point of `receivers`: all but those that everything is in front of.
+    pub(super) fn new(scene: &Scene, light: u32, receivers: &[DVec3]) -> Self {
+        let source = &scene.polygons()[light as usize];
+        let polygons = scene.polygons().iter().enumerate().filter_map(|(i, p)| {
+            let i = u32::try_from(i).expect("scenes hold fewer than 2¹⁶ polygons");
+            let slack = 1e-6 * p.area().sqrt();
+            let ahead = |x: &DVec3| (*x - p.vertices()[0]).dot(p.normal()) >= -slack;
+            let all = source.vertices().iter().chain(receivers).all(ahead);
+            (i != light && !all).then(|| (i, LocalPolygon::new(p, scene.lattice())))
+        });
+        Self { polygons: polygons.collect() }
+    }
+
+    pub(super) fn block(&self, light: u32, receiver: Option<u32>, y: DVec3, x: DVec3) -> bool {
+        self.polygons.iter().any(|(i, p)| {
+            receiver != Some(*i)
+                && p.intersect(*i, (Departure::Polygon(light), receiver), y, x - y, 1.0 - 1e-9).is_some()
+        })
+    }
+}

@@ -1,0 +1,302 @@
+//! What nodes reflect, as lines read it.
+
+use super::ends::{self, Standing};
+use super::flats::Flats;
+use super::grid::{self, Geometry, Planes};
+use super::half::{self, Half4};
+use crate::scene::Scene;
+use glam::DVec3;
+use rayon::prelude::*;
+use std::borrow::Cow;
+
+/// What a line reads at a hit is one of the four nodes around it on the nearer slice, drawn with bilinear weights. Over all places in
+/// a cell linear interpolation exceeds E by E″/12 along both axes of the slice, and the nearest slice falls short by E″/24; with every
+/// axis in turn across, E + ∇²E/24 is read: this much is taken off before. \[Condat05\]
+const SHARPENING: f32 = 1.0 / 24.0;
+
+/// A node less than this share of a voxel behind a luminaire is what lines before it read, not those behind.
+const SLIT: f64 = 0.25;
+
+/// Turns irradiance into radiance.
+pub(super) struct Mirror<'a> {
+    scene: &'a Scene,
+    geometry: &'a Geometry<'a>,
+    /// Nodes with light of their own to reflect.
+    shown: Cow<'a, [bool]>,
+    /// Nodes closely behind a luminaire, and the node in front of it each shows instead.
+    hidden: Vec<(usize, usize)>,
+    /// Luminaires that hide some.
+    hiding: Vec<u32>,
+}
+
+impl<'a> Mirror<'a> {
+    pub(super) fn new(scene: &'a Scene, geometry: &'a Geometry<'a>) -> Self {
+        let mut hidden = Vec::new();
+        let mut hiding = Vec::new();
+        for &number in scene.luminaires() {
+            let nodes = hidden_by(scene, number);
+            if !nodes.is_empty() {
+                hiding.push(number);
+            }
+            hidden.extend(nodes);
+        }
+        let mut shown = Cow::Borrowed(geometry.lit.as_slice());
+        for &(node, _) in &hidden {
+            shown.to_mut()[node] = false;
+        }
+        Self { scene, geometry, shown, hidden, hiding }
+    }
+
+    /// Where polygons stand.
+    pub(super) fn standing(&self) -> Vec<Standing> {
+        let inside = ends::inside(self.scene);
+        let stands = |(number, inside)| match inside {
+            false => Standing::Outside,
+            true if self.hiding.contains(&number) => Standing::Slit,
+            true => Standing::Inside,
+        };
+        (0..).zip(inside).map(stands).collect()
+    }
+
+    /// B = Le + ρ/π Σ scale · irradiance of the sides, sharpened, and filled where no surface is; packs the flats too.
+    /// `light`: one or two sets of irradiance, each with its scale; `old`: memory of the same form. Returns what all was
+    /// multiplied by.
+    #[allow(clippy::cast_possible_truncation, reason = "albedo and emission")]
+    pub(super) fn reflect(
+        &self,
+        flats: &mut Flats,
+        light: &[(&[Planes], [f32; 3])],
+        old: Vec<Vec<Half4>>,
+    ) -> (Vec<Vec<Half4>>, f32) {
+        let surface = &self.scene.surface;
+        let over_pi =
+            |albedo: DVec3| -> [f32; 3] { std::array::from_fn(|c| (albedo[c] / std::f64::consts::PI) as f32) };
+        // Of every stop: also a bound for nodes just outside the sweep.
+        let greatest = over_pi(surface.albedo.stops().iter().fold(DVec3::ZERO, |m, s| m.max(s.1)));
+        let by_node: Option<Vec<[f32; 3]>> = (surface.albedo.stops().len() > 1).then(|| {
+            let h = self.geometry.h.par_iter().with_min_len(1 << 12);
+            h.map(|&h| over_pi(surface.albedo.at(f64::from(h)))).collect()
+        });
+        let emission = surface.emission.as_vec3().to_array();
+        let mut most = flats.greatest();
+        let sides = light[0].0.len();
+        for s in 0..sides {
+            for c in 0..3 {
+                let e: f32 = light.iter().map(|(planes, scale)| scale[c] * grid::greatest(&planes[s][c])).sum();
+                most = most.max(emission[c] + greatest[c] * e * (1.0 + 6.0 * SHARPENING));
+            }
+        }
+        let unit = half::scale(most);
+        flats.pack(unit);
+        let [nx, ny, nz] = self.geometry.dims;
+        let mut old = old.into_iter();
+        let b = (0..sides).map(|s| {
+            let n = light[0].0[s][0].len();
+            let mut b = old.next().unwrap_or_else(|| vec![[0; 4]; n]);
+            b.par_chunks_mut(nx).enumerate().with_max_len(64).for_each_init(Rows::default, |rows, (row, b)| {
+                let shown = &self.shown[row * nx..][..nx];
+                if !shown.contains(&true) {
+                    b.fill([0; 4]);
+                    return;
+                }
+                let (j, k) = (row % ny, row / ny);
+                let beside = [
+                    (j > 0).then(|| row - 1),
+                    (j + 1 < ny).then_some(row + 1),
+                    (k > 0).then(|| row - ny),
+                    (k + 1 < nz).then_some(row + ny),
+                ];
+                for c in 0..3 {
+                    // A second set that is not there counts nothing.
+                    let set = |n: usize| light.get(n).map(|(planes, scale)| (&planes[s][c], scale[c]));
+                    let (first, f) = set(0).expect("at least one set of light");
+                    let (second, g) = set(1).unwrap_or((first, 0.0));
+                    let read = |row: usize, to: &mut Vec<f32>| {
+                        let range = row * nx..(row + 1) * nx;
+                        to.clear();
+                        to.extend(first[range.clone()].iter().zip(&second[range]).map(|(a, b)| f * a + g * b));
+                    };
+                    rows.sharpen(row, beside, &self.shown, read);
+                    let (le, rho) = (unit * emission[c], unit * greatest[c]);
+                    let nodes = b.iter_mut().zip(&rows.sharp).zip(shown);
+                    if let Some(by_node) = &by_node {
+                        for (((b, e), shown), rho) in nodes.zip(&by_node[row * nx..]) {
+                            b[c] = half::encode(if *shown { le + unit * rho[c] * e } else { 0.0 });
+                        }
+                        continue;
+                    }
+                    for ((b, e), shown) in nodes {
+                        b[c] = half::encode(if *shown { le + rho * e } else { 0.0 });
+                    }
+                }
+            });
+            for &(node, front) in &self.hidden {
+                b[node] = b[front];
+            }
+            self.geometry.fill(&mut b);
+            b
+        });
+        (b.collect(), unit)
+    }
+}
+
+/// Rows of nodes at work.
+#[derive(Default)]
+struct Rows {
+    row: Vec<f32>,
+    other: Vec<f32>,
+    /// Σ over neighbours that are shown of their difference.
+    laplacian: Vec<f32>,
+    sharp: Vec<f32>,
+}
+
+impl Rows {
+    /// Sharpens a row of irradiance, which `read` reads, against the rows `beside` it.
+    #[inline(always)]
+    fn sharpen(&mut self, row: usize, beside: [Option<usize>; 4], shown: &[bool], read: impl Fn(usize, &mut Vec<f32>)) {
+        let Self { row: here, other, laplacian, sharp } = self;
+        read(row, here);
+        let nx = here.len();
+        laplacian.clear();
+        laplacian.resize(nx, 0.0);
+        let count = |shown: bool| if shown { 1.0 } else { 0.0 };
+        let is = &shown[row * nx..][..nx];
+        for i in 1..nx {
+            let d = here[i] - here[i - 1];
+            laplacian[i - 1] += count(is[i]) * d;
+            laplacian[i] -= count(is[i - 1]) * d;
+        }
+        for row in beside.into_iter().flatten() {
+            read(row, other);
+            let is = &shown[row * nx..][..nx];
+            for (((sum, e), here), is) in laplacian.iter_mut().zip(&*other).zip(&*here).zip(is) {
+                *sum += count(*is) * (e - here);
+            }
+        }
+        sharp.clear();
+        sharp.extend(here.iter().zip(&*laplacian).map(|(e, l)| (e - SHARPENING * l).max(0.0)));
+    }
+}
+
+/// Nodes less than [`SLIT`] voxels behind luminaire `number`, or in its plane, and the nodes in front of it.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "nodes of the lattice")]
+fn hidden_by(scene: &Scene, number: u32) -> Vec<(usize, usize)> {
+    let lattice = scene.lattice();
+    let mut out = Vec::new();
+    let light = &scene.polygons()[number as usize];
+    let along = lattice.axes().transpose() * light.normal();
+    let size = along.abs();
+    let axis = if size.z >= size.x && size.z >= size.y { 2 } else { usize::from(size.y >= size.x) };
+    let step = DVec3::AXES[axis] * along[axis].signum();
+    let vertices = light.vertices().iter().map(|v| lattice.to_index(*v));
+    let (lo, hi) = vertices.fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(lo, hi), v| (lo.min(v), hi.max(v)));
+    let lo = (lo - SLIT).ceil().max(DVec3::ZERO);
+    let hi = (hi + SLIT).floor().min(lattice.far());
+    let range = |a: usize| (0..).map(move |n| lo[a] + f64::from(n)).take_while(move |x| *x <= hi[a]);
+    for z in range(2) {
+        for (y, x) in range(1).flat_map(|y| range(0).map(move |x| (y, x))) {
+            let node = DVec3::new(x, y, z);
+            let front = node + step;
+            // Voxels from the plane, along the axis.
+            let world = lattice.to_world(node);
+            let depth = (light.vertices()[0] - world).dot(light.normal()) / size[axis];
+            let foot = lattice.to_world(node + depth * step);
+            let within = front.cmpge(DVec3::ZERO).all() && front.cmple(lattice.far()).all();
+            if (0.0..SLIT).contains(&depth) && light.contains(foot) && within {
+                let at = |p: DVec3| lattice.offset(p.x as usize, p.y as usize, p.z as usize);
+                out.push((at(node), at(front)));
+            }
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::{Field, Sweep};
+    use crate::rng::{Rng, Stage};
+    use crate::scene::{Boundary, Surface, cornell_box};
+    use crate::volume::{Lattice, Samples, Volume};
+
+    /// Of a field whose second differences are known: read as lines do, at any place, it is itself on average. Without sharpening the
+    /// mean would be off by 0.083.
+    #[test]
+    fn lines_read_on_average_what_is_there() {
+        let n = 9;
+        let at = |x: DVec3| {
+            let x = x - 4.0;
+            100.0 + x.x * x.x - 2.0 * x.y * x.y + 2.0 * x.z * x.z + x.x * x.y - 0.5 * x.z
+        };
+        let place = |o: usize| DVec3::new((o % n) as f64, (o / n % n) as f64, (o / n / n) as f64);
+        let field: Vec<f32> = (0..n * n * n).map(|o| at(place(o)) as f32).collect();
+        let mut rows = Rows::default();
+        let shown = vec![true; n * n * n];
+        let sharp: Vec<f32> = (0..n * n)
+            .flat_map(|row| {
+                let (j, k) = (row % n, row / n);
+                let inside = (1..n - 1).contains(&j) && (1..n - 1).contains(&k);
+                let beside = if inside { [row - 1, row + 1, row - n, row + n].map(Some) } else { [None; 4] };
+                rows.sharpen(row, beside, &shown, |row, to| {
+                    to.clear();
+                    to.extend_from_slice(&field[row * n..][..n]);
+                });
+                rows.sharp.clone()
+            })
+            .collect();
+        let mut rng = Rng::stream(1, Stage::Test, 0);
+        let mut sum = 0.0;
+        let count = 1_000_000;
+        for _ in 0..count {
+            let x = DVec3::new(rng.unit(), rng.unit(), rng.unit()) * 5.0 + 1.5;
+            let across = (3.0 * rng.unit()) as usize;
+            let node: Vec<usize> = (0..3)
+                .map(|a| if a == across { x[a].round() } else { x[a].floor() + f64::from(rng.unit() < x[a].fract()) } as usize)
+                .collect();
+            sum += f64::from(sharp[(node[2] * n + node[1]) * n + node[0]]) - at(x);
+        }
+        let mean = sum / f64::from(count);
+        assert!(mean.abs() < 0.015, "{mean}");
+    }
+
+    /// What is even stays so, beside nodes that show nothing too.
+    #[test]
+    fn even_light_is_not_sharpened() {
+        let shown: Vec<bool> = (0..40).map(|i| i % 7 != 3).collect();
+        let light: Vec<f32> = shown.iter().map(|shown| if *shown { 0.7 } else { 0.0 }).collect();
+        let mut rows = Rows::default();
+        for row in 0..4 {
+            let beside = [(row > 0).then(|| row - 1), (row < 3).then_some(row + 1), None, None];
+            rows.sharpen(row, beside, &shown, |row, to| {
+                to.clear();
+                to.extend_from_slice(&light[10 * row..][..10]);
+            });
+            for (sharp, shown) in rows.sharp.iter().zip(&shown[10 * row..]).filter(|x| *x.1) {
+                assert!(*shown && *sharp == 0.7, "{sharp}");
+            }
+        }
+    }
+
+    /// The luminaire of the default box covers nodes 12 to 28 of 41, a thousandth of the box below the ceiling.
+    #[test]
+    fn nodes_closely_behind_a_luminaire_show_those_in_front() {
+        for (up, depth) in [(true, 40), (false, 0)] {
+            let step = DVec3::new(0.1, 0.1, if up { 0.1 } else { -0.1 });
+            let lattice = Lattice::aligned([41; 3], DVec3::ZERO, DVec3::splat(0.1)).unwrap();
+            let lattice =
+                Lattice::new([41; 3], DVec3::ZERO, lattice.axes() * glam::DMat3::from_diagonal(step * 10.0)).unwrap();
+            let walls = cornell_box(&lattice, 0.0).unwrap();
+            let samples = Samples::F64((0..lattice.len()).map(|o| o as f64).collect());
+            let volume = Volume::new("x", lattice.clone(), samples).unwrap();
+            let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+            let scene = Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap();
+            let hidden = hidden_by(&scene, scene.luminaires()[0]);
+            assert!((15 * 15..=17 * 17).contains(&hidden.len()), "{}", hidden.len());
+            for (node, front) in hidden {
+                let ([i, j, k], [x, y, z]) = (lattice.ijk(node), lattice.ijk(front));
+                assert!((12..=28).contains(&i) && (12..=28).contains(&j) && k == depth);
+                assert!((x, y) == (i, j) && z == depth.abs_diff(1), "{x} {y} {z}");
+            }
+        }
+    }
+}
