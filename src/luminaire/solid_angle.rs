@@ -152,6 +152,11 @@ mod tests {
             let aim = Aim::new(&light, x, n);
             assert!(aim.rectangle.is_some());
             let set = Sobol::set(3, Stage::Test, i as u64);
+            let open = unoccluded(&light, x, n);
+            if let Some(best) = Aim::best(&light, x, n, open) {
+                let mean = (0..1 << 16).map(|k| best.sample(set.point2(k, 0)).1).sum::<f64>() / f64::from(1 << 16);
+                assert!(open > 0.0 && (mean - open).abs() < 2e-3 * open.max(1e-2), "receiver {i}: {mean} {open}");
+            }
             let (mut whole, mut inside, count) = (0.0, 0.0, 1 << 16);
             for k in 0..count {
                 let (y, w) = aim.sample(set.point2(k, 0));
@@ -182,6 +187,8 @@ mod tests {
             seen += if (y - x).truncate().length() < r { g } else { 0.0 };
         }
         assert!((seen / all - r * r / (r * r + h * h)).abs() < 0.05, "{}", seen / all);
+        let far = Aim::best(&light, DVec3::ZERO, DVec3::Z, 0.5).unwrap();
+        assert!(far.rectangle.is_none(), "not near");
         assert!(Aim::best(&light, x, -DVec3::Z, 0.0).is_none(), "looks away");
     }
 

@@ -6,6 +6,7 @@ use super::fans::Fans;
 use super::flats::{Flats, capped};
 use super::grid::{Geometry, Planes, Spare};
 use super::near;
+use super::open_share::OpenShare;
 use super::pack::LANES;
 use super::points::Points;
 use super::segments::Segments;
@@ -41,7 +42,8 @@ pub(super) fn direct(
         s if !sides.contains(&s) => 0.0,
         _ => 1.0,
     });
-    for &number in scene.luminaires() {
+    let shares: Vec<OpenShare> = scene.luminaires().iter().map(|&number| part.open_share(scene, number)).collect();
+    for (&number, open) in scene.luminaires().iter().zip(&shares) {
         let light = &scene.polygons()[number as usize];
         let points = part.on(light, number);
         let blockers = Blockers::new(scene, number, &corners);
@@ -84,7 +86,6 @@ pub(super) fn direct(
                 });
             });
         }
-        let open = part.open_share(scene, number);
         if !open.whole() {
             sums.par_iter_mut().enumerate().with_min_len(1 << 12).filter(|(_, sum)| sum[0] > 0.0).for_each(
                 |(at, sum)| {
@@ -108,8 +109,8 @@ pub(super) fn direct(
             });
         }
     }
-    for &number in scene.luminaires() {
-        walls((scene, isa), flats, sides, number, part);
+    for (&number, open) in scene.luminaires().iter().zip(&shares) {
+        walls((scene, isa), flats, sides, number, (part, open));
     }
     (planes, true)
 }
@@ -157,12 +158,17 @@ impl Staircases {
 /// Direct light of one luminaire on all flats: every texel looks from a point of its own along the segment to each
 /// luminaire point; it is lit at the isovalues above the greatest h there (and, inside solids, up to the least).
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the isovalues")]
-fn walls((scene, isa): (&Scene, Isa), flats: &mut Flats, sides: &[Side], number: u32, part: Points) {
+fn walls(
+    (scene, isa): (&Scene, Isa),
+    flats: &mut Flats,
+    sides: &[Side],
+    number: u32,
+    (part, share): (Points, &OpenShare),
+) {
     let lattice = scene.lattice();
     let light = &scene.polygons()[number as usize];
     let points = part.on(light, number);
     let nc = flats.isovalues;
-    let share = part.open_share(scene, number);
     let corrections = [Side::Lower, Side::Higher]
         .map(|side| (0..nc).map(|t| share.correction(side, (t as f32 + 0.5) / nc as f32)).collect::<Vec<f64>>());
     let caps = scene.polygons().len();

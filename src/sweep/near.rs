@@ -9,6 +9,7 @@ use super::segments::Segments;
 use super::simd::Isa;
 use crate::flattened::Side;
 use crate::luminaire::{Aim, unoccluded};
+use crate::polygon::LocalPolygon;
 use crate::rng::{Sobol, Stage};
 use crate::scene::Scene;
 use glam::DVec3;
@@ -86,8 +87,7 @@ pub(super) fn look(
 /// Bounds of all nodes within `reach` of a luminaire.
 fn bounds(scene: &Scene, number: u32, reach: f64) -> (DVec3, DVec3) {
     let lattice = scene.lattice();
-    let vertices = scene.polygons()[number as usize].vertices().iter().map(|v| lattice.to_index(*v));
-    let (lo, hi) = vertices.fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(lo, hi), v| (lo.min(v), hi.max(v)));
+    let (lo, hi) = LocalPolygon::new(&scene.polygons()[number as usize], lattice).bounds();
     // A step of length 1 in the world is at most so long along each index.
     let inverse = lattice.axes().inverse().transpose();
     let most = reach * DVec3::new(inverse.x_axis.length(), inverse.y_axis.length(), inverse.z_axis.length());
