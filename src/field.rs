@@ -199,22 +199,21 @@ impl Field {
     /// h at `p` (trilinear), exact at the nodes; NaN in a cell that holds no surface.
     pub fn value(&self, p: DVec3) -> f64 {
         let (cell, u) = self.locate(p);
-        let s = self.corners(cell).map(f64::from);
-        // By weights: a corner that does not count leaves no rounding behind, however large it is.
-        let lerp = |a: f64, b: f64, u: f64| (1.0 - u) * a + u * b;
-        let x = |a: usize| lerp(s[a], s[a + 1], u.x);
-        lerp(lerp(x(0), x(2), u.y), lerp(x(4), x(6), u.y), u.z)
+        trilinear(&self.corners(cell).map(f64::from), u)
     }
 
     /// ∇h at `p` of the trilinear cell, per world unit. Jumps at cell faces: it serves sides and |∇h|, not cosines.
     pub fn gradient(&self, p: DVec3) -> DVec3 {
         let (cell, u) = self.locate(p);
+        self.lattice.gradient_to_world(trilinear_gradient(&self.corners(cell).map(f64::from), u))
+    }
+
+    /// [`Field::value`] and [`Field::gradient`].
+    #[inline]
+    pub fn value_and_gradient(&self, p: DVec3) -> (f64, DVec3) {
+        let (cell, u) = self.locate(p);
         let s = self.corners(cell).map(f64::from);
-        let lerp = |t: f64, a: f64, b: f64| a + t * (b - a);
-        let gx = lerp(u.z, lerp(u.y, s[1] - s[0], s[3] - s[2]), lerp(u.y, s[5] - s[4], s[7] - s[6]));
-        let gy = lerp(u.z, lerp(u.x, s[2] - s[0], s[3] - s[1]), lerp(u.x, s[6] - s[4], s[7] - s[5]));
-        let gz = lerp(u.y, lerp(u.x, s[4] - s[0], s[5] - s[1]), lerp(u.x, s[6] - s[2], s[7] - s[3]));
-        self.lattice.gradient_to_world(DVec3::new(gx, gy, gz))
+        (trilinear(&s, u), self.lattice.gradient_to_world(trilinear_gradient(&s, u)))
     }
 
     /// Central-difference gradient at a node, per world unit: one-sided at Ω's faces and beside non-finite samples,
@@ -296,6 +295,25 @@ impl Field {
     pub fn falling_normal(&self, p: DVec3) -> Option<DVec3> {
         unit(-self.receiver_gradient(p))
     }
+}
+
+/// A cell's samples interpolated at `u`.
+#[inline]
+fn trilinear(s: &[f64; 8], u: DVec3) -> f64 {
+    // By weights: a corner that does not count leaves no rounding behind, however large it is.
+    let lerp = |a: f64, b: f64, u: f64| (1.0 - u) * a + u * b;
+    let x = |a: usize| lerp(s[a], s[a + 1], u.x);
+    lerp(lerp(x(0), x(2), u.y), lerp(x(4), x(6), u.y), u.z)
+}
+
+/// Its derivatives by `u`.
+#[inline]
+fn trilinear_gradient(s: &[f64; 8], u: DVec3) -> DVec3 {
+    let lerp = |t: f64, a: f64, b: f64| a + t * (b - a);
+    let x = lerp(u.z, lerp(u.y, s[1] - s[0], s[3] - s[2]), lerp(u.y, s[5] - s[4], s[7] - s[6]));
+    let y = lerp(u.z, lerp(u.x, s[2] - s[0], s[3] - s[1]), lerp(u.x, s[6] - s[4], s[7] - s[5]));
+    let z = lerp(u.y, lerp(u.x, s[4] - s[0], s[5] - s[1]), lerp(u.x, s[6] - s[2], s[7] - s[3]));
+    DVec3::new(x, y, z)
 }
 
 /// `v` normalised, also for lengths whose square under- or overflows; `None` for 0 and non-finite.

@@ -34,11 +34,17 @@ impl Moments {
         )
     }
 
-    /// g such that g · Σ w v (1, d) is the fit's value at d = 0; of no use if [`Moments::weight`] is 0.
-    pub fn at_origin(&self) -> DVec4 {
+    /// The symmetric matrix whose product with Σ w v (1, d) is the fit's value at d = 0 and its slope; of no use if
+    /// [`Moments::weight`] is 0.
+    pub fn inverse(&self) -> DMat4 {
         // ∫K d_x² / ∫K over the ball is 1/7 for Epanechnikov's kernel. [Silverman86]
         let ridge = DVec4::new(0.0, 1.0, 1.0, 1.0) * (RIDGE / 7.0 * f64::from(self.0[0]));
-        (self.matrix() + DMat4::from_diagonal(ridge)).inverse().x_axis
+        (self.matrix() + DMat4::from_diagonal(ridge)).inverse()
+    }
+
+    /// The first row of [`Moments::inverse`]: the value at d = 0.
+    pub fn at_origin(&self) -> DVec4 {
+        self.inverse().x_axis
     }
 }
 

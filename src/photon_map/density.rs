@@ -2,10 +2,13 @@
 //!
 //! What a bin needs beside its photons' power, the measure ∫|∇h| dV of level sets in it with their mean isovalue, receiver
 //! normal and place, does not depend on the photons: it is integrated once. Level sets that face different octants have bins of
-//! their own, so that the sides of a thin sheet do not mix. The estimate at x minimises Σ K A D (P/D − a − b·(y − x))²
-//! over the bins (power P, measure D, centroid y) that it accepts (A) and takes a: at a border or a crease, where bins
+//! their own, so that the sides of a thin sheet do not mix. The light around a bin at x minimises Σ K A D (P/D − a − b·(y − x))²
+//! over the bins (power P, measure D, centroid y) that it accepts (A): a + b·(z − x) at z. At a border or a crease, where bins
 //! lie on one side only, the slope b keeps their mean from standing for x. The kernel is a ball in coordinates of the
-//! bins, so that coarse slices of a volume blur no further than they must; its radius is found once per bin. \[Loader99\]
+//! bins, so that coarse slices of a volume blur no further than they must. \[Loader99\]
+//!
+//! That, too, is found once per bin, as light is at the photons of \[Christensen99\]: an estimate blends what the bins of the
+//! eight cells around it say of its place.
 
 use super::{EstimateSettings, Irradiance};
 use crate::direct::luminance;
@@ -13,13 +16,12 @@ use crate::field::Field;
 use crate::linear_fit::Moments;
 use crate::photon::SurfacePhoton;
 use crate::scene::Scene;
-use glam::{DVec3, Vec3};
+use glam::{DVec3, DVec4, Vec3};
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// The level sets in a cell of the bins that face one octant: a cache line.
+/// The level sets in a cell of the bins that face one octant.
 #[derive(Clone, Copy, Debug, Default)]
-#[repr(align(64))]
 struct Bin {
     /// Centroid by `measure`, in coordinates of the bins.
     centroid: Vec3,
@@ -29,17 +31,33 @@ struct Bin {
     normal: Vec3,
     /// Mean isovalue by that measure.
     isovalue: f32,
-    /// Σ w.
-    power: Vec3,
     /// How far another isovalue may be to share light: τ, or half of what the bin spans. A steep edge spans the sweep
     /// within a voxel, where c hardly moves its level set.
     reach: f32,
-    /// Σ luminance(w)².
-    squares: f32,
-    /// Radius of estimates here, in bins.
-    radius: f32,
     /// Signs of the normal.
     octant: u8,
+}
+
+/// The photons of a bin.
+#[derive(Clone, Copy, Debug, Default)]
+struct Tally {
+    /// Σ w.
+    power: Vec3,
+    /// Σ luminance(w)².
+    squares: f32,
+}
+
+/// Irradiance around a bin: a linear function of the place.
+#[derive(Clone, Copy, Debug, Default)]
+struct Light {
+    /// At the bin's centroid.
+    value: Vec3,
+    /// Per bin along each axis.
+    slope: [Vec3; 3],
+    /// Of the value's luminance.
+    variance: f32,
+    /// Of the ball that it was fitted in, in bins.
+    radius: f32,
 }
 
 /// The photons of one side in bins.
@@ -54,17 +72,30 @@ pub(super) struct PhotonDensity<'a> {
     /// First bin of each cell, x fastest; one more entry than cells.
     starts: Vec<u32>,
     bins: Vec<Bin>,
+    /// As many as bins.
+    light: Vec<Light>,
     /// World edge of a cube of a cell's volume.
     edge: f64,
 }
 
-/// Radii in bins: the least, where photons are counted, the largest.
-const LEAST: f32 = 1.3;
+/// Radii in bins: the least, which reaches the next bins, where photons are counted, the largest.
+const LEAST: f32 = 1.05;
 const FIRST: f32 = 2.0;
 const MOST: f32 = 5.0;
 /// Photons of an estimate per photon of a bin, and the most photons that bins are meant to hold on average.
 const SHARE: f64 = 8.0;
 const FULL: f64 = 8.0;
+
+/// Middles of the octants of a cube of edge 1 around 0.
+const CORNERS: [DVec3; 8] = {
+    let (mut corners, mut n) = ([DVec3::ZERO; 8], 0);
+    while n < 8 {
+        corners[n] = DVec3::new(OFFSETS[n & 1], OFFSETS[n >> 1 & 1], OFFSETS[n >> 2]);
+        n += 1;
+    }
+    corners
+};
+const OFFSETS: [f64; 2] = [-0.25, 0.25];
 
 /// The octant of a normal: a bit per negative coordinate.
 #[inline]
@@ -101,6 +132,7 @@ impl<'a> PhotonDensity<'a> {
             dims: std::array::from_fn(|a| dims[a].div_ceil(factor[a])),
             starts: vec![0],
             bins: Vec::new(),
+            light: Vec::new(),
             edge: (volume * factor.iter().product::<usize>() as f64).cbrt(),
         };
         let [nx, ny, nz] = density.dims;
@@ -122,14 +154,15 @@ impl<'a> PhotonDensity<'a> {
             density.bins.extend(bins);
         }
         let places: Vec<Option<usize>> = kept.par_iter().map(|p| density.own(p.position.as_dvec3()).1).collect();
+        let mut tallies = vec![Tally::default(); density.bins.len()];
         for (p, place) in kept.iter().zip(places) {
-            let Some(bin) = place.map(|n| &mut density.bins[n]) else { continue };
+            let Some(bin) = place.map(|n| &mut tallies[n]) else { continue };
             let power = p.power * p.foreshortening;
             bin.power += power;
             bin.squares += luminance(power.as_dvec3()).powi(2) as f32;
         }
-        let radii: Vec<f32> = density.bins.par_iter().with_min_len(256).map(|b| density.radius(b)).collect();
-        density.bins.iter_mut().zip(radii).for_each(|(b, r)| b.radius = r);
+        let fitted = |b| density.fitted(b, &tallies);
+        density.light = density.bins.par_iter().with_max_len(4096).map(fitted).collect();
         density
     }
 
@@ -171,8 +204,7 @@ impl<'a> PhotonDensity<'a> {
         (normal, best.1)
     }
 
-    /// Adds the bins of a cell, without their photons: ∫ over the octants of its voxels, one point in each, eight where
-    /// the sweep ends.
+    /// Adds the bins of a cell: ∫ over the octants of its voxels, one point in each, eight of its tangent where the sweep ends.
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     fn measured(&self, cell: [usize; 3], out: &mut Vec<Bin>) {
         let lattice = self.field.lattice();
@@ -200,14 +232,6 @@ impl<'a> PhotonDensity<'a> {
         let from = DVec3::from_array(std::array::from_fn(|a| (cell[a] * self.factor[a]) as f64 - 0.5));
         let count: [usize; 3] = std::array::from_fn(|a| self.factor[a] * fine(a) as usize);
         let mut parts = [Part::default(); 8];
-        let mut add = |p: DVec3, h: f64, g: DVec3, weight: f64| {
-            let w = g.length() * weight;
-            if w > 0.0
-                && let Some(normal) = self.field.falling_normal(p)
-            {
-                parts[usize::from(octant(normal))].add(w, h, normal, p);
-            }
-        };
         let to_steps = lattice.axes().transpose();
         for k in 0..count[2] {
             for j in 0..count[1] {
@@ -216,20 +240,24 @@ impl<'a> PhotonDensity<'a> {
                     if p.cmplt(DVec3::ZERO).any() || p.cmpgt(far).any() {
                         continue;
                     }
-                    let (h, g) = (self.field.value(p), self.field.gradient(p));
+                    let (h, g) = self.field.value_and_gradient(p);
                     // How far h goes within the octant.
-                    let spread = 0.5 * (to_steps * g).abs().dot(step);
+                    let rise = (to_steps * g) * step;
+                    let spread = 0.5 * rise.abs().element_sum();
+                    let w = g.length() * volume;
+                    if !(w > 0.0 && h + spread >= 0.0 && h - spread <= 1.0) {
+                        continue;
+                    }
+                    let Some(normal) = self.field.falling_normal(p) else { continue };
+                    let part = &mut parts[usize::from(octant(normal))];
                     if h - spread >= 0.0 && h + spread <= 1.0 {
-                        add(p, h, g, volume);
-                    } else if h + spread >= 0.0 && h - spread <= 1.0 {
-                        for corner in 0..8u32 {
-                            let o =
-                                DVec3::from_array([0, 1, 2].map(|a| if corner >> a & 1 == 1 { 0.25 } else { -0.25 }));
-                            let q = p + o * step;
-                            let h = self.field.value(q);
-                            if (0.0..=1.0).contains(&h) {
-                                add(q, h, self.field.gradient(q), volume / 8.0);
-                            }
+                        part.add(w, h, normal, p);
+                        continue;
+                    }
+                    for corner in CORNERS {
+                        let h = h + rise.dot(corner);
+                        if (0.0..=1.0).contains(&h) {
+                            part.add(w / 8.0, h, normal, p + corner * step);
                         }
                     }
                 }
@@ -243,13 +271,12 @@ impl<'a> PhotonDensity<'a> {
             isovalue: (p.isovalue / p.measure) as f32,
             reach: tau.max(0.5 * (p.highest - p.lowest)) as f32,
             octant,
-            ..Bin::default()
         }));
     }
 
-    /// Calls `visit(bin, d², d)` for the bins within `radius` of `place`, at offset d; all in bins.
+    /// Calls `visit(bin, d², d)` for the numbers of the bins within `radius` of `place`, at offset d; all in bins.
     #[inline]
-    fn around(&self, place: Vec3, radius: f32, mut visit: impl FnMut(&Bin, f32, Vec3)) {
+    fn around(&self, place: Vec3, radius: f32, mut visit: impl FnMut(usize, f32, Vec3)) {
         // How far a coordinate is from a cell's span.
         let beyond = |at: f32, cell: usize| (cell as f32 - at).max(at - cell as f32 - 1.0).max(0.0);
         let r2 = radius * radius;
@@ -261,12 +288,11 @@ impl<'a> PhotonDensity<'a> {
                     continue;
                 }
                 let half = left.sqrt();
-                let row = self.row(self.cell(0, place.x - half), self.cell(0, place.x + half), j, k);
-                for bin in &self.bins[row] {
-                    let d = bin.centroid - place;
+                for n in self.row(self.cell(0, place.x - half), self.cell(0, place.x + half), j, k) {
+                    let d = self.bins[n].centroid - place;
                     let d2 = d.length_squared();
                     if d2 < r2 {
-                        visit(bin, d2, d);
+                        visit(n, d2, d);
                     }
                 }
             }
@@ -281,15 +307,15 @@ impl<'a> PhotonDensity<'a> {
 
     /// The radius around a bin that holds the photons asked for, so far as bins allow.
     #[allow(clippy::cast_possible_truncation, reason = "f32 does")]
-    fn radius(&self, at: &Bin) -> f32 {
+    fn radius(&self, at: &Bin, tallies: &[Tally]) -> f32 {
         let wanted = self.settings.photons as f32;
         // Photons of equal power that would be as noisy as those within a radius.
         let count = |radius: f32| {
             let (mut sum, mut squares) = (0.0f32, 0.0f32);
-            self.around(at.centroid, radius, |b, _, _| {
-                if self.accepts(b, at.isovalue, at.normal) {
-                    sum += luminance(b.power.as_dvec3()) as f32;
-                    squares += b.squares;
+            self.around(at.centroid, radius, |n, _, _| {
+                if self.accepts(&self.bins[n], at.isovalue, at.normal) {
+                    sum += luminance(tallies[n].power.as_dvec3()) as f32;
+                    squares += tallies[n].squares;
                 }
             });
             if squares > 0.0 { sum * sum / squares } else { 0.0 }
@@ -304,27 +330,59 @@ impl<'a> PhotonDensity<'a> {
         (radius * (wanted / n.max(1.0)).cbrt()).clamp(LEAST, MOST)
     }
 
-    /// See [`super::PhotonMap::irradiance`].
-    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-    pub(super) fn irradiance(&self, position: DVec3, isovalue: f64) -> Irradiance {
-        let (normal, own) = self.own(position);
-        let own = own.map(|n| &self.bins[n]);
-        let (place, radius) = (self.place(position).as_vec3(), own.map_or(MOST, |b| b.radius));
+    /// The light that the bins around one that are alike have.
+    fn fitted(&self, at: &Bin, tallies: &[Tally]) -> Light {
+        let radius = self.radius(at, tallies);
         let scale = 1.0 / radius;
         let mut fit = Fit::default();
-        self.around(place, radius, |b, d2, d| {
-            if self.accepts(b, isovalue as f32, normal) {
-                fit.add(b, 1.0 - d2 * scale * scale, d * scale);
+        self.around(at.centroid, radius, |n, d2, d| {
+            let bin = &self.bins[n];
+            if self.accepts(bin, at.isovalue, at.normal) {
+                fit.add(bin.measure, &tallies[n], 1.0 - d2 * scale * scale, d * scale);
             }
         });
-        if !fit.any()
-            && let Some(bin) = own
-        {
-            // A tip or a crease, whose bin has another mean normal than the place itself.
-            fit.add(bin, 1.0, Vec3::ZERO);
+        let (value, slope, variance) = fit.solve();
+        Light { value, slope: slope.map(|s| s * scale), variance, radius }
+    }
+
+    /// See [`super::PhotonMap::irradiance`]: the light of the bins around that are alike, by their part of the place.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "storage is f32; cells are clamped")]
+    pub(super) fn irradiance(&self, position: DVec3, isovalue: f64) -> Irradiance {
+        let (normal, own) = self.own(position);
+        let place = self.place(position).as_vec3();
+        let low = (place - 0.5).floor();
+        let high = place - 0.5 - low;
+        let (mut mean, mut variance, mut weight) = (Vec3::ZERO, 0.0, 0.0);
+        for corner in 0..8 {
+            let step = Vec3::new((corner & 1) as f32, (corner >> 1 & 1) as f32, (corner >> 2) as f32);
+            let cell = low + step;
+            let part = (1.0 - (high - step).abs()).element_product();
+            if part <= 0.0 || (0..3).any(|a| cell[a] < 0.0 || cell[a] as usize >= self.dims[a]) {
+                continue;
+            }
+            let [i, j, k] = cell.to_array().map(|x| x as usize);
+            for n in self.row(i, i, j, k) {
+                let bin = &self.bins[n];
+                if self.accepts(bin, isovalue as f32, normal) {
+                    let (light, d, w) = (&self.light[n], place - bin.centroid, part * bin.measure);
+                    mean += w * (light.value + d.x * light.slope[0] + d.y * light.slope[1] + d.z * light.slope[2]);
+                    variance += w * light.variance;
+                    weight += w;
+                }
+            }
         }
-        let (mean, variance) = fit.solve();
-        Irradiance { mean, variance, radius: f64::from(radius) * self.edge }
+        let own = own.map(|n| &self.light[n]);
+        if weight > 0.0 {
+            (mean, variance) = (mean / weight, variance / weight);
+        } else if let Some(light) = own {
+            // A tip or a crease, whose bin has another mean normal than the place itself.
+            (mean, variance) = (light.value, light.variance);
+        }
+        Irradiance {
+            mean: mean.max(Vec3::ZERO).as_dvec3(),
+            variance: f64::from(variance),
+            radius: f64::from(own.map_or(MOST, |l| l.radius)) * self.edge,
+        }
     }
 }
 
@@ -370,31 +428,30 @@ struct Fit {
 
 impl Fit {
     #[inline]
-    fn add(&mut self, bin: &Bin, kernel: f32, d: Vec3) {
-        self.measure.add(kernel * bin.measure, d);
-        self.noise.add(kernel * kernel * bin.squares, d);
-        let p = bin.power * kernel;
+    fn add(&mut self, measure: f32, tally: &Tally, kernel: f32, d: Vec3) {
+        self.measure.add(kernel * measure, d);
+        self.noise.add(kernel * kernel * tally.squares, d);
+        let p = tally.power * kernel;
         self.power[0] += p;
         self.power[1] += p * d.x;
         self.power[2] += p * d.y;
         self.power[3] += p * d.z;
     }
 
-    fn any(&self) -> bool {
-        self.measure.weight() > 0.0
-    }
-
-    /// The value at d = 0 and the variance of its luminance. A channel that the slope would drive below 0 falls back to
-    /// the mean.
-    fn solve(&self) -> (DVec3, f64) {
-        if !self.any() {
-            return (DVec3::ZERO, 0.0);
+    /// The value at d = 0, its slope, and the variance of the value's luminance. A channel that the slope would drive below 0
+    /// falls back to the mean.
+    fn solve(&self) -> (Vec3, [Vec3; 3], f32) {
+        let weight = self.measure.weight();
+        if weight <= 0.0 {
+            return Default::default();
         }
-        let g = self.measure.at_origin();
+        let inverse = self.measure.inverse();
         let p = self.power.map(|p| p.as_dvec3());
-        let flat = p[0] / f64::from(self.measure.weight());
-        let fitted = g.x * p[0] + g.y * p[1] + g.z * p[2] + g.w * p[3];
-        let variance = g.dot(self.noise.matrix() * g).max(0.0);
-        (DVec3::select(fitted.cmpge(DVec3::ZERO), fitted, flat), variance)
+        let of = |g: DVec4| (g.x * p[0] + g.y * p[1] + g.z * p[2] + g.w * p[3]).as_vec3();
+        let value = of(inverse.x_axis);
+        let lit = value.cmpge(Vec3::ZERO);
+        let variance = inverse.x_axis.dot(self.noise.matrix() * inverse.x_axis).max(0.0);
+        let slope = [inverse.y_axis, inverse.z_axis, inverse.w_axis].map(|g| Vec3::select(lit, of(g), Vec3::ZERO));
+        (Vec3::select(lit, value, self.power[0] / weight), slope, variance as f32)
     }
 }
