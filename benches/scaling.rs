@@ -13,6 +13,7 @@ use isolume::fitted_grid::{Wish, fit};
 use isolume::flattened::Side;
 use isolume::illumination_grid::shepard;
 use isolume::mask::{Mask, masks};
+use isolume::node_set::NodeSet;
 use isolume::photon::{PhotonSettings, trace_photons};
 use isolume::photon_map::EstimateSettings;
 use isolume::progress::{Clock, Progress};
@@ -196,8 +197,8 @@ fn main() {
         (
             "fit",
             Box::new(|| {
-                let free = |m| m != Mask::Empty;
-                drop(black_box(fit(&scene.field, lattice, &wishes, start.clone(), free, &|_| true)));
+                let free = NodeSet::new(lattice.len(), |o| start.mask[o] != Mask::Empty);
+                drop(black_box(fit(&scene.field, lattice, &wishes, start.clone(), &free, &|_| true)));
             }),
         ),
         ("sweep, direct", Box::new(|| swept(8, 64, 1))),

@@ -86,8 +86,7 @@ impl Default for SweepSettings {
     }
 }
 
-/// Light on one stored side of every level set, at the lattice's nodes. Nodes that hold no surface of the sweep (h outside
-/// it or not finite, or ∇h = 0) are 0.
+/// Light on one stored side of every level set, at the lattice's nodes. Nodes that are not [`SweepResult::lit`] are 0.
 #[derive(Clone, Debug)]
 pub struct SweptSide {
     /// Which side.
@@ -105,6 +104,9 @@ pub struct SweptSide {
 pub struct SweepResult {
     /// The stored sides, in the order of [`crate::scene::Surface::stored_sides`].
     pub sides: Vec<SweptSide>,
+    /// Nodes with light: those with ∇h ≠ 0 that hold a surface of the sweep, and those beside one whose own lies less than
+    /// 0.1 of the sweep outside it.
+    pub lit: Vec<bool>,
     /// Reflected radiance of walls, luminaires and caps, by flat number; `None` where nothing is reflected.
     pub flats: Vec<Option<FlatTexture>>,
     /// Indirect bounces of the replicate that took the most.
@@ -250,7 +252,8 @@ pub fn sweep_resumable(
         })
     });
     let flats = flats.collect();
-    Ok(SweepResult { sides: total.finish(&geometry, done), flats, bounces, residual, stopped, counts })
+    let sides = total.finish(&geometry, done);
+    Ok(SweepResult { sides, lit: geometry.lit, flats, bounces, residual, stopped, counts })
 }
 
 /// The sides that are swept: the stored ones, and the other one if light passes to it.

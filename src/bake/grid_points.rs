@@ -251,20 +251,26 @@ impl BesideLight {
 }
 
 impl<'a> Beside<'a> {
-    /// Places around the points whose mask says [`Mask::Filled`].
+    /// Places around the points that `stand_in` picks.
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-    pub(super) fn new(field: &'a Field, lattice: &'a Lattice, masks: &[Mask], seed: u64) -> Self {
-        let set = NodeSet::new(masks.len(), |o| masks[o] == Mask::Filled);
+    pub(super) fn new(
+        field: &'a Field,
+        lattice: &'a Lattice,
+        stand_in: impl Fn(usize) -> bool + Sync,
+        seed: u64,
+    ) -> Self {
+        let points = lattice.len();
+        let set = NodeSet::new(points, stand_in);
         let mut found = vec![[None; STAND_INS]; set.len()];
         const ROW: usize = 4096;
         set.split(&mut found, ROW).into_par_iter().enumerate().for_each(|(row, found)| {
-            for (found, o) in found.iter_mut().zip(set.members(row * ROW..masks.len().min((row + 1) * ROW))) {
+            for (found, o) in found.iter_mut().zip(set.members(row * ROW..points.min((row + 1) * ROW))) {
                 *found = stand_ins::<STAND_INS>(field, lattice, o, seed).map(|p| p.map(|p: DVec3| p.as_vec3()));
             }
         });
         let count = found.iter().flatten().flatten().count();
         let (mut positions, mut owners) = (Vec::with_capacity(count), Vec::with_capacity(count));
-        for (o, found) in set.members(0..masks.len()).zip(&found) {
+        for (o, found) in set.members(0..points).zip(&found) {
             positions.extend(found.iter().flatten());
             owners.resize(positions.len(), o as u64);
         }
@@ -336,7 +342,8 @@ impl<'a> Beside<'a> {
             .filter(|(_, l)| l.variance >= 0.0)
             .map(|(&position, l)| Wish { position, radiance: l.radiance })
             .collect();
-        fit(self.field, self.lattice, &wishes, grid, |m| m == Mask::Filled, &|_| true)
+        let free = NodeSet::new(self.lattice.len(), |o| grid.mask[o] == Mask::Filled);
+        fit(self.field, self.lattice, &wishes, grid, &free, &|_| true)
     }
 }
 

@@ -11,6 +11,7 @@ use crate::flattened::Side;
 use crate::illumination_grid::{IlluminationGrid, shepard};
 use crate::irradiance_caching::interpolate;
 use crate::mask::Mask;
+use crate::node_set::NodeSet;
 use crate::photon::{PhotonSettings, trace_photons};
 use crate::progress::{Clock, Progress, interrupted};
 use crate::radiance::{BLOCK, Indirect, RadianceSample, Sampler, sample_places};
@@ -168,7 +169,8 @@ impl<'a> FieldLight<'a> {
         let places = match settings.strategy.placed() {
             Some(strategy) => Places::Scattered(scatter(scene, settings, masks, &strategy)?),
             None => {
-                let beside = Beside::new(&scene.field, lattice, masks, settings.seed);
+                let filled = |o: usize| masks[o] == Mask::Filled;
+                let beside = Beside::new(&scene.field, lattice, filled, settings.seed);
                 Places::Grid(GridPoints::new(&scene.field, lattice, masks), beside)
             }
         };
@@ -258,7 +260,8 @@ impl<'a> FieldLight<'a> {
                             let grid = blended();
                             let wishes: Vec<Wish> = samples.iter().map(Wish::from).collect();
                             drop(samples);
-                            fit(&scene.field, lattice, &wishes, grid, |m| m != Mask::Empty, tick)
+                            let free = NodeSet::new(lattice.len(), |o| grid.mask[o] != Mask::Empty);
+                            fit(&scene.field, lattice, &wishes, grid, &free, tick)
                         }
                     }
                 }

@@ -321,7 +321,7 @@ impl BakeSettings {
         };
         let (directions, light_points) = match preset {
             Preset::Preview => (64, 16),
-            Preset::Standard => (128, 64),
+            Preset::Standard => (256, 64),
             Preset::Reference => (512, 128),
         };
         let estimator = o.estimator.unwrap_or_default();

@@ -64,7 +64,8 @@ pub(super) fn light(
     lit.sweep_queries = swept.counts.gather_rays + swept.counts.shadow_rays;
 
     // What the sweep knows is also what rays from the other points gather.
-    let white: Vec<Vec<[f32; 3]>> = swept.sides.iter().map(|s| white(masks, s)).collect();
+    let known = |o: usize| masks[o] != Mask::Empty && swept.lit[o];
+    let white: Vec<Vec<[f32; 3]>> = swept.sides.iter().map(|s| white(&known, s)).collect();
     let nodes = [Side::Lower, Side::Higher].map(|side| {
         let stored = swept.sides.iter().position(|s| s.side == side)?;
         Some(widened(lattice, masks, &white[stored]))
@@ -75,9 +76,11 @@ pub(super) fn light(
     let tracer = GraphTracer::new(device, scene)?;
     lit.spend(clock, |s| &mut s.build);
     let clock = Clock::start();
-    let beside = Beside::new(&scene.field, lattice, masks, settings.seed);
-    let mut sides = Vec::new();
+    // Just outside the sweep, light on the point's own level set is a better end of interpolation than any fit.
+    let fitted = |o: usize| masks[o] == Mask::Filled && !swept.lit[o];
+    let beside = Beside::new(&scene.field, lattice, fitted, settings.seed);
     let near = beside_luminaires(scene, masks);
+    let mut sides = Vec::new();
     for (s, white) in swept.sides.iter().zip(white) {
         let stage = progress.stage("samples", (beside.len() + near.len()) as u64);
         let seed = settings.seed;
@@ -96,14 +99,17 @@ pub(super) fn light(
         let sampled = sample_places(&sampler, near.len(), &place, Stage::UNSAVED, 0, &|n| stage.tick(n));
         stage.end()?;
         lit.count(Counts::from(&sampled));
-        let mut grid = swept_grid(masks, outgoing(scene, white), &s.std_error);
+        let mut grid = swept_grid(&known, outgoing(scene, white), &s.std_error);
         for (&o, sample) in near.iter().zip(&sampled.samples) {
             if let Some(sample) = sample {
                 grid.radiance[o] = sample.radiance.to_array();
                 grid.std_error[o] = sample.variance.sqrt();
             }
         }
-        sides.push((s.side, beside.fit(grid, &light)));
+        let mut grid = beside.fit(grid, &light);
+        // Those outside the sweep were called valid so that the fit left them alone.
+        grid.mask.par_iter_mut().zip(masks).filter(|(m, _)| **m == Mask::Valid).for_each(|(m, own)| *m = *own);
+        sides.push((s.side, grid));
     }
     lit.fields.push(sides);
     lit.spend(clock, |s| &mut s.samples);
@@ -134,13 +140,13 @@ fn beside_luminaires(scene: &Scene, masks: &[Mask]) -> Vec<usize> {
     (0..masks.len()).into_par_iter().with_min_len(1 << 12).filter(near).collect()
 }
 
-/// What a white surface would reflect at valid nodes, NaN elsewhere.
-fn white(masks: &[Mask], s: &SweptSide) -> Vec<[f32; 3]> {
+/// What a white surface would reflect at lit nodes, NaN elsewhere.
+fn white(known: &(dyn Fn(usize) -> bool + Sync), s: &SweptSide) -> Vec<[f32; 3]> {
     let vector = |v: [f32; 3]| DVec3::from_array(v.map(f64::from));
-    (0..masks.len())
+    (0..s.irradiance.len())
         .into_par_iter()
         .map(|o| {
-            if masks[o] != Mask::Valid {
+            if !known(o) {
                 return [f32::NAN; 3];
             }
             reflected(DVec3::ONE, vector(s.irradiance[o])).as_vec3().to_array()
@@ -154,7 +160,7 @@ fn widened(lattice: &Lattice, masks: &[Mask], nodes: &[[f32; 3]]) -> Vec<[f32; 3
     (0..nodes.len())
         .into_par_iter()
         .map(|o| {
-            if masks[o] != Mask::Filled {
+            if masks[o] != Mask::Filled || !nodes[o][0].is_nan() {
                 return nodes[o];
             }
             let [i, j, k] = lattice.ijk(o);
@@ -174,10 +180,14 @@ fn widened(lattice: &Lattice, masks: &[Mask], nodes: &[[f32; 3]]) -> Vec<[f32; 3
         .collect()
 }
 
-/// A grid of what the sweep knows.
-fn swept_grid(masks: &[Mask], mut radiance: Vec<[f32; 3]>, std_error: &[f32]) -> IlluminationGrid {
-    let known = |&m: &Mask| if m == Mask::Valid { m } else { Mask::Empty };
-    let mask: Vec<Mask> = masks.par_iter().map(known).collect();
+/// A grid of the points with light, called valid.
+fn swept_grid(
+    known: &(dyn Fn(usize) -> bool + Sync),
+    mut radiance: Vec<[f32; 3]>,
+    std_error: &[f32],
+) -> IlluminationGrid {
+    let mask: Vec<Mask> =
+        (0..radiance.len()).into_par_iter().map(|o| if known(o) { Mask::Valid } else { Mask::Empty }).collect();
     radiance.par_iter_mut().zip(&mask).filter(|(_, m)| **m == Mask::Empty).for_each(|(r, _)| *r = [0.0; 3]);
     let std_error = mask
         .par_iter()

@@ -120,11 +120,11 @@ impl Totals {
             (0..self.nodes)
                 .into_par_iter()
                 .with_min_len(1 << 12)
-                .map(|i| if geometry.valid[i] { node(i) } else { [0.0; 3] })
+                .map(|i| if geometry.lit[i] { node(i) } else { [0.0; 3] })
                 .collect()
         };
         let std_error = |m: &Vec<f32>| -> Vec<f32> {
-            let nodes = m.par_iter().zip(&geometry.valid).with_min_len(1 << 12);
+            let nodes = m.par_iter().zip(&geometry.lit).with_min_len(1 << 12);
             nodes.map(|(m, v)| if *v { (together * m * scale / (done - 1) as f32).sqrt() } else { 0.0 }).collect()
         };
         let sides = self.sides.iter().enumerate().map(|(s, &side)| SweptSide {

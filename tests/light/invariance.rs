@@ -2,10 +2,10 @@
 
 use crate::support::*;
 use glam::{DMat3, DVec3, Vec3};
-use isolume::bake::{Bake, BakeSettings};
+use isolume::bake::{Bake, BakeSettings, Engine};
 use isolume::embree::{Device, GraphTracer};
 use isolume::field::{Field, Sweep};
-use isolume::flattened::FlattenedRay;
+use isolume::flattened::{FlattenedRay, Side};
 use isolume::photon::PhotonSettings;
 use isolume::rng::{Rng, Stage};
 use isolume::scene::{Scene, Surface, cornell_box};
@@ -197,5 +197,35 @@ fn lattices_do_not_matter() {
         let (ratio, bias) = ((difference / noise).sqrt(), b / a - 1.0);
         println!("{name}: {count} shared nodes, difference {ratio:.3} × two seeds', sum off {:+.3} %", 100.0 * bias);
         assert!(count > 1000 && ratio < 1.5 && bias.abs() < 0.01);
+    }
+}
+
+/// Beside the ends of the sweep, light is what it is where the sweep goes on: 1.14 and 0.47 % apart in the mean square; 1.42
+/// and 3.03 % with nodes outside the sweep fitted to samples instead of lit by lines themselves.
+#[test]
+fn where_the_sweep_ends_does_not_matter() {
+    let hill = |x: DVec3| (-(x - DVec3::new(0.45, 0.55, 0.4)).length_squared() / 0.2).exp();
+    let swept = |lo, hi| {
+        let field = field(lattice([33; 3], DVec3::ZERO, DVec3::ONE), lo, hi, hill);
+        let walls = cornell_box(field.lattice(), 0.0).unwrap();
+        scene(field, grey(0.75, Side::Lower), walls)
+    };
+    let settings = BakeSettings { engine: Engine::Sweep, ..at_nodes(1) };
+    let (narrow, wide) = (swept(0.2, 0.9), swept(0.1, 1.0));
+    let [a, b] = [&narrow, &wide].map(|scene| run(scene, &settings).sides.remove(0).1);
+    for (name, ends) in [("low", [0.2, 0.21]), ("high", [0.89, 0.9])] {
+        let mut rng = Rng::stream(7, Stage::Test, 0);
+        let (mut squares, mut light, mut count) = (0.0, 0.0, 0);
+        while count < 2000 {
+            let p = narrow.lattice().far() * DVec3::new(rng.unit(), rng.unit(), rng.unit());
+            if !(ends[0]..ends[1]).contains(&narrow.field.sweep().from_unit(narrow.field.value(p))) {
+                continue;
+            }
+            let [x, y] = [&a, &b].map(|grid| grid.interpolate(narrow.lattice(), p).y);
+            (squares, light, count) = (squares + (x - y).powi(2), light + y * y, count + 1);
+        }
+        let apart = (squares / light).sqrt();
+        println!("{name} end: {:.2} % apart", 100.0 * apart);
+        assert!(apart < 0.0125, "{name} end: {apart}");
     }
 }
