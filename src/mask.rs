@@ -16,7 +16,7 @@ pub enum Mask {
     /// Radiance of the level set through the point.
     Valid = 1,
     /// Outside the sweep or without gradient itself, but in a cell that surfaces of the sweep cross, or beside one:
-    /// filled from valid samples nearby, since those surfaces interpolate it.
+    /// those surfaces interpolate it. Holds light of its own level set, or what fits samples nearby.
     Filled = 2,
 }
 

@@ -124,8 +124,8 @@ fn level_set_positions(field: &Field, isovalues: &[f64], count: u64, seed: u64) 
             let [s, t] = crate::warp::triangle(rng.unit2());
             let mut p = a + s * (b - a) + t * (c - a);
             for _ in 0..4 {
-                let g = field.gradient(p);
-                let step = (field.value(p) - isovalue) / g.length_squared();
+                let (h, g) = field.value_and_gradient(p);
+                let step = (h - isovalue) / g.length_squared();
                 if step.is_finite() {
                     // Never farther than a cell: beyond, the linear model of h means nothing.
                     let d = lattice.direction_to_index(-g * step);

@@ -319,7 +319,8 @@ impl<'a> Beside<'a> {
 
     /// Gives the points without a level set of their own what makes interpolation come nearest to the light in the cells
     /// around them: between the points of a steep edge there may be none with one. Points around which no light was found
-    /// stay empty, which viewers and [`IlluminationGrid::interpolate`] leave out.
+    /// stay empty, which viewers and [`IlluminationGrid::interpolate`] leave out. Points beside which are no places stay as
+    /// they are.
     pub(super) fn fit(&self, mut grid: IlluminationGrid, light: &[BesideLight]) -> IlluminationGrid {
         let mut start = 0;
         for run in self.owners.chunk_by(|a, b| a == b) {
@@ -342,7 +343,8 @@ impl<'a> Beside<'a> {
             .filter(|(_, l)| l.variance >= 0.0)
             .map(|(&position, l)| Wish { position, radiance: l.radiance })
             .collect();
-        let free = NodeSet::new(self.lattice.len(), |o| grid.mask[o] == Mask::Filled);
+        let lit = |o: usize| grid.mask[o] == Mask::Filled && self.owners.binary_search(&(o as u64)).is_ok();
+        let free = NodeSet::new(self.lattice.len(), lit);
         fit(self.field, self.lattice, &wishes, grid, &free, &|_| true)
     }
 }

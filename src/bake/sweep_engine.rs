@@ -64,8 +64,7 @@ pub(super) fn light(
     lit.sweep_queries = swept.counts.gather_rays + swept.counts.shadow_rays;
 
     // What the sweep knows is also what rays from the other points gather.
-    let known = |o: usize| masks[o] != Mask::Empty && swept.lit[o];
-    let white: Vec<Vec<[f32; 3]>> = swept.sides.iter().map(|s| white(&known, s)).collect();
+    let white: Vec<Vec<[f32; 3]>> = swept.sides.iter().map(|s| white(&swept.lit, s)).collect();
     let nodes = [Side::Lower, Side::Higher].map(|side| {
         let stored = swept.sides.iter().position(|s| s.side == side)?;
         Some(widened(lattice, masks, &white[stored]))
@@ -99,17 +98,15 @@ pub(super) fn light(
         let sampled = sample_places(&sampler, near.len(), &place, Stage::UNSAVED, 0, &|n| stage.tick(n));
         stage.end()?;
         lit.count(Counts::from(&sampled));
-        let mut grid = swept_grid(&known, outgoing(scene, white), &s.std_error);
+        let own = |o: usize| if swept.lit[o] { masks[o] } else { Mask::Empty };
+        let mut grid = swept_grid(own, outgoing(scene, white), &s.std_error);
         for (&o, sample) in near.iter().zip(&sampled.samples) {
             if let Some(sample) = sample {
                 grid.radiance[o] = sample.radiance.to_array();
                 grid.std_error[o] = sample.variance.sqrt();
             }
         }
-        let mut grid = beside.fit(grid, &light);
-        // Those outside the sweep were called valid so that the fit left them alone.
-        grid.mask.par_iter_mut().zip(masks).filter(|(m, _)| **m == Mask::Valid).for_each(|(m, own)| *m = *own);
-        sides.push((s.side, grid));
+        sides.push((s.side, beside.fit(grid, &light)));
     }
     lit.fields.push(sides);
     lit.spend(clock, |s| &mut s.samples);
@@ -141,17 +138,9 @@ fn beside_luminaires(scene: &Scene, masks: &[Mask]) -> Vec<usize> {
 }
 
 /// What a white surface would reflect at lit nodes, NaN elsewhere.
-fn white(known: &(dyn Fn(usize) -> bool + Sync), s: &SweptSide) -> Vec<[f32; 3]> {
-    let vector = |v: [f32; 3]| DVec3::from_array(v.map(f64::from));
-    (0..s.irradiance.len())
-        .into_par_iter()
-        .map(|o| {
-            if !known(o) {
-                return [f32::NAN; 3];
-            }
-            reflected(DVec3::ONE, vector(s.irradiance[o])).as_vec3().to_array()
-        })
-        .collect()
+fn white(lit: &[bool], s: &SweptSide) -> Vec<[f32; 3]> {
+    let white = |e: [f32; 3]| reflected(DVec3::ONE, DVec3::from_array(e.map(f64::from))).as_vec3().to_array();
+    s.irradiance.par_iter().zip(lit).map(|(&e, &lit)| if lit { white(e) } else { [f32::NAN; 3] }).collect()
 }
 
 /// Unknown nodes beside known ones become their mean, so that lookups in cells at the sweep's ends find something.
@@ -180,19 +169,14 @@ fn widened(lattice: &Lattice, masks: &[Mask], nodes: &[[f32; 3]]) -> Vec<[f32; 3
         .collect()
 }
 
-/// A grid of the points with light, called valid.
-fn swept_grid(
-    known: &(dyn Fn(usize) -> bool + Sync),
-    mut radiance: Vec<[f32; 3]>,
-    std_error: &[f32],
-) -> IlluminationGrid {
-    let mask: Vec<Mask> =
-        (0..radiance.len()).into_par_iter().map(|o| if known(o) { Mask::Valid } else { Mask::Empty }).collect();
+/// A grid of the points that are not empty by `own`.
+fn swept_grid(own: impl Fn(usize) -> Mask + Sync, mut radiance: Vec<[f32; 3]>, std_error: &[f32]) -> IlluminationGrid {
+    let mask: Vec<Mask> = (0..radiance.len()).into_par_iter().map(&own).collect();
     radiance.par_iter_mut().zip(&mask).filter(|(_, m)| **m == Mask::Empty).for_each(|(r, _)| *r = [0.0; 3]);
     let std_error = mask
         .par_iter()
         .enumerate()
-        .map(|(o, &m)| if m == Mask::Valid { std_error.get(o).copied().unwrap_or(0.0) } else { 0.0 })
+        .map(|(o, &m)| if m == Mask::Empty { 0.0 } else { std_error.get(o).copied().unwrap_or(0.0) })
         .collect();
     IlluminationGrid { radiance, std_error, mask }
 }

@@ -86,17 +86,6 @@ const MOST: f32 = 5.0;
 const SHARE: f64 = 8.0;
 const FULL: f64 = 8.0;
 
-/// Middles of the octants of a cube of edge 1 around 0.
-const CORNERS: [DVec3; 8] = {
-    let (mut corners, mut n) = ([DVec3::ZERO; 8], 0);
-    while n < 8 {
-        corners[n] = DVec3::new(OFFSETS[n & 1], OFFSETS[n >> 1 & 1], OFFSETS[n >> 2]);
-        n += 1;
-    }
-    corners
-};
-const OFFSETS: [f64; 2] = [-0.25, 0.25];
-
 /// The octant of a normal: a bit per negative coordinate.
 #[inline]
 fn octant(n: DVec3) -> u8 {
@@ -254,10 +243,12 @@ impl<'a> PhotonDensity<'a> {
                         part.add(w, h, normal, p);
                         continue;
                     }
-                    for corner in CORNERS {
-                        let h = h + rise.dot(corner);
+                    for eighth in 0..8usize {
+                        let at = |axis: usize| if eighth >> axis & 1 == 1 { 0.25 } else { -0.25 };
+                        let offset = DVec3::new(at(0), at(1), at(2));
+                        let h = h + rise.dot(offset);
                         if (0.0..=1.0).contains(&h) {
-                            part.add(w / 8.0, h, normal, p + corner * step);
+                            part.add(w / 8.0, h, normal, p + offset * step);
                         }
                     }
                 }
