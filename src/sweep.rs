@@ -105,7 +105,7 @@ pub struct SweepResult {
     /// The stored sides, in the order of [`crate::scene::Surface::stored_sides`].
     pub sides: Vec<SweptSide>,
     /// Nodes with light: those with ∇h ≠ 0 that hold a surface of the sweep, and those beside one whose own lies less than
-    /// 0.1 of the sweep outside it.
+    /// a quarter of the sweep outside it, unless h ends in a plateau there.
     pub lit: Vec<bool>,
     /// Reflected radiance of walls, luminaires and caps, by flat number; `None` where nothing is reflected.
     pub flats: Vec<Option<FlatTexture>>,

@@ -1,5 +1,5 @@
-//! The fast engine: line sweeps light every node; exact rays fill the points beside the sweep's ends, and those next to
-//! luminaires.
+//! The fast engine: line sweeps light every node; exact rays fill points outside the sweep beside steep edges, and those
+//! next to luminaires.
 
 use super::bands::Band;
 use super::grid_points::{Beside, Counts, STAND_INS};
@@ -25,9 +25,9 @@ use rayon::prelude::*;
 /// Resolution of the progress bar, since a sweep knows only fractions.
 const STEPS: f64 = 1000.0;
 
-/// The share of the photon engine's rays that a sample beside the sweep's ends takes: each point there is fitted to samples
-/// of its own and its neighbours'.
-const SHARE: u32 = 8;
+/// The shares of the photon engine's gather and shadow rays that a sample beside steep edges takes: each point there is fitted
+/// to samples of its own and its neighbours'.
+const SHARES: [u32; 2] = [4, 8];
 
 /// Points nearer to a luminaire than this many voxels are sampled by exact rays: on its front light falls off within a voxel,
 /// and what lies behind it is lit by lines that a sweep mixes a voxel further.
@@ -85,7 +85,7 @@ pub(super) fn light(
         let seed = settings.seed;
         let gather = |share: u32| Indirect::Gather(&cache, (settings.gather_rays / share).max(2));
         let shadow = |share: u32| (settings.shadow_rays / share).max(2);
-        let (indirect, shadow_rays) = (gather(SHARE), shadow(SHARE));
+        let (indirect, shadow_rays) = (gather(SHARES[0]), shadow(SHARES[1]));
         let sampler = Sampler { scene, tracer: &tracer, indirect: &indirect, side: s.side, shadow_rays, seed };
         let saved = stages(checkpoint, STAGES * number + 4)[s.side.index()];
         let mut light = beside.dark();

@@ -12,8 +12,10 @@ use std::sync::Mutex;
 /// Normals are stored in units of 1/32767.
 pub(super) const NORMAL_SCALE: f32 = 32767.0;
 
-/// Nodes this far outside the sweep, in its units, are still lit if a neighbour is in it.
-const OVERSHOOT: f32 = 0.1;
+/// Nodes this far outside the sweep, in its units, are still lit if a neighbour is in it,
+const OVERSHOOT: f32 = 0.25;
+/// and if h bends less than this there: level sets on a plateau beside a steep edge are dark, and no end to interpolate from.
+const BEND: f32 = 0.8;
 
 /// Red, green and blue, a plane each, so that neighbouring lines load neighbouring numbers.
 pub(super) type Planes = [Vec<f32>; 3];
@@ -174,7 +176,8 @@ impl<'a> Geometry<'a> {
             .collect();
         let on_surface = |(h, n): (&f32, &[i16; 3])| (0.0..=1.0).contains(h) && *n != [0; 3];
         let valid: Vec<bool> = h.par_iter().zip(&encoded).with_min_len(1 << 14).map(on_surface).collect();
-        let near = |at: usize| (-OVERSHOOT..=1.0 + OVERSHOOT).contains(&h[at]) && encoded[at] != [0; 3];
+        let range = -OVERSHOOT..=1.0 + OVERSHOOT;
+        let near = |at: usize| range.contains(&h[at]) && encoded[at] != [0; 3] && bend(h, dims, at) < BEND;
         let mut lit = valid.clone();
         ring(dims, &valid).into_iter().filter(|at| near(*at as usize)).for_each(|at| lit[at as usize] = true);
         // Nodes that are not lit take no light whatever lines bring.
@@ -323,6 +326,21 @@ impl<'a> Geometry<'a> {
             ring.iter().for_each(|&at| known[at as usize] = true);
         }
     }
+}
+
+/// How much h bends at a node: its second differences over its first ones between both neighbours, summed over the axes. 1
+/// where a plateau ends, about 0 where h goes on as before.
+fn bend(h: &[f32], dims: [usize; 3], at: usize) -> f32 {
+    let (mut first, mut second, mut step) = (0.0, 0.0, 1);
+    for n in dims {
+        if (1..n - 1).contains(&(at / step % n)) {
+            let (before, after) = (h[at - step], h[at + step]);
+            first += (after - before).abs();
+            second += (after + before - 2.0 * h[at]).abs();
+        }
+        step *= n;
+    }
+    second / first
 }
 
 fn neighbours([nx, ny, nz]: [usize; 3], at: usize, mut visit: impl FnMut(usize)) {

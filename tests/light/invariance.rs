@@ -3,15 +3,17 @@
 use crate::support::*;
 use glam::{DMat3, DVec3, Vec3};
 use isolume::bake::{Bake, BakeSettings, Engine};
+use isolume::direct::{Receiver, direct_irradiance};
 use isolume::embree::{Device, GraphTracer};
 use isolume::field::{Field, Sweep};
-use isolume::flattened::{FlattenedRay, Side};
+use isolume::flattened::{Departure, FlattenedRay, Side};
 use isolume::photon::PhotonSettings;
 use isolume::rng::{Rng, Stage};
 use isolume::scene::{Scene, Surface, cornell_box};
 use isolume::tracer::Tracer;
 use isolume::volume::{Lattice, Samples, Volume};
 use isolume::warp::sphere;
+use std::f64::consts::PI;
 
 /// Noise on n³ samples in the Cornell box; `change` sees each value last.
 fn noise(n: usize, change: impl Fn(usize, f64) -> f64) -> Scene {
@@ -228,4 +230,38 @@ fn where_the_sweep_ends_does_not_matter() {
         println!("{name} end: {:.2} % apart", 100.0 * apart);
         assert!(apart < 0.0125, "{name} end: {apart}");
     }
+}
+
+/// A coil two voxels thick on a plateau closely outside the sweep: direct light on an isosurface near its edge, against exact shadow
+/// rays. Grid points on the plateau hold what fits the light around; 23 instead of 15 % off with their own.
+#[test]
+fn a_plateau_outside_the_sweep_is_no_end_to_interpolate_from() {
+    let coil = |x: DVec3| {
+        let near = |t: f64| (x - DVec3::new(0.5 + 0.3 * t.cos(), 0.5 + 0.3 * t.sin(), 0.1 + 0.06 * t)).length_squared();
+        let d = (0..400).map(|i| near(0.03 * f64::from(i))).fold(f64::INFINITY, f64::min);
+        let h = (-d * 48.0 * 48.0 / 0.7).exp();
+        if h > 0.05 { h } else { 0.0 }
+    };
+    let field = field(lattice([49; 3], DVec3::ZERO, DVec3::ONE), 0.04, 1.0, coil);
+    let lamp = rectangle("lamp", DVec3::new(0.5, 0.5, 1.3), DVec3::Y, DVec3::X, 0.0, 1.0);
+    let scene = scene(field, grey(0.01, Side::Lower), vec![lamp]);
+    let grid = run(&scene, &BakeSettings { engine: Engine::Sweep, ..at_nodes(1) }).sides.remove(0).1;
+    let device = Device::new(1).unwrap();
+    let tracer = GraphTracer::new(&device, &scene).unwrap();
+    let mut rng = Rng::stream(7, Stage::Test, 0);
+    let (mut squares, mut light, mut count) = (0.0, 0.0, 0);
+    while count < 2000 {
+        let position = (scene.lattice().far() * DVec3::new(rng.unit(), rng.unit(), rng.unit())).as_vec3();
+        let p = position.as_dvec3();
+        let c = scene.field.value(p);
+        let Some(normal) = scene.normal(p, Side::Lower).filter(|_| (0.2..0.3).contains(&c)) else { continue };
+        #[allow(clippy::cast_possible_truncation)]
+        let receiver = Receiver { position, normal, isovalue: c as f32, departure: Departure::Surface(Side::Lower) };
+        let exact = direct_irradiance(&scene, &tracer, &receiver, 64, (1, Stage::Direct, count)).mean.y;
+        let got = grid.interpolate(scene.lattice(), p).y * PI / 0.01;
+        (squares, light, count) = (squares + (got - exact).powi(2), light + exact * exact, count + 1);
+    }
+    let error = (squares / light).sqrt();
+    println!("{:.2} %", 100.0 * error);
+    assert!(error < 0.18, "{error}");
 }
