@@ -24,8 +24,10 @@ mod grid;
 mod half;
 mod monitor;
 mod near;
+mod normals;
 mod open_share;
 mod pack;
+mod planes;
 mod points;
 mod reflect;
 mod runs;
@@ -43,8 +45,9 @@ use crate::scene::{Boundary, Scene};
 use ends::Standing;
 use flats::Flats;
 use gather::Pass;
-use grid::{Geometry, Planes, Spare};
+use grid::Geometry;
 use monitor::Monitor;
+use planes::{Light, Planes, Spare};
 use points::Points;
 use rayon::prelude::*;
 use reflect::Mirror;
@@ -209,8 +212,10 @@ pub fn sweep_resumable(
     let mut state = State::new(&stored, geometry.h.len(), replicates);
     let mut passes = saved.read(0, |bytes| state.restore(bytes, sides.len(), &mut flats)).flatten();
     if state.counts.valid == 0 {
-        state.counts.valid = geometry.valid.iter().filter(|v| **v).count() as u64;
-        state.counts.masked = geometry.valid.len() as u64 - state.counts.valid;
+        let nodes = geometry.h.len();
+        state.counts.valid =
+            (0..nodes).into_par_iter().with_min_len(1 << 14).filter(|&at| geometry.valid(at)).count() as u64;
+        state.counts.masked = nodes as u64 - state.counts.valid;
     }
     let spare = Spare::default();
     let run = Run {
@@ -231,9 +236,8 @@ pub fn sweep_resumable(
         let (indirect, complete) = run.replicate(&mut state, passes.take(), &mut flats, &progress);
         stopped = !complete;
         if complete {
-            // Planes that were blackened take memory everywhere, fresh ones only where something is lit.
-            spare.clear();
-            spare.keep(state.add(indirect, &flats, scene));
+            state.add(&indirect, &flats, scene);
+            spare.keep(indirect.into_iter().flatten());
         }
     }
     spare.clear();
@@ -241,6 +245,8 @@ pub fn sweep_resumable(
         // What there is.
         state.flats = flats.textures.iter().map(|t| t.as_ref().map(|t| t.radiance.clone())).collect();
     }
+    let lit = geometry.all_lit();
+    drop(geometry);
     if !stopped {
         saved.save(0, || state.bytes(None, &flats));
     }
@@ -252,8 +258,8 @@ pub fn sweep_resumable(
         })
     });
     let flats = flats.collect();
-    let sides = total.finish(&geometry, done);
-    Ok(SweepResult { sides, lit: geometry.lit, flats, bounces, residual, stopped, counts })
+    let sides = total.finish(&lit, done);
+    Ok(SweepResult { sides, lit, flats, bounces, residual, stopped, counts })
 }
 
 /// The sides that are swept: the stored ones, and the other one if light passes to it.
@@ -333,11 +339,13 @@ impl Run<'_> {
             }
             // Of the first one what there is.
             if complete || number == 0 {
-                self.spare.keep(state.total.add_direct(direct, self.scene));
+                self.spare.keep(state.total.add_direct(direct, self.scene).into_iter().flatten());
             }
         }
         if first < replicates {
             state.total.average_direct();
+            // Passes need fewer planes.
+            self.spare.clear();
             flats.average_direct(state.total.lit);
         }
         if !complete {
@@ -349,11 +357,11 @@ impl Run<'_> {
     /// What nodes and flats reflect before the first pass of a replicate.
     fn begin(&self, state: &State, flats: &mut Flats) -> Passes {
         let late = if self.warm(state) { LATE - 1 } else { 0 };
-        let direct = (state.total.direct.as_slice(), [1.0; 3]);
+        let direct = (Light::Half(&state.total.direct), [1.0; 3]);
         let (b, unit) = if late > 0 {
             let share = 1.0 / state.done as f32;
             flats.take(&state.flats, share);
-            self.mirror.reflect(flats, &[direct, (state.total.light.as_slice(), [share; 3])], Vec::new())
+            self.mirror.reflect(flats, &[direct, (Light::Half(&state.total.light), [share; 3])], Vec::new())
         } else {
             flats.reflect_direct();
             self.mirror.reflect(flats, &[direct], Vec::new())
@@ -435,7 +443,7 @@ impl Run<'_> {
             }
             if stopped {
                 // Half a pass is not kept, and may be as large as what is.
-                self.spare.keep(indirect.drain(..));
+                self.spare.keep(indirect.drain(..).flatten());
                 self.saved.save(0, || state.bytes(Some(&now), flats));
                 state.see(&now);
                 return (Vec::new(), false);
@@ -451,9 +459,12 @@ impl Run<'_> {
                 break;
             }
             let old = std::mem::take(&mut now.b);
-            (now.b, now.unit) =
-                self.mirror.reflect(flats, &[(state.total.direct.as_slice(), [1.0; 3]), (&indirect, scale)], old);
-            self.spare.keep(indirect.drain(..));
+            (now.b, now.unit) = self.mirror.reflect(
+                flats,
+                &[(Light::Half(&state.total.direct), [1.0; 3]), (Light::Full(&indirect), scale)],
+                old,
+            );
+            self.spare.keep(indirect.drain(..).flatten());
         }
         state.see(&now);
         (indirect, true)
@@ -465,8 +476,11 @@ impl Run<'_> {
         let sum = |plane: &Vec<f32>| -> f64 {
             let chunks: Vec<f64> = plane
                 .par_chunks(1 << 14)
-                .zip(self.geometry.valid.par_chunks(1 << 14))
-                .map(|(x, v)| x.iter().zip(v).filter(|(_, v)| **v).map(|(x, _)| f64::from(*x)).sum())
+                .enumerate()
+                .map(|(chunk, x)| {
+                    let nodes = x.iter().zip(chunk << 14..);
+                    nodes.filter(|(_, at)| self.geometry.valid(*at)).map(|(x, _)| f64::from(*x)).sum()
+                })
                 .collect();
             chunks.iter().sum()
         };

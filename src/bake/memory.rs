@@ -43,15 +43,15 @@ const CACHING: u64 = 12 + 16 + irradiance_caching::BYTES;
 const WISH: u64 = 24;
 const SORTED: u64 = 40 + 40 + 12;
 
-/// Bytes of the sweep engine per grid point (normals in two orders, h in the second, what direct light sees), per point and
-/// swept side (direct light, what lines read, one plane of a pass turned over), and per point and stored side (sums over
-/// replicates and their spread). What a pass gathers is less than its checkpoint, and gone when that is made.
-const SWEPT: u64 = 24;
-const SWEPT_SIDE: u64 = 24;
-const SUMMED_SIDE: u64 = 16;
+/// Bytes of the sweep engine per grid point (h turned over, normals, one plane of a pass turned over, bits per block), per point
+/// and swept side (direct light, what lines read, what a pass gathers), and per point and stored side (sums over replicates
+/// and their spread). Direct light takes less: 44 and what its lines see.
+const SWEPT: u64 = 13;
+const SWEPT_SIDE: u64 = 26;
+const SUMMED_SIDE: u64 = 9;
 
 /// Bytes per point and side that its checkpoint holds while a replicate is under way, besides the sums.
-const KEPT_SIDE: u64 = 20;
+const KEPT_SIDE: u64 = 14;
 
 /// Bytes per fitted point: seven vectors of conjugate gradients.
 const FITTED: u64 = 84;
@@ -274,7 +274,8 @@ impl Parts {
             ],
             Engine::Sweep => vec![
                 ("sweep", base + self.swept + flats * 4),
-                ("samples", light + self.points * (12 * 3 + 16) + beside * SAMPLE + fitting),
+                // What rays gather, and which points are lit.
+                ("samples", light + grids / 17 * 12 + self.points + beside * SAMPLE + fitting),
             ],
         };
         let export = ("export", base + grids + flats + self.export);

@@ -17,7 +17,7 @@ use crate::progress::{Clock, Progress};
 use crate::radiance::{Indirect, Sampler, sample_places};
 use crate::radiance_cache::RadianceCache;
 use crate::scene::{Scene, Surface};
-use crate::sweep::{SweptSide, sweep_resumable};
+use crate::sweep::{SweepResult, sweep_resumable};
 use crate::volume::Lattice;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
@@ -63,24 +63,22 @@ pub(super) fn light(
     lit.spend(clock, |s| &mut s.sweep);
     lit.sweep_queries = swept.counts.gather_rays + swept.counts.shadow_rays;
 
-    // What the sweep knows is also what rays from the other points gather.
-    let white: Vec<Vec<[f32; 3]>> = swept.sides.iter().map(|s| white(&swept.lit, s)).collect();
-    let nodes = [Side::Lower, Side::Higher].map(|side| {
-        let stored = swept.sides.iter().position(|s| s.side == side)?;
-        Some(widened(lattice, masks, &white[stored]))
-    });
-    let cache = RadianceCache::from_parts(nodes, swept.flats);
-
+    let SweepResult { sides: mut swept, lit: own, flats, .. } = swept;
+    swept.iter_mut().for_each(|s| whiten(&own, &mut s.irradiance));
     let clock = Clock::start();
     let tracer = GraphTracer::new(device, scene)?;
     lit.spend(clock, |s| &mut s.build);
     let clock = Clock::start();
     // Just outside the sweep, light on the point's own level set is a better end of interpolation than any fit.
-    let fitted = |o: usize| masks[o] == Mask::Filled && !swept.lit[o];
+    let fitted = |o: usize| masks[o] == Mask::Filled && !own[o];
     let beside = Beside::new(&scene.field, lattice, fitted, settings.seed);
     let near = beside_luminaires(scene, masks);
+    // What the sweep knows is what rays from these points gather.
+    let gathered = |side| swept.iter().find(|s| s.side == side && beside.len() + near.len() > 0);
+    let nodes = [Side::Lower, Side::Higher].map(|side| Some(widened(lattice, masks, &gathered(side)?.irradiance)));
+    let cache = RadianceCache::from_parts(nodes, flats);
     let mut sides = Vec::new();
-    for (s, white) in swept.sides.iter().zip(white) {
+    for s in swept {
         let stage = progress.stage("samples", (beside.len() + near.len()) as u64);
         let seed = settings.seed;
         let gather = |share: u32| Indirect::Gather(&cache, (settings.gather_rays / share).max(2));
@@ -98,8 +96,8 @@ pub(super) fn light(
         let sampled = sample_places(&sampler, near.len(), &place, Stage::UNSAVED, 0, &|n| stage.tick(n));
         stage.end()?;
         lit.count(Counts::from(&sampled));
-        let own = |o: usize| if swept.lit[o] { masks[o] } else { Mask::Empty };
-        let mut grid = swept_grid(own, outgoing(scene, white), &s.std_error);
+        let mask = |o: usize| if own[o] { masks[o] } else { Mask::Empty };
+        let mut grid = swept_grid(mask, outgoing(scene, s.irradiance), s.std_error);
         for (&o, sample) in near.iter().zip(&sampled.samples) {
             if let Some(sample) = sample {
                 grid.radiance[o] = sample.radiance.to_array();
@@ -137,10 +135,11 @@ fn beside_luminaires(scene: &Scene, masks: &[Mask]) -> Vec<usize> {
     (0..masks.len()).into_par_iter().with_min_len(1 << 12).filter(near).collect()
 }
 
-/// What a white surface would reflect at lit nodes, NaN elsewhere.
-fn white(lit: &[bool], s: &SweptSide) -> Vec<[f32; 3]> {
+/// Turns irradiance into what a white surface would reflect at lit nodes, NaN elsewhere.
+fn whiten(lit: &[bool], irradiance: &mut [[f32; 3]]) {
     let white = |e: [f32; 3]| reflected(DVec3::ONE, DVec3::from_array(e.map(f64::from))).as_vec3().to_array();
-    s.irradiance.par_iter().zip(lit).map(|(&e, &lit)| if lit { white(e) } else { [f32::NAN; 3] }).collect()
+    let nodes = irradiance.par_iter_mut().zip(lit).with_min_len(1 << 14);
+    nodes.for_each(|(e, &lit)| *e = if lit { white(*e) } else { [f32::NAN; 3] });
 }
 
 /// Unknown nodes beside known ones become their mean, so that lookups in cells at the sweep's ends find something.
@@ -170,13 +169,15 @@ fn widened(lattice: &Lattice, masks: &[Mask], nodes: &[[f32; 3]]) -> Vec<[f32; 3
 }
 
 /// A grid of the points that are not empty by `own`.
-fn swept_grid(own: impl Fn(usize) -> Mask + Sync, mut radiance: Vec<[f32; 3]>, std_error: &[f32]) -> IlluminationGrid {
-    let mask: Vec<Mask> = (0..radiance.len()).into_par_iter().map(&own).collect();
-    radiance.par_iter_mut().zip(&mask).filter(|(_, m)| **m == Mask::Empty).for_each(|(r, _)| *r = [0.0; 3]);
-    let std_error = mask
-        .par_iter()
-        .enumerate()
-        .map(|(o, &m)| if m == Mask::Empty { 0.0 } else { std_error.get(o).copied().unwrap_or(0.0) })
-        .collect();
+fn swept_grid(
+    own: impl Fn(usize) -> Mask + Sync,
+    mut radiance: Vec<[f32; 3]>,
+    mut std_error: Vec<f32>,
+) -> IlluminationGrid {
+    let mask: Vec<Mask> = (0..radiance.len()).into_par_iter().with_min_len(1 << 14).map(&own).collect();
+    // There is none of fewer than two replicates.
+    std_error.resize(mask.len(), 0.0);
+    let points = radiance.par_iter_mut().zip(&mut std_error).zip(&mask).with_min_len(1 << 14);
+    points.filter(|(_, m)| **m == Mask::Empty).for_each(|((r, e), _)| (*r, *e) = ([0.0; 3], 0.0));
     IlluminationGrid { radiance, std_error, mask }
 }

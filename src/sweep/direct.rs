@@ -4,10 +4,11 @@
 use super::blockers::Blockers;
 use super::fans::Fans;
 use super::flats::{Flats, capped};
-use super::grid::{Geometry, Planes, Spare};
+use super::grid::Geometry;
 use super::near;
 use super::open_share::OpenShare;
 use super::pack::LANES;
+use super::planes::{Planes, Spare};
 use super::points::Points;
 use super::segments::Segments;
 use super::simd::Isa;
@@ -68,7 +69,8 @@ pub(super) fn direct(
                 let begin = DVec3::new(0.0, j as f64, k as f64);
                 let start = (world - lattice.to_world(begin)).as_vec3();
                 geometry.lit_nodes(row, |i| {
-                    let normal = geometry.normal_f32(row * nx + i);
+                    // Its length falls out of Σ V g / Σ g.
+                    let normal = geometry.along_normal(row * nx + i);
                     let to = start - i as f32 * step;
                     let (r2, cos_x, cos_y) = (to.length_squared(), to.dot(normal), -to.dot(facing));
                     // A side that nobody asks for counts as facing away.

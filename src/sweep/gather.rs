@@ -1,12 +1,14 @@
 //! One pass of gather sweeps: a bounce for every node and every isovalue at once, walls included.
 
 use super::arrive;
-use super::directions::{Layout, Shear};
+use super::directions::Shear;
 use super::ends::{Ends, Standing};
 use super::flats::{Arrivals, Flats, Incoming};
-use super::grid::{Geometry, NORMAL_SCALE, Planes, Source, Spare};
+use super::grid::{Geometry, Source};
 use super::half::Half4;
+use super::normals::decode;
 use super::pack::{LANES, Light, Pack, Plan, Way};
+use super::planes::{Planes, Spare};
 use super::runs::Runs;
 use super::simd::{Isa, prefetch};
 use crate::flattened::Side;
@@ -62,11 +64,13 @@ pub(super) struct Workspace {
 struct Family<'a> {
     plan: &'a Plan,
     source: Source<'a>,
+    /// In the memory order of its lines.
+    normals: &'a [u32],
     ends: &'a Ends,
     flats: &'a Flats,
     walls: arrive::Walls<'a>,
     way: Way,
-    /// The direction times what |ω·N| weighs, over N's units.
+    /// The direction times what |ω·N| weighs.
     omega: [f32; 3],
 }
 
@@ -93,16 +97,19 @@ impl Pass<'_> {
         // Darkness is the same in both orders.
         for (transposed, some) in [(true, &lines[split..]), (false, &lines[..split])] {
             let Some(any) = some.first() else { continue };
+            let turned = transposed.then(|| self.geometry.transposed_normals(self.spare));
+            let normals = turned.as_ref().unwrap_or(&self.geometry.normals);
             let rows = node_rows(&mut e, any.layout.dims[0]);
             for shear in some {
                 complete = complete && tick();
                 if complete {
                     let walls = (flats, &mut *incoming, arrivals);
-                    arrivals = self.family(side, shear, lines.len(), (b, scale), &rows, walls);
+                    arrivals = self.family((side, shear, lines.len()), normals, (b, scale), &rows, walls);
                 }
             }
             drop(rows);
-            if transposed {
+            if let Some(turned) = turned {
+                self.spare.keep_numbers(turned);
                 e = self.geometry.untransposed(e, self.spare);
             }
         }
@@ -114,20 +121,20 @@ impl Pass<'_> {
     /// Divides by the sum of cosines that the directions gave each node's normal, which is π only in the mean: equal
     /// radiance from everywhere gives its irradiance exactly.
     fn normalise(&self, lines: &[Shear], e: &mut Planes) {
-        let n = self.geometry.normals(&Layout::new(self.geometry.dims, 2));
         let omega: Vec<[f32; 3]> = lines.iter().map(|s| s.omega.as_vec3().to_array()).collect();
-        // Σ|ω·N| · 4π/(2·lines) over N's units, against π.
-        let half = 0.5 * lines.len() as f32 * NORMAL_SCALE;
+        // Σ|ω·N| · 4π/(2·lines) against π; N's length falls out.
+        let half = 0.5 * lines.len() as f32;
         let [e0, e1, e2] = e;
         (e0.par_chunks_mut(COSINES), e1.par_chunks_mut(COSINES), e2.par_chunks_mut(COSINES))
             .into_par_iter()
             .enumerate()
             .for_each(|(row, (e0, e1, e2))| {
-                if !self.geometry.lit[row * COSINES..][..e0.len()].contains(&true) {
+                let normals = &self.geometry.normals[row * COSINES..][..e0.len()];
+                if normals.iter().all(|n| *n == 0) {
                     return;
                 }
                 let mut sum = [0f32; COSINES];
-                self.isa.cosines(&omega, n.each_ref().map(|n| &n[row * COSINES..][..e0.len()]), &mut sum);
+                self.isa.cosines(&omega, normals, &mut sum);
                 // What goes on linearly beyond the last lines may fall below 0.
                 for e in [e0, e1, e2] {
                     let scaled = |(e, s): (&mut f32, &f32)| *e = if *s > 0.0 { (*e * half / s).max(0.0) } else { 0.0 };
@@ -139,9 +146,8 @@ impl Pass<'_> {
     /// All lines of one family, both ways. `before` is what the last family brought to walls; returns what this one does.
     fn family(
         &self,
-        side: Side,
-        shear: &Shear,
-        lines: usize,
+        (side, shear, lines): (Side, &Shear, usize),
+        normals: &[u32],
         (b, scale): (&[Half4], f32),
         rows: &Rows,
         (flats, incoming, before): (&Flats, &mut Incoming, Vec<Arrivals>),
@@ -150,10 +156,11 @@ impl Pass<'_> {
         let plan = Plan::new(*shear, sign);
         let ends = Ends::new(self.scene, flats, shear, self.standing);
         let walls = arrive::Walls::new(self, &plan, &ends, flats, side, lines, 1.0 / scale);
-        let share = 4.0 * std::f64::consts::PI / (2 * lines) as f64 / f64::from(NORMAL_SCALE * scale);
+        let share = 4.0 * std::f64::consts::PI / (2 * lines) as f64 / f64::from(scale);
         let family = Family {
             plan: &plan,
             source: self.geometry.source(&shear.layout, side, b),
+            normals,
             ends: &ends,
             flats,
             way: Way { strict: side == Side::Higher, sign },
@@ -267,7 +274,7 @@ impl Pass<'_> {
         let layout = &family.plan.shear.layout;
         let at = k * layout.stride[1] + j * layout.stride[0];
         rows[at / layout.dims[0]].lock().expect("no thread panics").iter().for_each(|e| prefetch(e));
-        self.geometry.normals(layout).iter().for_each(|n| prefetch(&n[at..][..layout.dims[0]]));
+        prefetch(&family.normals[at..][..layout.dims[0]]);
     }
 
     /// Adds what a row of lines and the one before it brought to a row of nodes: each node takes its four nearest lines by
@@ -284,8 +291,7 @@ impl Pass<'_> {
         let light: [[&[f32]; 3]; 2] =
             light.map(|light| std::array::from_fn(|c| &light[c][k * plan.width..][..plan.width]));
         let at = k * layout.stride[1] + j * layout.stride[0];
-        let normals = self.geometry.normals(layout);
-        let n = [0, 1, 2].map(|a| &normals[a][at..][..nu]);
+        let n = &family.normals[at..][..nu];
         let lit = self.geometry.lit_blocks(layout);
         let mut row = rows[at / nu].lock().expect("no thread panics");
         let [e0, e1, e2] = &mut *row;
@@ -316,18 +322,25 @@ fn node_rows(e: &mut Planes, nu: usize) -> Rows<'_> {
     rows.map(|((e0, e1), e2)| Mutex::new([e0, e1, e2])).collect()
 }
 
+/// |ω·N|, times N's length.
+#[inline(always)]
+fn cosine(omega: [f32; 3], normal: u32) -> f32 {
+    let [x, y, z] = decode(normal);
+    (omega[0] * x + omega[1] * y + omega[2] * z).abs()
+}
+
 /// Nodes a..b of a row. `line0` is the line (in `light`) just beyond node 0, −1 of which is missing.
 #[inline(always)]
 pub(super) fn accumulate_row(
     e: [&mut [f32]; 3],
-    n: [&[i16]; 3],
+    n: &[u32],
     omega: [f32; 3],
     light: [[&[f32]; 3]; 2],
     line0: usize,
     [fu, fv]: [f32; 2],
     (a, b): (usize, usize),
 ) {
-    let nu = n[0].len();
+    let nu = n.len();
     // Ω's faces: the light goes on as between the last two columns of lines; of a single one it is the same everywhere.
     let faces = if nu > 2 {
         [(0, line0, line0 + 1, -fu), (nu - 1, line0 + nu - 2, line0 + nu - 3, fu - 1.0)]
@@ -336,8 +349,7 @@ pub(super) fn accumulate_row(
     };
     for (i, last, inner, f) in faces {
         if a <= i && i < b {
-            let cos = omega[0] * f32::from(n[0][i]) + omega[1] * f32::from(n[1][i]) + omega[2] * f32::from(n[2][i]);
-            let cos = cos.abs();
+            let cos = cosine(omega, n[i]);
             for c in 0..3 {
                 let [near, far] = [0, 1].map(|r| (1.0 - f) * light[r][c][last] + f * light[r][c][inner]);
                 e[c][i] += cos * ((1.0 - fv) * near + fv * far);
@@ -350,14 +362,13 @@ pub(super) fn accumulate_row(
     }
     let w = [(1.0 - fv) * (1.0 - fu), (1.0 - fv) * fu, fv * (1.0 - fu), fv * fu];
     let len = b - a;
-    let n = n.map(|n| &n[a..b]);
+    let n = &n[a..b];
     let [e0, e1, e2] = e;
     let e = [&mut e0[a..b], &mut e1[a..b], &mut e2[a..b]];
     let lines = light.map(|row| row.map(|c| (&c[line0 + a..][..len], &c[line0 + a - 1..][..len])));
     let [near, far] = lines;
     for i in 0..len {
-        let cos = omega[0] * f32::from(n[0][i]) + omega[1] * f32::from(n[1][i]) + omega[2] * f32::from(n[2][i]);
-        let cos = cos.abs();
+        let cos = cosine(omega, n[i]);
         for c in 0..3 {
             e[c][i] += cos * ((w[0] * near[c].0[i] + w[1] * near[c].1[i]) + (w[2] * far[c].0[i] + w[3] * far[c].1[i]));
         }
@@ -369,10 +380,11 @@ pub(super) const COSINES: usize = 256;
 
 /// Σ|ω·N| over directions, of up to [`COSINES`] nodes with normals `n`.
 #[inline(always)]
-pub(super) fn sum_cosines(omega: &[[f32; 3]], n: [&[i16]; 3], sum: &mut [f32; COSINES]) {
+pub(super) fn sum_cosines(omega: &[[f32; 3]], n: &[u32], sum: &mut [f32; COSINES]) {
     let mut normal = [[0f32; COSINES]; 3];
-    for (to, from) in normal.iter_mut().zip(n) {
-        to.iter_mut().zip(from).for_each(|(o, &x)| *o = f32::from(x));
+    for i in 0..n.len() {
+        let [x, y, z] = decode(n[i]);
+        (normal[0][i], normal[1][i], normal[2][i]) = (x, y, z);
     }
     for w in omega {
         for i in 0..COSINES {

@@ -1,72 +1,30 @@
-//! The lattice's share of the sweep: planes of normals, radiance and irradiance, their transposition, and the filling
-//! of nodes without a surface.
+//! The lattice's share of the sweep: h and normals as lines read them, which nodes are lit, and the filling of those without
+//! a surface.
 
 use super::directions::Layout;
 use super::half::{Half4, decode, encode};
+use super::normals;
+use super::planes::{Planes, Spare, transpose, transposed};
 use crate::field::Field;
 use crate::flattened::Side;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
-use std::sync::Mutex;
-
-/// Normals are stored in units of 1/32767.
-pub(super) const NORMAL_SCALE: f32 = 32767.0;
 
 /// Nodes this far outside the sweep, in its units, are still lit if a neighbour is in it,
 const OVERSHOOT: f32 = 0.25;
 /// and if h bends less than this there: level sets on a plateau beside a steep edge are dark, and no end to interpolate from.
 const BEND: f32 = 0.8;
 
-/// Red, green and blue, a plane each, so that neighbouring lines load neighbouring numbers.
-pub(super) type Planes = [Vec<f32>; 3];
-
-/// Planes to be used again: taking memory from the system and giving it back costs more than a pass over it, and memory
-/// that is read before it is written twice as much, with all threads waiting.
-#[derive(Default)]
-pub(super) struct Spare {
-    planes: Mutex<Vec<Vec<f32>>>,
-}
-
-impl Spare {
-    /// Black planes of `n` nodes.
-    pub(super) fn black(&self, n: usize) -> Planes {
-        std::array::from_fn(|_| self.plane(n))
-    }
-
-    /// A black plane of `n` nodes.
-    fn plane(&self, n: usize) -> Vec<f32> {
-        match self.planes.lock().expect("no thread panics").pop() {
-            Some(mut plane) if plane.len() == n => {
-                plane.par_chunks_mut(1 << 14).for_each(|chunk| chunk.fill(0.0));
-                plane
-            }
-            _ => (0..n).into_par_iter().with_min_len(1 << 14).map(|_| 0.0).collect(),
-        }
-    }
-
-    /// Takes planes that are no longer needed.
-    pub(super) fn keep(&self, planes: impl IntoIterator<Item = Planes>) {
-        self.planes.lock().expect("no thread panics").extend(planes.into_iter().flatten());
-    }
-
-    /// Gives all back to the system.
-    pub(super) fn clear(&self) {
-        self.planes.lock().expect("no thread panics").clear();
-    }
-}
-
-/// What every pass reads: h and the receiver normals towards the lower side, in both memory orders.
+/// What every pass reads: h in both memory orders, and the receiver normals towards the lower side.
+///
+/// Nodes are *lit* that hold a surface of the sweep, and those just outside the sweep, whose own light is a better neighbour to
+/// interpolate with than a copy.
 pub(super) struct Geometry<'a> {
     pub dims: [usize; 3],
     pub h: &'a [f32],
     h_transposed: Vec<f32>,
-    normals: [Vec<i16>; 3],
-    normals_transposed: [Vec<i16>; 3],
-    /// Nodes that hold a surface of the sweep.
-    pub valid: Vec<bool>,
-    /// Nodes that are lit: the valid ones, and those just outside the sweep, whose own light is a better neighbour to
-    /// interpolate with than a copy.
-    pub lit: Vec<bool>,
+    /// Of lit nodes; the others have none.
+    pub normals: Vec<u32>,
     rings: Vec<Vec<u32>>,
     /// Per memory order, the blocks of lit nodes.
     lit_blocks: [Blocks; 2],
@@ -162,31 +120,19 @@ impl<'a> Geometry<'a> {
     #[allow(clippy::cast_possible_truncation, reason = "a unit vector in 16 bits")]
     pub(super) fn new(field: &'a Field) -> Self {
         let (dims, h) = (field.lattice().dims(), field.samples());
-        let encoded: Vec<[i16; 3]> = (0..h.len())
+        let mut normals: Vec<u32> = (0..h.len())
             .into_par_iter()
             .with_min_len(1 << 12)
-            .map(|at| {
-                let g = -field.node_gradient(field.lattice().ijk(at));
-                let scale = g.abs().max_element();
-                if !(scale > 0.0 && scale.is_finite()) {
-                    return [0; 3];
-                }
-                ((g / scale).normalize() * f64::from(NORMAL_SCALE)).to_array().map(|x| x.round() as i16)
-            })
+            .map(|at| normals::encode(-field.node_gradient(field.lattice().ijk(at))))
             .collect();
-        let on_surface = |(h, n): (&f32, &[i16; 3])| (0.0..=1.0).contains(h) && *n != [0; 3];
-        let valid: Vec<bool> = h.par_iter().zip(&encoded).with_min_len(1 << 14).map(on_surface).collect();
+        let on_surface = |(h, n): (&f32, &u32)| (0.0..=1.0).contains(h) && *n != 0;
+        let mut lit: Vec<bool> = h.par_iter().zip(&normals).with_min_len(1 << 14).map(on_surface).collect();
         let range = -OVERSHOOT..=1.0 + OVERSHOOT;
-        let near = |at: usize| range.contains(&h[at]) && encoded[at] != [0; 3] && bend(h, dims, at) < BEND;
-        let mut lit = valid.clone();
-        ring(dims, &valid).into_iter().filter(|at| near(*at as usize)).for_each(|at| lit[at as usize] = true);
+        let near = |at: usize| range.contains(&h[at]) && normals[at] != 0 && bend(h, dims, at) < BEND;
+        let near: Vec<u32> = ring(dims, &lit).into_iter().filter(|at| near(*at as usize)).collect();
+        near.into_iter().for_each(|at| lit[at as usize] = true);
         // Nodes that are not lit take no light whatever lines bring.
-        let normals: [Vec<i16>; 3] = std::array::from_fn(|a| {
-            let nodes = encoded.par_iter().zip(&lit).with_min_len(1 << 14);
-            nodes.map(|(n, lit)| if *lit { n[a] } else { 0 }).collect()
-        });
-        drop(encoded);
-        let normals_transposed = std::array::from_fn(|a| transposed(&normals[a], dims));
+        normals.par_iter_mut().zip(&lit).with_min_len(1 << 14).filter(|(_, lit)| !**lit).for_each(|(n, _)| *n = 0);
         let rings = rings(dims, &lit);
         let h_transposed = transposed(h, dims);
         let [nx, ny, nz] = dims;
@@ -209,7 +155,31 @@ impl<'a> Geometry<'a> {
                 Blocks::new(ny, nz * nx, fine(ny), |at| reaches(h_transposed[at])).joined(nz),
             ]
         });
-        Self { dims, h, h_transposed, normals, normals_transposed, valid, lit, rings, lit_blocks, awake }
+        Self { dims, h, h_transposed, normals, rings, lit_blocks, awake }
+    }
+
+    /// Whether a node is lit.
+    #[inline(always)]
+    pub(super) fn lit(&self, at: usize) -> bool {
+        self.normals[at] != 0
+    }
+
+    /// Whether a node holds a surface of the sweep.
+    #[inline(always)]
+    pub(super) fn valid(&self, at: usize) -> bool {
+        self.lit(at) && (0.0..=1.0).contains(&self.h[at])
+    }
+
+    /// [`Self::lit`] of all nodes.
+    pub(super) fn all_lit(&self) -> Vec<bool> {
+        self.normals.par_iter().with_min_len(1 << 14).map(|n| *n != 0).collect()
+    }
+
+    /// The normals in y, z, x order.
+    pub(super) fn transposed_normals(&self, spare: &Spare) -> Vec<u32> {
+        let mut to = spare.numbers(self.normals.len());
+        transpose(&self.normals, self.dims, |row| self.lit_blocks[0].rows[row] != 0, &mut to);
+        to
     }
 
     /// What lines of `side` read.
@@ -228,7 +198,7 @@ impl<'a> Geometry<'a> {
         planes.map(|from| {
             let mut to = spare.plane(from.len());
             self.untranspose(&from, &mut to);
-            spare.planes.lock().expect("no thread panics").push(from);
+            spare.keep([from]);
             to
         })
     }
@@ -264,14 +234,15 @@ impl<'a> Geometry<'a> {
             let a = bits.trailing_zeros() as usize * blocks.size;
             bits &= bits - 1;
             let b = (a + blocks.size).min(nx);
-            self.lit[row * nx + a..row * nx + b].iter().zip(a..b).filter(|(lit, _)| **lit).for_each(|(_, i)| visit(i));
+            let nodes = self.normals[row * nx + a..row * nx + b].iter().zip(a..b);
+            nodes.filter(|(normal, _)| **normal != 0).for_each(|(_, i)| visit(i));
         }
     }
 
-    /// The normal of a lit node towards the lower side, a unit vector to 3·10⁻⁵.
+    /// A vector of any length along the normal of a lit node towards the lower side.
     #[inline(always)]
-    pub(super) fn normal_f32(&self, at: usize) -> Vec3 {
-        Vec3::from_array(std::array::from_fn(|a| f32::from(self.normals[a][at]))) / NORMAL_SCALE
+    pub(super) fn along_normal(&self, at: usize) -> Vec3 {
+        Vec3::from_array(normals::decode(self.normals[at]))
     }
 
     /// The lit nodes of rows in the memory order of `layout`.
@@ -284,23 +255,15 @@ impl<'a> Geometry<'a> {
         if layout.transposed { &self.h_transposed } else { self.h }
     }
 
-    /// Normals in the memory order of `layout`.
-    pub(super) fn normals(&self, layout: &Layout) -> &[Vec<i16>; 3] {
-        if layout.transposed { &self.normals_transposed } else { &self.normals }
-    }
-
     /// The unit normal of a node towards the lower side; `None` where none is lit.
     pub(super) fn normal(&self, at: usize) -> Option<DVec3> {
-        if !self.lit[at] {
-            return None;
-        }
-        DVec3::from_array(std::array::from_fn(|a| f64::from(self.normals[a][at]))).try_normalize()
+        self.along_normal(at).as_dvec3().try_normalize()
     }
 
     /// Gives nodes without a surface the mean of their neighbours that have one (or were filled before), so that
     /// interpolation near the sweep's ends meets no black.
     pub(super) fn fill(&self, b: &mut [Half4]) {
-        let mut known = self.lit.clone();
+        let mut known = self.all_lit();
         let [nx, ny, nz] = self.dims;
         for ring in &self.rings {
             let known_before = &known;
@@ -388,32 +351,6 @@ fn rings(dims: [usize; 3], lit: &[bool]) -> Vec<Vec<u32>> {
         .collect()
 }
 
-/// The greatest of numbers that are not negative.
-pub(super) fn greatest(plane: &[f32]) -> f32 {
-    // Their bits compare as they do, and integers in vectors.
-    let most = |x: &[f32]| x.iter().fold(0, |m, x| x.to_bits().max(m));
-    f32::from_bits(plane.par_chunks(1 << 14).map(most).max().unwrap_or(0))
-}
-
-/// Columns of x are moved this many at a time: a cache line of f32.
-const STRIP: usize = 16;
-
-/// x, y, z order to y, z, x.
-pub(super) fn transposed<T: Copy + Default + Send + Sync>(from: &[T], [nx, ny, nz]: [usize; 3]) -> Vec<T> {
-    let mut to = vec![T::default(); from.len()];
-    to.par_chunks_mut(STRIP * ny * nz).enumerate().for_each(|(strip, out)| {
-        let x0 = strip * STRIP;
-        let width = STRIP.min(nx - x0);
-        for (row, line) in from.chunks_exact(nx).enumerate() {
-            // Row (y, z) in memory order has number z·ny + y in both orders.
-            for (x, &value) in line[x0..x0 + width].iter().enumerate() {
-                out[x * ny * nz + row] = value;
-            }
-        }
-    });
-    to
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -431,15 +368,14 @@ mod tests {
         let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
         let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
         let geometry = Geometry::new(&field);
-        let from: Vec<f32> =
-            geometry.lit.iter().enumerate().map(|(o, lit)| if *lit { 1.0 + o as f32 } else { 0.0 }).collect();
-        assert!(geometry.lit.iter().filter(|lit| **lit).count() > 200);
+        let from: Vec<f32> = (0..lattice.len()).map(|o| if geometry.lit(o) { 1.0 + o as f32 } else { 0.0 }).collect();
+        assert!(from.iter().filter(|x| **x != 0.0).count() > 200);
         let to = transposed(&from, dims);
         // (x, y, z) = (2, 3, 4).
         assert_eq!(to[(2 * 11 + 4) * 9 + 3], from[(4 * 9 + 3) * 67 + 2]);
         let spare = Spare::default();
         // What a plane held before is forgotten.
-        spare.keep([std::array::from_fn(|_| vec![3.0; from.len()])]);
+        spare.keep(std::array::from_fn::<_, 3, _>(|_| vec![3.0; from.len()]));
         let got = geometry.untransposed(std::array::from_fn(|_| to.clone()), &spare);
         got.iter().for_each(|plane| assert_eq!(plane, &from));
     }

@@ -2,13 +2,13 @@
 
 use super::ends::{self, Standing};
 use super::flats::Flats;
-use super::grid::{self, Geometry, Planes};
+use super::grid::Geometry;
 use super::half::{self, Half4};
+use super::planes::Light;
 use crate::polygon::LocalPolygon;
 use crate::scene::Scene;
 use glam::DVec3;
 use rayon::prelude::*;
-use std::borrow::Cow;
 
 /// What a line reads at a hit is one of the four nodes around it on the nearer slice, drawn with bilinear weights. Over all places in
 /// a cell linear interpolation exceeds E by E″/12 along both axes of the slice, and the nearest slice falls short by E″/24; with every
@@ -22,9 +22,7 @@ const SLIT: f64 = 0.25;
 pub(super) struct Mirror<'a> {
     scene: &'a Scene,
     geometry: &'a Geometry<'a>,
-    /// Nodes with light of their own to reflect.
-    shown: Cow<'a, [bool]>,
-    /// Nodes closely behind a luminaire, and the node in front of it each shows instead.
+    /// Nodes closely behind a luminaire, in rising order, and the node in front of it each shows instead.
     hidden: Vec<(usize, usize)>,
     /// Luminaires that hide some.
     hiding: Vec<u32>,
@@ -41,11 +39,18 @@ impl<'a> Mirror<'a> {
             }
             hidden.extend(nodes);
         }
-        let mut shown = Cow::Borrowed(geometry.lit.as_slice());
-        for &(node, _) in &hidden {
-            shown.to_mut()[node] = false;
-        }
-        Self { scene, geometry, shown, hidden, hiding }
+        hidden.sort_unstable();
+        Self { scene, geometry, hidden, hiding }
+    }
+
+    /// Which nodes of a row along x have light of their own to reflect: 1, the others 0.
+    fn shown(&self, row: usize, to: &mut Vec<f32>) {
+        let nx = self.geometry.dims[0];
+        let nodes = row * nx..(row + 1) * nx;
+        to.clear();
+        to.extend(self.geometry.normals[nodes.clone()].iter().map(|n| if *n != 0 { 1.0 } else { 0.0 }));
+        let first = self.hidden.partition_point(|h| h.0 < nodes.start);
+        self.hidden[first..].iter().take_while(|h| h.0 < nodes.end).for_each(|h| to[h.0 - nodes.start] = 0.0);
     }
 
     /// Where polygons stand.
@@ -66,7 +71,7 @@ impl<'a> Mirror<'a> {
     pub(super) fn reflect(
         &self,
         flats: &mut Flats,
-        light: &[(&[Planes], [f32; 3])],
+        light: &[(Light, [f32; 3])],
         old: Vec<Vec<Half4>>,
     ) -> (Vec<Vec<Half4>>, f32) {
         let surface = &self.scene.surface;
@@ -80,54 +85,60 @@ impl<'a> Mirror<'a> {
         });
         let emission = surface.emission.as_vec3().to_array();
         let mut most = flats.greatest();
-        let sides = light[0].0.len();
+        let sides = light[0].0.sides();
         for s in 0..sides {
             for c in 0..3 {
-                let e: f32 = light.iter().map(|(planes, scale)| scale[c] * grid::greatest(&planes[s][c])).sum();
+                let e: f32 = light.iter().map(|(light, scale)| scale[c] * light.greatest(s, c)).sum();
                 most = most.max(emission[c] + greatest[c] * e * (1.0 + 6.0 * SHARPENING));
             }
         }
         let unit = half::scale(most);
         flats.pack(unit);
         let [nx, ny, nz] = self.geometry.dims;
+        let n = nx * ny * nz;
         let mut old = old.into_iter();
         let b = (0..sides).map(|s| {
-            let n = light[0].0[s][0].len();
             let mut b = old.next().unwrap_or_else(|| vec![[0; 4]; n]);
             b.par_chunks_mut(nx).enumerate().with_max_len(64).for_each_init(Rows::default, |rows, (row, b)| {
-                let shown = &self.shown[row * nx..][..nx];
-                if !shown.contains(&true) {
-                    b.fill([0; 4]);
-                    return;
-                }
                 let (j, k) = (row % ny, row / ny);
                 let beside = [
+                    Some(row),
                     (j > 0).then(|| row - 1),
                     (j + 1 < ny).then_some(row + 1),
                     (k > 0).then(|| row - ny),
                     (k + 1 < nz).then_some(row + ny),
                 ];
+                let Rows { shown, light: rows, laplacian } = rows;
+                self.shown(row, &mut shown[0]);
+                if !shown[0].contains(&1.0) {
+                    b.fill([0; 4]);
+                    return;
+                }
+                for (shown, row) in shown.iter_mut().zip(beside).skip(1) {
+                    match row {
+                        Some(row) => self.shown(row, shown),
+                        None => shown.clear(),
+                    }
+                }
                 for c in 0..3 {
-                    // A second set that is not there counts nothing.
-                    let set = |n: usize| light.get(n).map(|(planes, scale)| (&planes[s][c], scale[c]));
-                    let (first, f) = set(0).expect("at least one set of light");
-                    let (second, g) = set(1).unwrap_or((first, 0.0));
-                    let read = |row: usize, to: &mut Vec<f32>| {
-                        let range = row * nx..(row + 1) * nx;
+                    for (to, row) in rows.iter_mut().zip(beside) {
                         to.clear();
-                        to.extend(first[range.clone()].iter().zip(&second[range]).map(|(a, b)| f * a + g * b));
-                    };
-                    rows.sharpen(row, beside, &self.shown, read);
+                        if let Some(row) = row {
+                            to.resize(nx, 0.0);
+                            light.iter().for_each(|(light, scale)| light.add((s, c), scale[c], row * nx, to));
+                        }
+                    }
+                    sharpen(rows, shown, laplacian);
                     let (le, rho) = (unit * emission[c], unit * greatest[c]);
-                    let nodes = b.iter_mut().zip(&rows.sharp).zip(shown);
+                    let nodes = b.iter_mut().zip(&rows[0]).zip(&shown[0]);
                     if let Some(by_node) = &by_node {
                         for (((b, e), shown), rho) in nodes.zip(&by_node[row * nx..]) {
-                            b[c] = half::encode(if *shown { le + unit * rho[c] * e } else { 0.0 });
+                            b[c] = half::encode(shown * (le + unit * rho[c] * e));
                         }
                         continue;
                     }
                     for ((b, e), shown) in nodes {
-                        b[c] = half::encode(if *shown { le + rho * e } else { 0.0 });
+                        b[c] = half::encode(shown * (le + rho * e));
                     }
                 }
             });
@@ -141,42 +152,35 @@ impl<'a> Mirror<'a> {
     }
 }
 
+/// A row of nodes and the four beside it, which are empty where there is none.
+type Cross = [Vec<f32>; 5];
+
 /// Rows of nodes at work.
 #[derive(Default)]
 struct Rows {
-    row: Vec<f32>,
-    other: Vec<f32>,
-    /// Σ over neighbours that are shown of their difference.
+    shown: Cross,
+    light: Cross,
     laplacian: Vec<f32>,
-    sharp: Vec<f32>,
 }
 
-impl Rows {
-    /// Sharpens a row of irradiance, which `read` reads, against the rows `beside` it.
-    #[inline(always)]
-    fn sharpen(&mut self, row: usize, beside: [Option<usize>; 4], shown: &[bool], read: impl Fn(usize, &mut Vec<f32>)) {
-        let Self { row: here, other, laplacian, sharp } = self;
-        read(row, here);
-        let nx = here.len();
-        laplacian.clear();
-        laplacian.resize(nx, 0.0);
-        let count = |shown: bool| if shown { 1.0 } else { 0.0 };
-        let is = &shown[row * nx..][..nx];
-        for i in 1..nx {
-            let d = here[i] - here[i - 1];
-            laplacian[i - 1] += count(is[i]) * d;
-            laplacian[i] -= count(is[i - 1]) * d;
-        }
-        for row in beside.into_iter().flatten() {
-            read(row, other);
-            let is = &shown[row * nx..][..nx];
-            for (((sum, e), here), is) in laplacian.iter_mut().zip(&*other).zip(&*here).zip(is) {
-                *sum += count(*is) * (e - here);
-            }
-        }
-        sharp.clear();
-        sharp.extend(here.iter().zip(&*laplacian).map(|(e, l)| (e - SHARPENING * l).max(0.0)));
+/// Sharpens the first row of irradiance, against its neighbours that are shown.
+#[inline(always)]
+fn sharpen(light: &mut Cross, shown: &Cross, laplacian: &mut Vec<f32>) {
+    let ([here, beside @ ..], [is, is_beside @ ..]) = (light, shown);
+    let nx = here.len();
+    laplacian.clear();
+    laplacian.resize(nx, 0.0);
+    for i in 1..nx {
+        let d = here[i] - here[i - 1];
+        laplacian[i - 1] += is[i] * d;
+        laplacian[i] -= is[i - 1] * d;
     }
+    for (other, is) in beside.iter().zip(is_beside) {
+        for (((sum, e), here), is) in laplacian.iter_mut().zip(other).zip(&*here).zip(is) {
+            *sum += is * (e - here);
+        }
+    }
+    here.iter_mut().zip(laplacian).for_each(|(e, l)| *e = (*e - SHARPENING * *l).max(0.0));
 }
 
 /// Nodes less than [`SLIT`] voxels behind luminaire `number`, or in its plane, and the nodes in front of it.
@@ -230,18 +234,17 @@ mod tests {
         };
         let place = |o: usize| DVec3::new((o % n) as f64, (o / n % n) as f64, (o / n / n) as f64);
         let field: Vec<f32> = (0..n * n * n).map(|o| at(place(o)) as f32).collect();
-        let mut rows = Rows::default();
-        let shown = vec![true; n * n * n];
+        let shown: Cross = std::array::from_fn(|_| vec![1.0; n]);
         let sharp: Vec<f32> = (0..n * n)
             .flat_map(|row| {
                 let (j, k) = (row % n, row / n);
                 let inside = (1..n - 1).contains(&j) && (1..n - 1).contains(&k);
-                let beside = if inside { [row - 1, row + 1, row - n, row + n].map(Some) } else { [None; 4] };
-                rows.sharpen(row, beside, &shown, |row, to| {
-                    to.clear();
-                    to.extend_from_slice(&field[row * n..][..n]);
-                });
-                rows.sharp.clone()
+                let read = |row: usize| field[row * n..][..n].to_vec();
+                let mut light = [row, row - row.min(1), row + 1, row - row.min(n), row + n]
+                    .map(|row| if inside { read(row) } else { Vec::new() });
+                light[0] = read(row);
+                sharpen(&mut light, &shown, &mut Vec::new());
+                light[0].clone()
             })
             .collect();
         let mut rng = Rng::stream(1, Stage::Test, 0);
@@ -264,14 +267,15 @@ mod tests {
     fn even_light_is_not_sharpened() {
         let shown: Vec<bool> = (0..40).map(|i| i % 7 != 3).collect();
         let light: Vec<f32> = shown.iter().map(|shown| if *shown { 0.7 } else { 0.0 }).collect();
-        let mut rows = Rows::default();
+        let rows = |x: &[f32], row: usize| -> Cross {
+            let read = |row: Option<usize>| row.filter(|r| *r < 4).map_or(Vec::new(), |r| x[10 * r..][..10].to_vec());
+            [read(Some(row)), read(row.checked_sub(1)), read(Some(row + 1)), Vec::new(), Vec::new()]
+        };
+        let is: Vec<f32> = shown.iter().map(|shown| f32::from(u8::from(*shown))).collect();
         for row in 0..4 {
-            let beside = [(row > 0).then(|| row - 1), (row < 3).then_some(row + 1), None, None];
-            rows.sharpen(row, beside, &shown, |row, to| {
-                to.clear();
-                to.extend_from_slice(&light[10 * row..][..10]);
-            });
-            for (sharp, _) in rows.sharp.iter().zip(&shown[10 * row..]).filter(|x| *x.1) {
+            let mut sharp = rows(&light, row);
+            sharpen(&mut sharp, &rows(&is, row), &mut Vec::new());
+            for (sharp, _) in sharp[0].iter().zip(&shown[10 * row..]).filter(|x| *x.1) {
                 assert_eq!(*sharp, 0.7);
             }
         }

@@ -95,9 +95,9 @@ impl Isa {
 
     dispatch!(read, Pack::read, (pack: &mut Pack, plan: &Plan, source: &Source, first: isize, q: isize) -> bool);
     dispatch!(end, Pack::end, (pack: &mut Pack, plan: &Plan, ends: &Ends, flats: &Flats, first: isize, q: isize));
-    dispatch!(cosines, sum_cosines, (omega: &[[f32; 3]], n: [&[i16]; 3], sum: &mut [f32; COSINES]));
+    dispatch!(cosines, sum_cosines, (omega: &[[f32; 3]], n: &[u32], sum: &mut [f32; COSINES]));
     dispatch!(accumulate, accumulate_row, (
-        e: [&mut [f32]; 3], n: [&[i16]; 3], omega: [f32; 3], light: [[&[f32]; 3]; 2], line0: usize,
+        e: [&mut [f32]; 3], n: &[u32], omega: [f32; 3], light: [[&[f32]; 3]; 2], line0: usize,
         f: [f32; 2], range: (usize, usize)
     ));
 

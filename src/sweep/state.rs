@@ -2,12 +2,13 @@
 
 use super::SweepCounts;
 use super::flats::Flats;
-use super::grid::Planes;
 use super::half::Half4;
 use super::monitor::Monitor;
-use super::totals::{STRIDE, Totals};
+use super::planes::{HalfPlanes, Planes};
+use super::totals::{Totals, stride};
 use crate::flattened::Side;
 use crate::scene::Scene;
+use ::half::bf16;
 
 /// What the finished replicates of a sweep gave.
 pub(super) struct State {
@@ -47,9 +48,9 @@ impl State {
         }
     }
 
-    /// Adds the indirect light of a replicate and what it left on the flats. Returns the planes that are free.
-    pub(super) fn add(&mut self, indirect: Vec<Planes>, flats: &Flats, scene: &Scene) -> Vec<Planes> {
-        let spare = self.total.add(indirect, scene);
+    /// Adds the indirect light of a replicate and what it left on the flats.
+    pub(super) fn add(&mut self, indirect: &[Planes], flats: &Flats, scene: &Scene) {
+        self.total.add(indirect, scene);
         let radiance = || flats.textures.iter().map(|t| t.as_ref().map(|t| &t.radiance));
         if self.done == 0 {
             self.flats = radiance().map(Option::<&Vec<f32>>::cloned).collect();
@@ -61,7 +62,6 @@ impl State {
             }
         }
         self.done += 1;
-        spare
     }
 
     /// Takes note of how far a replicate came.
@@ -80,12 +80,11 @@ impl State {
 
     /// Everything as bytes, with the passes of a replicate that is under way.
     pub(super) fn bytes(&self, passes: Option<&Passes>, flats: &Flats) -> Vec<u8> {
-        let numbers = |planes: &[Planes]| planes.iter().flatten().map(Vec::len).sum::<usize>();
-        let total = numbers(&self.total.direct) + numbers(&self.total.light);
-        let spread = self.total.spread.iter().map(Vec::len).sum::<usize>();
-        let under_way = passes.map_or(0, |p| p.b.iter().map(|b| 2 * b.len()).sum::<usize>());
+        let Totals { lighting, direct, light, spread, parts, .. } = &self.total;
+        let numbers = 12 * lighting.len() + 6 * (direct.len() + light.len()) + 3 * spread.len();
+        let under_way = passes.map_or(0, |p| 8 * p.b.len());
         // The flats are small beside it.
-        let mut out = Writer { bytes: Vec::with_capacity(4 * (total + spread + under_way) + (1 << 16)) };
+        let mut out = Writer { bytes: Vec::with_capacity(self.total.nodes() * (numbers + under_way) + (1 << 16)) };
         out.count(self.done);
         out.count(self.bounces);
         out.real(self.residual);
@@ -95,14 +94,18 @@ impl State {
         }
         out.count(self.total.lit);
         if self.total.lit > 0 {
-            out.planes(&self.total.direct);
-            self.total.spread.iter().chain(&self.total.parts).for_each(|s| out.numbers(s));
+            // Sums of direct light until they are all there.
+            out.count(lighting.len());
+            lighting.iter().flatten().for_each(|plane| out.numbers(plane));
+            direct.iter().for_each(|d| out.half_planes(d));
+            spread.iter().for_each(|s| out.halves(s.iter().map(|x| x.to_bits())));
+            parts.iter().for_each(|p| out.numbers(p));
             flats.textures.iter().flatten().for_each(|t| out.numbers(&t.direct));
         }
         // None where nothing bounces.
-        out.count(self.total.light.len());
+        out.count(light.len());
         if self.done > 0 {
-            out.planes(&self.total.light);
+            light.iter().for_each(|l| out.half_planes(l));
             self.flats.iter().flatten().for_each(|f| out.numbers(f));
         }
         out.count(usize::from(passes.is_some()));
@@ -114,7 +117,7 @@ impl State {
             out.count(p.monitor.means.len());
             let means = p.monitor.means.iter().flatten();
             means.chain(&p.monitor.ratio).chain(&p.monitor.tail).for_each(|&x| out.real(x));
-            p.b.iter().for_each(|b| out.halves(b));
+            p.b.iter().for_each(|b| out.halves(b.iter().flatten().copied()));
             flats.textures.iter().flatten().for_each(|t| out.numbers(&t.radiance));
         }
         out.bytes
@@ -124,9 +127,7 @@ impl State {
     /// the flats take what belongs to them. Nothing is changed if the bytes do not fit.
     pub(super) fn restore(&mut self, bytes: &[u8], sides: usize, flats: &mut Flats) -> Option<Passes> {
         let Parsed { state, direct, passes } = self.parse(bytes, sides, flats)?;
-        (self.total.direct, self.total.light) = (state.total.direct, state.total.light);
-        (self.total.spread, self.total.parts) = (state.total.spread, state.total.parts);
-        (self.total.lit, self.total.count) = (state.total.lit, state.done);
+        self.total = state.total;
         for (texture, direct) in flats.textures.iter_mut().flatten().zip(direct) {
             texture.direct = direct;
         }
@@ -143,8 +144,10 @@ impl State {
         let mut from = Reader { bytes };
         let nodes = self.total.nodes();
         let stored = self.total.sides();
-        let mut state = Self::new(stored, 0, 1);
+        let replicates = if self.total.spread.is_empty() { 1 } else { 2 };
+        let mut state = Self::new(stored, nodes, replicates);
         state.done = from.count()?;
+        state.total.count = state.done;
         state.bounces = from.count()?;
         state.residual = from.real()?;
         let mut count = || from.count().map(|n| n as u64);
@@ -155,17 +158,21 @@ impl State {
             valid: count()?,
             masked: count()?,
         };
-        state.total.spread.clone_from(&self.total.spread);
         state.flats = flats.textures.iter().map(|_| None).collect();
         state.total.lit = from.count()?;
         let mut direct = Vec::new();
         if state.total.lit > 0 {
-            state.total.direct = from.planes(sides, nodes)?;
+            let lighting = from.count()?;
+            if lighting > 0 {
+                state.total.lighting = from.planes(sides, nodes)?;
+            } else {
+                state.total.direct = from.half_planes(sides, nodes)?;
+            }
             for spread in &mut state.total.spread {
-                *spread = from.numbers(nodes)?;
+                *spread = from.halves(nodes)?.into_iter().map(bf16::from_bits).collect();
             }
             let parts = if state.total.spread.is_empty() { 0 } else { state.total.lit };
-            let each = state.total.spread.len() * nodes.div_ceil(STRIDE);
+            let each = state.total.spread.len() * nodes.div_ceil(stride(nodes));
             state.total.parts = (0..parts).map(|_| from.numbers(each)).collect::<Option<_>>()?;
             for t in flats.textures.iter().flatten() {
                 direct.push(from.numbers(t.direct.len())?);
@@ -173,7 +180,7 @@ impl State {
         }
         let bounced = from.count()?;
         if state.done > 0 {
-            state.total.light = from.planes(bounced.min(stored.len()), nodes)?;
+            state.total.light = from.half_planes(bounced.min(stored.len()), nodes)?;
             for (sum, texture) in state.flats.iter_mut().zip(&flats.textures) {
                 if let Some(t) = texture {
                     *sum = Some(from.numbers(t.radiance.len())?);
@@ -189,7 +196,7 @@ impl State {
                 monitor.means.push(from.three()?);
             }
             (monitor.ratio, monitor.tail) = (from.three()?, from.three()?);
-            let b = (0..sides).map(|_| from.halves(nodes)).collect::<Option<_>>()?;
+            let b = (0..sides).map(|_| from.four_halves(nodes)).collect::<Option<_>>()?;
             let mut textures = Vec::new();
             for t in flats.textures.iter().flatten() {
                 textures.push(from.numbers(t.radiance.len())?);
@@ -228,12 +235,13 @@ impl Writer {
         self.bytes.extend(numbers.iter().flat_map(|x| x.to_le_bytes()));
     }
 
-    fn halves(&mut self, halves: &[Half4]) {
-        self.bytes.extend(halves.as_flattened().iter().flat_map(|x| x.to_le_bytes()));
+    fn halves(&mut self, halves: impl Iterator<Item = u16>) {
+        self.bytes.extend(halves.flat_map(u16::to_le_bytes));
     }
 
-    fn planes(&mut self, planes: &[Planes]) {
-        planes.iter().flatten().for_each(|p| self.numbers(p));
+    fn half_planes(&mut self, light: &HalfPlanes) {
+        self.numbers(&[light.unit]);
+        self.halves(light.planes.iter().flatten().copied());
     }
 }
 
@@ -264,11 +272,25 @@ impl Reader<'_> {
         Some(head.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect())
     }
 
-    fn halves(&mut self, n: usize) -> Option<Vec<Half4>> {
+    fn halves(&mut self, n: usize) -> Option<Vec<u16>> {
+        let (head, rest) = self.bytes.split_at_checked(n.checked_mul(2)?)?;
+        self.bytes = rest;
+        Some(head.as_chunks().0.iter().map(|b| u16::from_le_bytes(*b)).collect())
+    }
+
+    fn four_halves(&mut self, n: usize) -> Option<Vec<Half4>> {
         let (head, rest) = self.bytes.split_at_checked(n.checked_mul(8)?)?;
         self.bytes = rest;
         let four = |b: &[u8; 8]| std::array::from_fn(|i| u16::from_le_bytes([b[2 * i], b[2 * i + 1]]));
         Some(head.as_chunks().0.iter().map(four).collect())
+    }
+
+    fn half_planes(&mut self, sides: usize, nodes: usize) -> Option<Vec<HalfPlanes>> {
+        let mut side = || {
+            let [unit] = self.numbers(1)?.try_into().ok()?;
+            Some(HalfPlanes { planes: [self.halves(nodes)?, self.halves(nodes)?, self.halves(nodes)?], unit })
+        };
+        (0..sides).map(|_| side()).collect()
     }
 
     fn planes(&mut self, sides: usize, nodes: usize) -> Option<Vec<Planes>> {

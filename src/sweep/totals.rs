@@ -1,30 +1,35 @@
 //! Sums over the replicates of a sweep, and their spread.
 
 use super::SweptSide;
-use super::grid::{Geometry, Planes};
+use super::planes::{HalfPlanes, Planes};
 use crate::flattened::Side;
 use crate::scene::Scene;
+use ::half::bf16;
 use glam::DVec3;
 use rayon::prelude::*;
 use std::f32::consts::PI;
 
-/// One node of so many tells how much better replicates are together.
-pub(super) const STRIDE: usize = 16;
+/// One node of so many tells how much better replicates are together: of 16, and not more than 65 536 to 131 071 in all.
+pub(super) fn stride(nodes: usize) -> usize {
+    (nodes >> 16).max(16)
+}
 
 /// Sums over replicates.
 pub(super) struct Totals {
     sides: Vec<Side>,
     nodes: usize,
-    /// Direct irradiance of all swept sides: the sum over the replicates so far, and the mean once it is that of all.
-    pub(super) direct: Vec<Planes>,
-    /// Replicates in it.
+    /// Sum of the direct irradiance of all swept sides over the replicates so far; gone once it is that of all.
+    pub(super) lighting: Vec<Planes>,
+    /// Replicates whose direct light is known.
     pub(super) lit: usize,
-    /// Indirect irradiance.
-    pub(super) light: Vec<Planes>,
-    /// Squared deviations of the luminance of ρE/π from its mean, of direct and of indirect light: they come from independent
-    /// sets. \[Welford62\]
-    pub(super) spread: Vec<Vec<f32>>,
-    /// That luminance of each replicate at every [`STRIDE`]th node.
+    /// Mean of their direct irradiance.
+    pub(super) direct: Vec<HalfPlanes>,
+    /// Sum of the indirect irradiance of the stored sides.
+    pub(super) light: Vec<HalfPlanes>,
+    /// Roots of the sums of squared deviations of the luminance of ρE/π from its mean, of direct and of indirect light: they
+    /// come from independent sets. \[Welford62\]
+    pub(super) spread: Vec<Vec<bf16>>,
+    /// That luminance of each replicate at every [`stride`]th node.
     pub(super) parts: Vec<Vec<f32>>,
     /// Replicates in `light`.
     pub(super) count: usize,
@@ -32,9 +37,9 @@ pub(super) struct Totals {
 
 impl Totals {
     pub(super) fn new(sides: &[Side], n: usize, replicates: usize) -> Self {
-        let spread = if replicates > 1 { vec![vec![0.0; n]; sides.len()] } else { Vec::new() };
-        let (direct, light, parts) = (Vec::new(), Vec::new(), Vec::new());
-        Self { sides: sides.to_vec(), nodes: n, direct, lit: 0, light, spread, parts, count: 0 }
+        let spread = if replicates > 1 { vec![vec![bf16::ZERO; n]; sides.len()] } else { Vec::new() };
+        let (lighting, direct, light, parts) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        Self { sides: sides.to_vec(), nodes: n, lighting, lit: 0, direct, light, spread, parts, count: 0 }
     }
 
     pub(super) fn sides(&self) -> &[Side] {
@@ -48,33 +53,51 @@ impl Totals {
     /// Takes the direct irradiance of a replicate. Returns the planes it does not keep.
     pub(super) fn add_direct(&mut self, new: Vec<Planes>, scene: &Scene) -> Vec<Planes> {
         self.lit += 1;
-        self.deviate(scene, &new, true);
-        add(&mut self.direct, new)
+        let before = 1.0 / (self.lit - 1) as f32;
+        let lighting = std::mem::take(&mut self.lighting);
+        let mean = |s: usize, c: usize, i: usize| before * lighting[s][c][i];
+        self.deviate(scene, &new, self.lit, mean);
+        self.lighting = lighting;
+        if self.lighting.is_empty() {
+            self.lighting = new;
+            return Vec::new();
+        }
+        for (sum, new) in self.lighting.iter_mut().flatten().zip(new.iter().flatten()) {
+            sum.par_iter_mut().zip(new).with_min_len(1 << 12).for_each(|(s, n)| *s += n);
+        }
+        new
     }
 
     /// Makes the sum of direct light its mean.
     pub(super) fn average_direct(&mut self) {
         let share = 1.0 / self.lit.max(1) as f32;
-        for plane in self.direct.iter_mut().flatten() {
-            plane.par_iter_mut().with_min_len(1 << 12).for_each(|x| *x *= share);
-        }
+        let lighting = std::mem::take(&mut self.lighting);
+        self.direct = lighting.iter().map(|planes| HalfPlanes::new(planes, share, None)).collect();
     }
 
-    /// Takes the indirect irradiance of a replicate, or nothing if there is none. Returns the planes it does not keep.
-    pub(super) fn add(&mut self, mut new: Vec<Planes>, scene: &Scene) -> Vec<Planes> {
+    /// Takes the indirect irradiance of a replicate, or nothing if there is none.
+    pub(super) fn add(&mut self, new: &[Planes], scene: &Scene) {
         self.count += 1;
         if new.is_empty() {
-            return new;
+            return;
         }
-        let mut spare = new.split_off(self.sides.len());
-        self.deviate(scene, &new, false);
-        spare.extend(add(&mut self.light, new));
-        spare
+        let before = 1.0 / (self.count - 1) as f32;
+        let light = std::mem::take(&mut self.light);
+        self.deviate(scene, new, self.count, |s, c, i| before * light[s].at(c, i));
+        let mut old = light.into_iter();
+        self.light = new[..self.sides.len()].iter().map(|new| HalfPlanes::new(new, 1.0, old.next())).collect();
     }
 
-    /// Adds the deviations of the `direct` or indirect light of a replicate that is about to be added.
+    /// Adds the deviations of the light of the replicate that is the `count`th of its kind, where `mean` (side, channel, node)
+    /// is that of those before.
     #[allow(clippy::cast_possible_truncation, reason = "albedo")]
-    fn deviate(&mut self, scene: &Scene, new: &[Planes], direct: bool) {
+    fn deviate(
+        &mut self,
+        scene: &Scene,
+        new: &[Planes],
+        count: usize,
+        mean: impl Fn(usize, usize, usize) -> f32 + Sync,
+    ) {
         if self.spread.is_empty() {
             return;
         }
@@ -88,64 +111,52 @@ impl Totals {
             let luminance = luminance(i);
             (0..3).map(|c| luminance[c] * planes[c][i]).sum::<f32>()
         };
-        let nodes = (0..self.nodes).step_by(STRIDE);
+        let nodes = (0..self.nodes).step_by(stride(self.nodes));
         let part = new[..self.sides.len()].iter().flat_map(|planes| nodes.clone().map(|i| at(planes, i)));
-        if direct {
-            self.parts.push(part.collect());
-        } else {
-            self.parts[self.count - 1].iter_mut().zip(part).for_each(|(sum, x)| *sum += x);
+        match self.parts.get_mut(count - 1) {
+            // Its direct light is there.
+            Some(sum) => sum.iter_mut().zip(part).for_each(|(sum, x)| *sum += x),
+            None => self.parts.push(part.collect()),
         }
-        let (sum, count) = if direct { (&self.direct, self.lit) } else { (&self.light, self.count) };
+        if count == 1 {
+            return;
+        }
         // (x − mean of those before)² (n − 1)/n.
-        let (before, share) = (1.0 / (count - 1) as f32, (count - 1) as f32 / count as f32);
-        for (spread, (sum, new)) in self.spread.iter_mut().zip(sum.iter().zip(new)) {
-            spread.par_iter_mut().enumerate().with_min_len(1 << 12).for_each(|(i, m)| {
+        let share = (count - 1) as f32 / count as f32;
+        for (s, (spread, new)) in self.spread.iter_mut().zip(new).enumerate() {
+            spread.par_iter_mut().enumerate().with_min_len(1 << 12).for_each(|(i, root)| {
                 let luminance = luminance(i);
-                let d: f32 = (0..3).map(|c| luminance[c] * (new[c][i] - before * sum[c][i])).sum();
-                *m += share * d * d;
+                let d: f32 = (0..3).map(|c| luminance[c] * (new[c][i] - mean(s, c, i))).sum();
+                let before = root.to_f32();
+                if d != 0.0 {
+                    *root = bf16::from_f32((before * before + share * d * d).sqrt());
+                }
             });
         }
     }
 
     /// What `done` replicates gave; of fewer than all the direct light of all that were lit.
     #[allow(clippy::cast_possible_truncation, reason = "a factor of at most 1")]
-    pub(super) fn finish(self, geometry: &Geometry, done: usize) -> Vec<SweptSide> {
+    pub(super) fn finish(self, lit: &[bool], done: usize) -> Vec<SweptSide> {
         let scale = 1.0 / done.max(1) as f32;
         let together = together(&self.parts[..done.min(self.parts.len())]) as f32;
-        let collect = |s: usize| -> Vec<[f32; 3]> {
-            let (direct, light) = (&self.direct[s], self.light.get(s));
+        let mut indirect = self.light.into_iter();
+        let mut spread = self.spread.into_iter().filter(|_| done > 1);
+        let nodes = || lit.par_iter().enumerate().with_min_len(1 << 12);
+        let side = |(&side, direct): (&Side, HalfPlanes)| {
+            let light = indirect.next();
             let node = |i: usize| -> [f32; 3] {
-                std::array::from_fn(|c| direct[c][i] + light.map_or(0.0, |light| scale * light[c][i]))
+                std::array::from_fn(|c| direct.at(c, i) + light.as_ref().map_or(0.0, |light| scale * light.at(c, i)))
             };
-            (0..self.nodes)
-                .into_par_iter()
-                .with_min_len(1 << 12)
-                .map(|i| if geometry.lit[i] { node(i) } else { [0.0; 3] })
-                .collect()
+            let irradiance = nodes().map(|(i, lit)| if *lit { node(i) } else { [0.0; 3] }).collect();
+            let factor = (together * scale / (done.max(2) - 1) as f32).sqrt();
+            let error = |roots: Vec<bf16>| -> Vec<f32> {
+                nodes().map(|(i, lit)| if *lit { factor * roots[i].to_f32() } else { 0.0 }).collect()
+            };
+            SweptSide { side, irradiance, std_error: spread.next().map(error).unwrap_or_default() }
         };
-        let std_error = |m: &Vec<f32>| -> Vec<f32> {
-            let nodes = m.par_iter().zip(&geometry.lit).with_min_len(1 << 12);
-            nodes.map(|(m, v)| if *v { (together * m * scale / (done - 1) as f32).sqrt() } else { 0.0 }).collect()
-        };
-        let sides = self.sides.iter().enumerate().map(|(s, &side)| SweptSide {
-            side,
-            irradiance: collect(s),
-            std_error: self.spread.get(s).filter(|_| done > 1).map(std_error).unwrap_or_default(),
-        });
-        sides.collect()
+        self.sides.iter().zip(self.direct).map(side).collect()
     }
-}
-
-/// Adds `new` to sums, which may be empty yet. Returns the planes that are free.
-fn add(sums: &mut Vec<Planes>, new: Vec<Planes>) -> Vec<Planes> {
-    if sums.is_empty() {
-        *sums = new;
-        return Vec::new();
-    }
-    for (s, n) in sums.iter_mut().flatten().zip(new.iter().flatten()) {
-        s.par_iter_mut().zip(n).with_min_len(1 << 12).for_each(|(s, n)| *s += n);
-    }
-    new
 }
 
 /// The variance of the mean of replicates over that of as many independent ones; 1 unless they are 4, 8, 16 …
