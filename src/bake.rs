@@ -81,7 +81,7 @@ pub struct BakeReport {
     pub masked: u64,
     /// Those of them that were filled from samples nearby.
     pub filled: u64,
-    /// Gather rays that landed where the cache held nothing.
+    /// Gather rays that landed where the cache held nothing: those of points just outside the sweep, far off what is in it.
     pub misses: u64,
     /// Radiance values that were not finite, set to 0 and masked.
     pub non_finite: u64,

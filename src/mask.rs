@@ -63,6 +63,37 @@ pub fn masks(field: &Field, lattice: &Lattice) -> Vec<Mask> {
     out
 }
 
+/// Points this far outside the sweep, in its units, may hold light of their own,
+const OVERSHOOT: f64 = 0.25;
+/// and if h bends less than this there: level sets on a plateau beside a steep edge are dark, and no end to interpolate from.
+const BEND: f64 = 0.8;
+
+/// Whether light on its own level set makes a filled point a better end to interpolate from than what fits the light around it:
+/// closely outside the sweep, where h goes on as it does within. Its second differences over the first ones between both
+/// neighbours, summed over the axes, are 1 where a plateau ends.
+pub fn lights_itself(field: &Field, lattice: &Lattice, o: usize) -> bool {
+    let own = lattice == field.lattice();
+    let value = |o: usize| match own {
+        true => f64::from(field.samples()[o]),
+        false => field.value(local_position(field, lattice, o)),
+    };
+    let h = value(o);
+    if !(-OVERSHOOT..=1.0 + OVERSHOOT).contains(&h) || field.falling_normal(local_position(field, lattice, o)).is_none()
+    {
+        return false;
+    }
+    let (mut first, mut second, mut step) = (0.0, 0.0, 1);
+    for n in lattice.dims() {
+        if (1..n - 1).contains(&(o / step % n)) {
+            let (before, after) = (value(o - step), value(o + step));
+            first += (after - before).abs();
+            second += (after + before - 2.0 * h).abs();
+        }
+        step *= n;
+    }
+    second / first < BEND
+}
+
 /// Slices of constant z that are looked at together.
 const SLICES: usize = 8;
 /// The range of no values.

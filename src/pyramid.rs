@@ -17,6 +17,7 @@ use glam::Vec4;
 use kernel::Scalar;
 use rayon::prelude::*;
 use simd::Avx512;
+use std::ops::Range;
 
 /// Levels at most: children are cells, then blocks of 4³, 16³ and 64³ cells.
 const LEVELS: usize = 4;
@@ -103,12 +104,14 @@ pub struct Pyramid {
 }
 
 /// A monotone map of isovalues to 8 bits: half linear, half by the share of samples below, so that ranges stay narrow where
-/// h is flat. Everything outside the sweep clamps, NaN is 0.
+/// h is flat. It goes on a quarter of the sweep beyond it, a quarter as finely; what is farther outside clamps, NaN is 0.
 #[derive(Clone, Debug)]
 struct Ranks(Box<[u8; Ranks::BINS]>);
 
 impl Ranks {
     const BINS: usize = 4096;
+    /// Those of the sweep.
+    const SWEEP: Range<usize> = 683..3413;
     /// Samples that are looked at.
     const SAMPLES: usize = 1 << 16;
 
@@ -120,11 +123,12 @@ impl Ranks {
             counts[bins(Vec4::splat(s))[0]] += 1;
         }
         let all = f64::from(counts.iter().sum::<u32>().max(1));
-        let mut below = 0;
+        let (mut below, mut linear) = (0, 0.0);
+        let most = 0.75 * Self::SWEEP.len() as f64 + 0.25 * Self::BINS as f64;
         let rank = |(n, count)| {
             below += count;
-            let linear = (n + 1) as f64 / Self::BINS as f64;
-            (127.5 * (linear + f64::from(below) / all)) as u8
+            linear += if Self::SWEEP.contains(&n) { 1.0 } else { 0.25 };
+            (127.5 * (linear / most + f64::from(below) / all)) as u8
         };
         let ranks: Vec<u8> = counts.into_iter().enumerate().map(rank).collect();
         Self(ranks.try_into().expect("as many as bins"))
@@ -146,7 +150,7 @@ impl Ranks {
 #[inline]
 fn bins(s: Vec4) -> [usize; 4] {
     // 2²³ rounds to an integer and leaves it in the low bits.
-    let clamped = (s * 4095.0).max(Vec4::ZERO).min(Vec4::splat(4095.0));
+    let clamped = (s * 2730.0 + 682.5).max(Vec4::ZERO).min(Vec4::splat(4095.0));
     (clamped + 8_388_608.0).to_array().map(|x| x.to_bits() as usize % Ranks::BINS)
 }
 

@@ -9,7 +9,7 @@ use crate::field::Field;
 use crate::fitted_grid::{Wish, fit};
 use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
-use crate::mask::{Mask, local_position, stand_ins};
+use crate::mask::{Mask, lights_itself, local_position, stand_ins};
 use crate::node_set::NodeSet;
 use crate::radiance::{BLOCK, RadianceSample, RadianceSamples, Sampler, sample_places};
 use crate::scene::Scene;
@@ -49,10 +49,11 @@ impl From<&RadianceSamples> for Counts {
     }
 }
 
-/// The points of a grid on a level set of the sweep.
+/// The points of a grid that hold light of their own level set.
 pub(super) struct GridPoints<'a> {
     field: &'a Field,
     lattice: &'a Lattice,
+    masks: &'a [Mask],
     set: NodeSet,
 }
 
@@ -106,8 +107,19 @@ pub(super) fn blocks(lattice: &Lattice) -> usize {
 }
 
 impl<'a> GridPoints<'a> {
-    pub(super) fn new(field: &'a Field, lattice: &'a Lattice, masks: &[Mask]) -> Self {
-        Self { field, lattice, set: NodeSet::new(masks.len(), |o| masks[o] == Mask::Valid) }
+    /// Those on a level set of the sweep, and with `beyond` those just outside that light themselves.
+    pub(super) fn new(field: &'a Field, lattice: &'a Lattice, masks: &'a [Mask], beyond: bool) -> Self {
+        let own = |o: usize| match masks[o] {
+            Mask::Valid => true,
+            Mask::Filled => beyond && lights_itself(field, lattice, o),
+            Mask::Empty => false,
+        };
+        Self { field, lattice, masks, set: NodeSet::new(masks.len(), own) }
+    }
+
+    /// Whether a point is one of them.
+    pub(super) fn contains(&self, o: usize) -> bool {
+        self.set.contains(o)
     }
 
     /// Points.
@@ -123,15 +135,16 @@ impl<'a> GridPoints<'a> {
         PointLight { grid, halves: smoothing.then(|| vec![Packed::NONE; self.set.len()]) }
     }
 
-    /// The isovalue of a point.
+    /// The isovalue of a point, or the nearest of the sweep.
     #[inline]
     #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
     fn isovalue(&self, o: usize) -> f32 {
-        if self.lattice == self.field.lattice() {
+        let h = if self.lattice == self.field.lattice() {
             self.field.samples()[o]
         } else {
             self.field.value(local_position(self.field, self.lattice, o)) as f32
-        }
+        };
+        h.clamp(0.0, 1.0)
     }
 
     /// Samples the points of a band.
@@ -171,7 +184,7 @@ impl<'a> GridPoints<'a> {
             for (&o, s) in own.iter().zip(&samples) {
                 let Some(s) = s else { continue };
                 radiance[o - start] = s.radiance.to_array();
-                mask[o - start] = Mask::Valid;
+                mask[o - start] = self.masks[o];
                 std_error[o - start] = match smoothing {
                     true => s.variance - s.indirect_variance,
                     false => s.variance.sqrt(),

@@ -9,7 +9,7 @@ use crate::error::{Error, Result};
 use crate::flat;
 use crate::flattened::Side;
 use crate::irradiance_caching;
-use crate::mask::{Mask, masks};
+use crate::mask::{Mask, lights_itself, masks};
 use crate::node_set::NodeSet;
 use crate::photon::{FlatPhoton, PhotonSettings, SurfacePhoton, trace_photons};
 use crate::radiance::RadianceSample;
@@ -173,21 +173,30 @@ impl Parts {
             let (own_voxels, own_points) = (member.field.lattice().len() as u64, lattice.len() as u64);
             // On the volume's own lattice: a finer one needs about the same share of its points.
             let masks = masks(&member.field, member.field.lattice());
-            let count = |m: Mask| masks.par_iter().filter(|&&x| x == m).count() as u64 * own_points / own_voxels;
-            let (valid, own_filled) = (count(Mask::Valid), count(Mask::Filled));
+            let beyond = settings.engine == Engine::Sweep || settings.gather_rays > 0;
+            let lit = |o: usize| match masks[o] {
+                Mask::Empty => false,
+                Mask::Valid => true,
+                Mask::Filled => beyond && lights_itself(&member.field, member.field.lattice(), o),
+            };
+            let count = |is: &(dyn Fn(usize) -> bool + Sync)| {
+                (0..masks.len()).into_par_iter().filter(|&o| is(o)).count() as u64 * own_points / own_voxels
+            };
+            let own = count(&lit);
+            let own_filled = count(&|o| masks[o] != Mask::Empty) - own;
             let sides = member.surface.stored_sides().len() as u64;
             let element = volume.samples().element_type().size() as u64;
             // Volume, field, the pyramid of min and max, the masks of volume and grid.
             base += own_voxels * (element + 4 + 1) + own_voxels * 33 / 16 + own_points;
             let spread = own_filled * STAND_INS as u64;
             samples += match (settings.strategy, settings.samples) {
-                (StrategyName::Nodes, _) => valid + spread,
+                (StrategyName::Nodes, _) => own + spread,
                 (_, Some(n)) => n,
-                (_, None) => ((valid + own_filled) as f64 * settings.samples_per_point) as u64,
+                (_, None) => ((own + own_filled) as f64 * settings.samples_per_point) as u64,
             };
             grids += own_points * 17 * sides;
             if smoothing {
-                halves += valid * PACKED * sides;
+                halves += own * PACKED * sides;
                 let [nx, ny, nz] = lattice.dims().map(|n| n as u64);
                 slices = slices.max(nx * ny * SLICES.min(nz * 112));
             }

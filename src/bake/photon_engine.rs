@@ -169,9 +169,11 @@ impl<'a> FieldLight<'a> {
         let places = match settings.strategy.placed() {
             Some(strategy) => Places::Scattered(scatter(scene, settings, masks, &strategy)?),
             None => {
-                let filled = |o: usize| masks[o] == Mask::Filled;
-                let beside = Beside::new(&scene.field, lattice, filled, settings.seed);
-                Places::Grid(GridPoints::new(&scene.field, lattice, masks), beside)
+                // The photon map knows nothing beyond the sweep; what gather rays find there goes on.
+                let points = GridPoints::new(&scene.field, lattice, masks, settings.gather_rays > 0);
+                let fitted = |o: usize| masks[o] == Mask::Filled && !points.contains(o);
+                let beside = Beside::new(&scene.field, lattice, fitted, settings.seed);
+                Places::Grid(points, beside)
             }
         };
         let smoothing = settings.smoothing && settings.gather_rays > 1;

@@ -108,9 +108,11 @@ fn ranks_are_monotone_clamp_and_serve_flat_parts() {
     let samples: Vec<f32> =
         (0..200_000).map(|i| (if i % 10 == 0 { rng.unit() } else { 0.5 + 0.01 * rng.unit() }) as f32).collect();
     let ranks = Ranks::new(&samples);
-    assert_eq!([f32::NAN, f32::NEG_INFINITY, -1.0, 0.0].map(|s| ranks.of(s)), [0; 4]);
-    assert_eq!([1.0, 2.0, f32::INFINITY].map(|s| ranks.of(s)), [255; 3]);
-    let values = (0..=1_000_000u32).map(|i| ranks.of(i as f32 * 1e-6));
+    assert_eq!([f32::NAN, f32::NEG_INFINITY, -1.0, -0.25].map(|s| ranks.of(s)), [0; 4]);
+    assert_eq!([1.25, 2.0, f32::INFINITY].map(|s| ranks.of(s)), [255; 3]);
+    // Just outside the sweep, too, blocks are told apart.
+    assert!(ranks.of(-0.1) > ranks.of(-0.2) && ranks.of(1.2) > ranks.of(1.1));
+    let values = (0..=1_500_000u32).map(|i| ranks.of(i as f32 * 1e-6 - 0.25));
     assert!(values.clone().zip(values.skip(1)).all(|(a, b)| a <= b));
     let steps = |a: f32, b: f32| ranks.of(b) - ranks.of(a);
     assert!(steps(0.5, 0.51) > 100 && steps(0.0, 0.5) > 60, "{} {}", steps(0.5, 0.51), steps(0.0, 0.5));

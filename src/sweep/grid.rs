@@ -7,13 +7,9 @@ use super::normals;
 use super::planes::{Planes, Spare, transpose, transposed};
 use crate::field::Field;
 use crate::flattened::Side;
+use crate::mask::lights_itself;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
-
-/// Nodes this far outside the sweep, in its units, are still lit if a neighbour is in it,
-const OVERSHOOT: f32 = 0.25;
-/// and if h bends less than this there: level sets on a plateau beside a steep edge are dark, and no end to interpolate from.
-const BEND: f32 = 0.8;
 
 /// What every pass reads: h in both memory orders, and the receiver normals towards the lower side.
 ///
@@ -127,9 +123,8 @@ impl<'a> Geometry<'a> {
             .collect();
         let on_surface = |(h, n): (&f32, &u32)| (0.0..=1.0).contains(h) && *n != 0;
         let mut lit: Vec<bool> = h.par_iter().zip(&normals).with_min_len(1 << 14).map(on_surface).collect();
-        let range = -OVERSHOOT..=1.0 + OVERSHOOT;
-        let near = |at: usize| range.contains(&h[at]) && normals[at] != 0 && bend(h, dims, at) < BEND;
-        let near: Vec<u32> = ring(dims, &lit).into_iter().filter(|at| near(*at as usize)).collect();
+        let near = |at: &u32| normals[*at as usize] != 0 && lights_itself(field, field.lattice(), *at as usize);
+        let near: Vec<u32> = ring(dims, &lit).into_iter().filter(near).collect();
         near.into_iter().for_each(|at| lit[at as usize] = true);
         // Nodes that are not lit take no light whatever lines bring.
         normals.par_iter_mut().zip(&lit).with_min_len(1 << 14).filter(|(_, lit)| !**lit).for_each(|(n, _)| *n = 0);
@@ -289,21 +284,6 @@ impl<'a> Geometry<'a> {
             ring.iter().for_each(|&at| known[at as usize] = true);
         }
     }
-}
-
-/// How much h bends at a node: its second differences over its first ones between both neighbours, summed over the axes. 1
-/// where a plateau ends, about 0 where h goes on as before.
-fn bend(h: &[f32], dims: [usize; 3], at: usize) -> f32 {
-    let (mut first, mut second, mut step) = (0.0, 0.0, 1);
-    for n in dims {
-        if (1..n - 1).contains(&(at / step % n)) {
-            let (before, after) = (h[at - step], h[at + step]);
-            first += (after - before).abs();
-            second += (after + before - 2.0 * h[at]).abs();
-        }
-        step *= n;
-    }
-    second / first
 }
 
 fn neighbours([nx, ny, nz]: [usize; 3], at: usize, mut visit: impl FnMut(usize)) {

@@ -202,19 +202,29 @@ fn lattices_do_not_matter() {
     }
 }
 
-/// Beside the ends of the sweep, light is what it is where the sweep goes on: 1.14 and 0.47 % apart in the mean square; 1.42
-/// and 3.03 % with nodes outside the sweep fitted to samples instead of lit by lines themselves.
 #[test]
 fn where_the_sweep_ends_does_not_matter() {
+    // 1.14 and 0.47 % apart; 1.42 and 3.03 % with nodes outside the sweep fitted to samples instead of lit by lines themselves.
     let hill = |x: DVec3| (-(x - DVec3::new(0.45, 0.55, 0.4)).length_squared() / 0.2).exp();
+    ends_do_not_matter(hill, &BakeSettings { engine: Engine::Sweep, ..at_nodes(1) }, 0.0125);
+}
+
+#[test]
+fn where_the_sweep_ends_does_not_matter_to_exact_rays() {
+    // 1.69 and 2.74 % apart; 3.29 and 4.52 % with points outside the sweep fitted to samples instead of sampled themselves.
+    let dunes = |x: DVec3| 0.55 + 3.0 * (0.5 - x.z) + 0.2 * (20.0 * x.x).sin() * (20.0 * x.y).cos();
+    ends_do_not_matter(dunes, &at_nodes(1), 0.03);
+}
+
+/// Beside the ends of the sweep, light is what it is where the sweep goes on, up to so much in the mean square.
+fn ends_do_not_matter(h: impl Fn(DVec3) -> f64, settings: &BakeSettings, limit: f64) {
     let swept = |lo, hi| {
-        let field = field(lattice([33; 3], DVec3::ZERO, DVec3::ONE), lo, hi, hill);
+        let field = field(lattice([33; 3], DVec3::ZERO, DVec3::ONE), lo, hi, &h);
         let walls = cornell_box(field.lattice(), 0.0).unwrap();
         scene(field, grey(0.75, Side::Lower), walls)
     };
-    let settings = BakeSettings { engine: Engine::Sweep, ..at_nodes(1) };
     let (narrow, wide) = (swept(0.2, 0.9), swept(0.1, 1.0));
-    let [a, b] = [&narrow, &wide].map(|scene| run(scene, &settings).sides.remove(0).1);
+    let [a, b] = [&narrow, &wide].map(|scene| run(scene, settings).sides.remove(0).1);
     for (name, ends) in [("low", [0.2, 0.21]), ("high", [0.89, 0.9])] {
         let mut rng = Rng::stream(7, Stage::Test, 0);
         let (mut squares, mut light, mut count) = (0.0, 0.0, 0);
@@ -228,7 +238,7 @@ fn where_the_sweep_ends_does_not_matter() {
         }
         let apart = (squares / light).sqrt();
         println!("{name} end: {:.2} % apart", 100.0 * apart);
-        assert!(apart < 0.0125, "{name} end: {apart}");
+        assert!(apart < limit, "{name} end: {apart}");
     }
 }
 
