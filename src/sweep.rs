@@ -47,7 +47,7 @@ use flats::Flats;
 use gather::Pass;
 use grid::Geometry;
 use monitor::Monitor;
-use planes::{Light, Planes, Spare};
+use planes::{NodeLight, Planes, Spare};
 use points::Points;
 use rayon::prelude::*;
 use reflect::Mirror;
@@ -357,11 +357,11 @@ impl Run<'_> {
     /// What nodes and flats reflect before the first pass of a replicate.
     fn begin(&self, state: &State, flats: &mut Flats) -> Passes {
         let late = if self.warm(state) { LATE - 1 } else { 0 };
-        let direct = (Light::Half(&state.total.direct), [1.0; 3]);
+        let direct = (NodeLight::Half(&state.total.direct), [1.0; 3]);
         let (b, unit) = if late > 0 {
             let share = 1.0 / state.done as f32;
             flats.take(&state.flats, share);
-            self.mirror.reflect(flats, &[direct, (Light::Half(&state.total.light), [share; 3])], Vec::new())
+            self.mirror.reflect(flats, &[direct, (NodeLight::Half(&state.total.light), [share; 3])], Vec::new())
         } else {
             flats.reflect_direct();
             self.mirror.reflect(flats, &[direct], Vec::new())
@@ -461,7 +461,7 @@ impl Run<'_> {
             let old = std::mem::take(&mut now.b);
             (now.b, now.unit) = self.mirror.reflect(
                 flats,
-                &[(Light::Half(&state.total.direct), [1.0; 3]), (Light::Full(&indirect), scale)],
+                &[(NodeLight::Half(&state.total.direct), [1.0; 3]), (NodeLight::Full(&indirect), scale)],
                 old,
             );
             self.spare.keep(indirect.drain(..).flatten());

@@ -124,7 +124,7 @@ impl<'a> Geometry<'a> {
         let on_surface = |(h, n): (&f32, &u32)| (0.0..=1.0).contains(h) && *n != 0;
         let mut lit: Vec<bool> = h.par_iter().zip(&normals).with_min_len(1 << 14).map(on_surface).collect();
         let near = |at: &u32| normals[*at as usize] != 0 && lights_itself(field, field.lattice(), *at as usize);
-        let near: Vec<u32> = ring(dims, &lit).into_iter().filter(near).collect();
+        let near: Vec<u32> = ring(dims, &lit).into_par_iter().with_min_len(256).filter(near).collect();
         near.into_iter().for_each(|at| lit[at as usize] = true);
         // Nodes that are not lit take no light whatever lines bring.
         normals.par_iter_mut().zip(&lit).with_min_len(1 << 14).filter(|(_, lit)| !**lit).for_each(|(n, _)| *n = 0);

@@ -98,12 +98,12 @@ impl HalfPlanes {
 
 /// Light of every node of the sides, as it is gathered or as it is kept.
 #[derive(Clone, Copy)]
-pub(super) enum Light<'a> {
+pub(super) enum NodeLight<'a> {
     Full(&'a [Planes]),
     Half(&'a [HalfPlanes]),
 }
 
-impl Light<'_> {
+impl NodeLight<'_> {
     /// How many sides.
     pub(super) fn sides(self) -> usize {
         match self {
@@ -200,7 +200,7 @@ mod tests {
         }
         let kept = kept.unwrap();
         let mut back = vec![1.0; n];
-        Light::Half(std::slice::from_ref(&kept)).add((0, 1), 2.0, 0, &mut back);
+        NodeLight::Half(std::slice::from_ref(&kept)).add((0, 1), 2.0, 0, &mut back);
         for (i, sum) in sum.iter().enumerate() {
             for c in 0..3 {
                 let error = (f64::from(kept.at(c, i)) - sum[c]).abs();

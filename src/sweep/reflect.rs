@@ -4,7 +4,7 @@ use super::ends::{self, Standing};
 use super::flats::Flats;
 use super::grid::Geometry;
 use super::half::{self, Half4};
-use super::planes::Light;
+use super::planes::NodeLight;
 use crate::polygon::LocalPolygon;
 use crate::scene::Scene;
 use glam::DVec3;
@@ -71,7 +71,7 @@ impl<'a> Mirror<'a> {
     pub(super) fn reflect(
         &self,
         flats: &mut Flats,
-        light: &[(Light, [f32; 3])],
+        light: &[(NodeLight, [f32; 3])],
         old: Vec<Vec<Half4>>,
     ) -> (Vec<Vec<Half4>>, f32) {
         let surface = &self.scene.surface;
