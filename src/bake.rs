@@ -79,7 +79,7 @@ pub struct BakeReport {
     pub samples_without_gradient: u64,
     /// Grid points without radiance of their own: outside the sweep, without gradient, or not finite.
     pub masked: u64,
-    /// Those of them that were filled from samples nearby.
+    /// Those of them that hold light all the same: of their own level set closely outside the sweep, else fitted to samples nearby.
     pub filled: u64,
     /// Gather rays that landed where the cache held nothing: those of points just outside the sweep, far off what is in it.
     pub misses: u64,

@@ -94,6 +94,21 @@ pub fn lights_itself(field: &Field, lattice: &Lattice, o: usize) -> bool {
     second / first < BEND
 }
 
+/// Tells which points are to hold light of their own level set: the valid ones, and with `beyond` those just outside the sweep
+/// that [`lights_itself`] picks.
+pub fn own_light<'a>(
+    field: &'a Field,
+    lattice: &'a Lattice,
+    masks: &'a [Mask],
+    beyond: bool,
+) -> impl Fn(usize) -> bool + Sync + 'a {
+    move |o| match masks[o] {
+        Mask::Empty => false,
+        Mask::Valid => true,
+        Mask::Filled => beyond && lights_itself(field, lattice, o),
+    }
+}
+
 /// Slices of constant z that are looked at together.
 const SLICES: usize = 8;
 /// The range of no values.

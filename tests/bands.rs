@@ -120,10 +120,11 @@ fn memory_that_is_allowed_decides_the_bands() {
         let output = command.current_dir(dir.path()).args(args).output().unwrap();
         (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
     };
-    assert_eq!(run(&["generate", "bumps", "--size", "129", "-o", "b.vti", "-q"]).0, Some(0));
-    let few = ["--isovalues", "3.6", "95", "--photons", "2000", "--gather", "2", "--shadow-rays", "1"];
-    let bake =
-        |more: &[&str]| run(&[&["bake", "b.vti", "-o", "o.vti", "--wall-resolution", "8"], &few[..], more].concat());
+    assert_eq!(run(&["generate", "bumps", "--size", "145", "-o", "b.vti", "-q"]).0, Some(0));
+    // Surfaces everywhere, so that the cache is large beside what every band shares.
+    let all = ["bake", "b.vti", "-o", "o.vti", "--isovalues", "-20", "120", "--smoothing", "false"];
+    let few = ["--wall-resolution", "8", "--photons", "2000", "--gather", "2", "--shadow-rays", "1"];
+    let bake = |more: &[&str]| run(&[&all[..], &few, more].concat());
     // What the estimate says of one band and of many.
     let estimate = |bands: &str| {
         let (code, text) = bake(&["--dry-run", "--bands", bands]);
@@ -132,7 +133,7 @@ fn memory_that_is_allowed_decides_the_bands() {
         about.parse::<f64>().unwrap()
     };
     let (one, many) = (estimate("1"), estimate("64"));
-    assert!(many < 0.95 * one, "{one} {many}");
+    assert!(many < 0.9 * one, "{one} {many}");
     let limit = format!("{}", (0.5 * (one + many) * 1e6) as u64);
     let (code, text) = bake(&["--max-memory", &limit, "--report", "r.json"]);
     assert_eq!(code, Some(0), "{text}");

@@ -9,7 +9,7 @@ use crate::field::Field;
 use crate::fitted_grid::{Wish, fit};
 use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
-use crate::mask::{Mask, lights_itself, local_position, stand_ins};
+use crate::mask::{Mask, local_position, own_light, stand_ins};
 use crate::node_set::NodeSet;
 use crate::radiance::{BLOCK, RadianceSample, RadianceSamples, Sampler, sample_places};
 use crate::scene::Scene;
@@ -109,12 +109,7 @@ pub(super) fn blocks(lattice: &Lattice) -> usize {
 impl<'a> GridPoints<'a> {
     /// Those on a level set of the sweep, and with `beyond` those just outside that light themselves.
     pub(super) fn new(field: &'a Field, lattice: &'a Lattice, masks: &'a [Mask], beyond: bool) -> Self {
-        let own = |o: usize| match masks[o] {
-            Mask::Valid => true,
-            Mask::Filled => beyond && lights_itself(field, lattice, o),
-            Mask::Empty => false,
-        };
-        Self { field, lattice, masks, set: NodeSet::new(masks.len(), own) }
+        Self { field, lattice, masks, set: NodeSet::new(masks.len(), own_light(field, lattice, masks, beyond)) }
     }
 
     /// Whether a point is one of them.

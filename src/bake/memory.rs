@@ -9,7 +9,7 @@ use crate::error::{Error, Result};
 use crate::flat;
 use crate::flattened::Side;
 use crate::irradiance_caching;
-use crate::mask::{Mask, lights_itself, masks};
+use crate::mask::{Mask, masks, own_light};
 use crate::node_set::NodeSet;
 use crate::photon::{FlatPhoton, PhotonSettings, SurfacePhoton, trace_photons};
 use crate::radiance::RadianceSample;
@@ -42,6 +42,10 @@ const CACHING: u64 = 12 + 16 + irradiance_caching::BYTES;
 /// Bytes per place beside the grid's points while they are fitted: the wish, and sorted by cells with what cells say.
 const WISH: u64 = 24;
 const SORTED: u64 = 40 + 40 + 12;
+
+/// Bytes per point and side of a grid (radiance, standard error, mask), and of what gather rays find at a node.
+const GRID: u64 = 17;
+const CACHED: u64 = 12;
 
 /// Bytes of the sweep engine per grid point (h turned over, normals, one plane of a pass turned over, bits per block), per point
 /// and swept side (direct light, what lines read, what a pass gathers), and per point and stored side (sums over replicates
@@ -174,16 +178,13 @@ impl Parts {
             // On the volume's own lattice: a finer one needs about the same share of its points.
             let masks = masks(&member.field, member.field.lattice());
             let beyond = settings.engine == Engine::Sweep || settings.gather_rays > 0;
-            let lit = |o: usize| match masks[o] {
-                Mask::Empty => false,
-                Mask::Valid => true,
-                Mask::Filled => beyond && lights_itself(&member.field, member.field.lattice(), o),
-            };
+            let lit = own_light(&member.field, member.field.lattice(), &masks, beyond);
             let count = |is: &(dyn Fn(usize) -> bool + Sync)| {
                 (0..masks.len()).into_par_iter().filter(|&o| is(o)).count() as u64 * own_points / own_voxels
             };
             let own = count(&lit);
             let own_filled = count(&|o| masks[o] != Mask::Empty) - own;
+            drop(lit);
             let sides = member.surface.stored_sides().len() as u64;
             let element = volume.samples().element_type().size() as u64;
             // Volume, field, the pyramid of min and max, the masks of volume and grid.
@@ -194,7 +195,7 @@ impl Parts {
                 (_, Some(n)) => n,
                 (_, None) => ((own + own_filled) as f64 * settings.samples_per_point) as u64,
             };
-            grids += own_points * 17 * sides;
+            grids += own_points * GRID * sides;
             if smoothing {
                 halves += own * PACKED * sides;
                 let [nx, ny, nz] = lattice.dims().map(|n| n as u64);
@@ -222,7 +223,7 @@ impl Parts {
                     Interpolation::Fit => samples * SHEPARD + points * FITTED,
                     Interpolation::Irradiance => samples * CACHING,
                 };
-                (samples * stored * SAMPLE, samples * SAMPLE + looked_at + points * 17)
+                (samples * stored * SAMPLE, samples * SAMPLE + looked_at + points * GRID)
             }
         };
         Ok(Self {
@@ -284,7 +285,7 @@ impl Parts {
             Engine::Sweep => vec![
                 ("sweep", base + self.swept + flats * 4),
                 // What rays gather, and which points are lit.
-                ("samples", light + grids / 17 * 12 + self.points + beside * SAMPLE + fitting),
+                ("samples", light + grids / GRID * CACHED + self.points + beside * SAMPLE + fitting),
             ],
         };
         let export = ("export", base + grids + flats + self.export);

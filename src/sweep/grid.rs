@@ -113,7 +113,6 @@ impl Source<'_> {
 }
 
 impl<'a> Geometry<'a> {
-    #[allow(clippy::cast_possible_truncation, reason = "a unit vector in 16 bits")]
     pub(super) fn new(field: &'a Field) -> Self {
         let (dims, h) = (field.lattice().dims(), field.samples());
         let mut normals: Vec<u32> = (0..h.len())

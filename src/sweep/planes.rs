@@ -68,7 +68,8 @@ impl HalfPlanes {
     /// `factor` times `light`, and what was in `old`, of the same form.
     pub(super) fn new(light: &Planes, factor: f32, old: Option<Self>) -> Self {
         let most = factor * light.iter().map(|p| greatest(p)).fold(0.0, f32::max);
-        let before = old.as_ref().map_or([0.0, 1.0], |old| [old.greatest(), old.unit]);
+        let greatest_of = |old: &Self| (0..3).map(|c| old.greatest(c)).fold(0.0, f32::max);
+        let before = old.as_ref().map_or([0.0, 1.0], |old| [greatest_of(old), old.unit]);
         let unit = scale(most + before[0]);
         let (add, keep) = (unit * factor, unit / before[1]);
         let mut planes = old.map_or_else(|| std::array::from_fn(|c| vec![0; light[c].len()]), |old| old.planes);
@@ -89,10 +90,10 @@ impl HalfPlanes {
         decode(self.planes[c][node]) / self.unit
     }
 
-    /// Of all channels.
-    fn greatest(&self) -> f32 {
-        let most = |plane: &[u16]| plane.par_chunks(CHUNK).map(|x| x.iter().fold(0, |m, x| m.max(*x))).max();
-        decode(self.planes.iter().filter_map(|p| most(p)).max().unwrap_or(0)) / self.unit
+    /// The greatest number of a channel.
+    fn greatest(&self, c: usize) -> f32 {
+        let most = self.planes[c].par_chunks(CHUNK).map(|x| x.iter().fold(0, |m, x| m.max(*x))).max();
+        decode(most.unwrap_or(0)) / self.unit
     }
 }
 
@@ -112,11 +113,11 @@ impl NodeLight<'_> {
         }
     }
 
-    /// The greatest number of a side in one channel, or a bound to it.
+    /// The greatest number of a side in one channel.
     pub(super) fn greatest(self, side: usize, c: usize) -> f32 {
         match self {
             Self::Full(sides) => greatest(&sides[side][c]),
-            Self::Half(sides) => sides[side].greatest(),
+            Self::Half(sides) => sides[side].greatest(c),
         }
     }
 
