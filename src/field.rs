@@ -151,6 +151,11 @@ impl Field {
         &self.samples
     }
 
+    /// Whether normals come from these samples, not from those of a coarser field that these interpolate.
+    pub fn has_own_normals(&self) -> bool {
+        self.coarse.is_none()
+    }
+
     /// The largest magnitude that a sample may have.
     pub fn largest(&self) -> f32 {
         self.largest

@@ -4,6 +4,8 @@
 //! dA dc = |∇h| dV. So E = Σ w K / ∫ K |∇h| dV, both over what the estimate accepts: the ball ∩ Ω ∩ {|h − c| ≤ τ} ∩
 //! normal cone. Normalising over the accepted set makes borders, thin sheets and τ unbiased.
 
+mod measure;
+
 mod density;
 mod points;
 

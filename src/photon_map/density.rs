@@ -10,6 +10,7 @@
 //! That, too, is found once per bin, as light is at the photons of \[Christensen99\]: an estimate blends what the bins of the
 //! eight cells around it say of its place.
 
+use super::measure::{self, Bin, Cells, octant};
 use super::{EstimateSettings, Irradiance};
 use crate::direct::luminance;
 use crate::field::Field;
@@ -20,29 +21,13 @@ use glam::{DVec3, DVec4, Vec3};
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// The level sets in a cell of the bins that face one octant.
-#[derive(Clone, Copy, Debug, Default)]
-struct Bin {
-    /// Centroid by `measure`, in coordinates of the bins.
-    centroid: Vec3,
-    /// ∫ |∇h| dV over what lies in Ω and in the sweep.
-    measure: f32,
-    /// Mean unit receiver normal by that measure, towards falling h, normalised.
-    normal: Vec3,
-    /// Mean isovalue by that measure.
-    isovalue: f32,
-    /// How far another isovalue may be to share light: τ, or half of what the bin spans. A steep edge spans the sweep
-    /// within a voxel, where c hardly moves its level set.
-    reach: f32,
-    /// Signs of the normal.
-    octant: u8,
-}
-
 /// The photons of a bin.
 #[derive(Clone, Copy, Debug, Default)]
 struct Tally {
     /// Σ w.
     power: Vec3,
+    /// Its luminance.
+    luminance: f32,
     /// Σ luminance(w)².
     squares: f32,
 }
@@ -60,15 +45,19 @@ struct Light {
     radius: f32,
 }
 
+/// A bin beside another.
+struct Neighbour {
+    number: u32,
+    /// The square of its distance, and its offset, in bins.
+    d2: f32,
+    d: Vec3,
+}
+
 /// The photons of one side in bins.
 pub(super) struct PhotonDensity<'a> {
     field: &'a Field,
     settings: EstimateSettings,
-    /// Cells of the bins per lattice step along each axis.
-    scale: DVec3,
-    /// Lattice steps per cell along each axis.
-    factor: [usize; 3],
-    dims: [usize; 3],
+    cells: Cells,
     /// First bin of each cell, x fastest; one more entry than cells.
     starts: Vec<u32>,
     bins: Vec<Bin>,
@@ -85,12 +74,6 @@ const MOST: f32 = 5.0;
 /// Photons of an estimate per photon of a bin, and the most photons that bins are meant to hold on average.
 const SHARE: f64 = 8.0;
 const FULL: f64 = 8.0;
-
-/// The octant of a normal: a bit per negative coordinate.
-#[inline]
-fn octant(n: DVec3) -> u8 {
-    (n.cmplt(DVec3::ZERO)).bitmask() as u8
-}
 
 impl<'a> PhotonDensity<'a> {
     /// Counts the photons that `keep` accepts. Cells hold whole voxels, as many as make for a few photons in each that
@@ -113,36 +96,12 @@ impl<'a> PhotonDensity<'a> {
         let wanted = (volume * voxels).cbrt();
         let dims = lattice.dims();
         let factor: [usize; 3] = std::array::from_fn(|a| ((wanted / spacing[a]).round() as usize).clamp(1, dims[a]));
-        let mut density = Self {
-            field,
-            settings,
-            scale: 1.0 / DVec3::from_array(factor.map(|f| f as f64)),
-            factor,
-            dims: std::array::from_fn(|a| dims[a].div_ceil(factor[a])),
-            starts: vec![0],
-            bins: Vec::new(),
-            light: Vec::new(),
-            edge: (volume * factor.iter().product::<usize>() as f64).cbrt(),
-        };
-        let [nx, ny, nz] = density.dims;
-        let rows: Vec<(Vec<u32>, Vec<Bin>)> = (0..ny * nz)
-            .into_par_iter()
-            .with_max_len(16)
-            .map(|row| {
-                let mut bins = Vec::new();
-                let end = |i| {
-                    density.measured([i, row % ny, row / ny], &mut bins);
-                    bins.len() as u32
-                };
-                ((0..nx).map(end).collect(), bins)
-            })
-            .collect();
-        for (ends, bins) in rows {
-            let before = density.bins.len() as u32;
-            density.starts.extend(ends.iter().map(|e| before + e));
-            density.bins.extend(bins);
-        }
-        let places: Vec<Option<usize>> = kept.par_iter().map(|p| density.own(p.position.as_dvec3()).1).collect();
+        let cells = Cells::new(factor, dims);
+        let (starts, bins) = measure::bins(field, &cells, settings.tau);
+        let edge = (volume * factor.iter().product::<usize>() as f64).cbrt();
+        let mut density = Self { field, settings, cells, starts, bins, light: Vec::new(), edge };
+        let places: Vec<Option<usize>> =
+            kept.par_iter().with_min_len(1024).map(|p| density.own(p.position.as_dvec3()).1).collect();
         let mut tallies = vec![Tally::default(); density.bins.len()];
         for (p, place) in kept.iter().zip(places) {
             let Some(bin) = place.map(|n| &mut tallies[n]) else { continue };
@@ -150,28 +109,22 @@ impl<'a> PhotonDensity<'a> {
             bin.power += power;
             bin.squares += luminance(power.as_dvec3()).powi(2) as f32;
         }
-        let fitted = |b| density.fitted(b, &tallies);
-        density.light = density.bins.par_iter().with_max_len(4096).map(fitted).collect();
+        for tally in &mut tallies {
+            tally.luminance = luminance(tally.power.as_dvec3()) as f32;
+        }
+        density.light = density
+            .bins
+            .par_iter()
+            .with_max_len(4096)
+            .map_init(Vec::new, |near, bin| density.fitted(bin, &tallies, near))
+            .collect();
         density
-    }
-
-    /// Coordinates of the bins of a local position: cell n spans [n, n + 1].
-    #[inline]
-    fn place(&self, p: DVec3) -> DVec3 {
-        (p + 0.5) * self.scale
-    }
-
-    /// The cell of one such coordinate, or the nearest.
-    #[inline]
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the cells")]
-    fn cell(&self, axis: usize, at: f32) -> usize {
-        (at as usize).min(self.dims[axis] - 1)
     }
 
     /// The bins of cells `from` to `to` of row (j, k).
     #[inline]
     fn row(&self, from: usize, to: usize, j: usize, k: usize) -> Range<usize> {
-        let row = (k * self.dims[1] + j) * self.dims[0];
+        let row = (k * self.cells.dims[1] + j) * self.cells.dims[0];
         self.starts[row + from] as usize..self.starts[row + to + 1] as usize
     }
 
@@ -179,9 +132,10 @@ impl<'a> PhotonDensity<'a> {
     #[inline]
     fn own(&self, position: DVec3) -> (Vec3, Option<usize>) {
         let normal = self.field.falling_normal(position).unwrap_or_default();
-        let place = self.place(position).as_vec3();
-        let [i, j, k] = [0, 1, 2].map(|a| self.cell(a, place[a]));
-        let (octant, normal) = (octant(normal), normal.as_vec3());
+        let normal = normal.as_vec3();
+        let place = self.cells.place(position);
+        let [i, j, k] = [0, 1, 2].map(|a| self.cells.cell(a, place[a]));
+        let octant = octant(normal.into());
         let mut best = (f32::NEG_INFINITY, None);
         for n in self.row(i, i, j, k) {
             let bin = &self.bins[n];
@@ -193,93 +147,21 @@ impl<'a> PhotonDensity<'a> {
         (normal, best.1)
     }
 
-    /// Adds the bins of a cell: ∫ over the octants of its voxels, one point in each, eight of its tangent where the sweep ends.
-    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-    fn measured(&self, cell: [usize; 3], out: &mut Vec<Bin>) {
-        let lattice = self.field.lattice();
-        let dims = lattice.dims();
-        // The samples that the cell interpolates.
-        let range =
-            |a: usize| (cell[a] * self.factor[a]).saturating_sub(1)..=((cell[a] + 1) * self.factor[a]).min(dims[a] - 1);
-        let (mut lo, mut hi) = (f32::INFINITY, f32::NEG_INFINITY);
-        for k in range(2) {
-            for j in range(1) {
-                let row = lattice.offset(*range(0).start(), j, k)..=lattice.offset(*range(0).end(), j, k);
-                for &h in &self.field.samples()[row] {
-                    (lo, hi) = (lo.min(h), hi.max(h));
-                }
-            }
-        }
-        if !(lo <= 1.0 && hi >= 0.0 && lo < hi) {
-            return;
-        }
-        let far = lattice.far();
-        // Points per lattice step: a bin of many voxels needs fewer.
-        let fine = |a: usize| if self.factor[a] < 3 { 2.0 } else { 1.0 };
-        let step = DVec3::new(1.0 / fine(0), 1.0 / fine(1), 1.0 / fine(2));
-        let volume = step.element_product() * lattice.axes().determinant().abs();
-        let from = DVec3::from_array(std::array::from_fn(|a| (cell[a] * self.factor[a]) as f64 - 0.5));
-        let count: [usize; 3] = std::array::from_fn(|a| self.factor[a] * fine(a) as usize);
-        let mut parts = [Part::default(); 8];
-        let to_steps = lattice.axes().transpose();
-        for k in 0..count[2] {
-            for j in 0..count[1] {
-                for i in 0..count[0] {
-                    let p = from + (DVec3::new(i as f64, j as f64, k as f64) + 0.5) * step;
-                    if p.cmplt(DVec3::ZERO).any() || p.cmpgt(far).any() {
-                        continue;
-                    }
-                    let (h, g) = self.field.value_and_gradient(p);
-                    // How far h goes within the octant.
-                    let rise = (to_steps * g) * step;
-                    let spread = 0.5 * rise.abs().element_sum();
-                    let w = g.length() * volume;
-                    if !(w > 0.0 && h + spread >= 0.0 && h - spread <= 1.0) {
-                        continue;
-                    }
-                    let Some(normal) = self.field.falling_normal(p) else { continue };
-                    let part = &mut parts[usize::from(octant(normal))];
-                    if h - spread >= 0.0 && h + spread <= 1.0 {
-                        part.add(w, h, normal, p);
-                        continue;
-                    }
-                    for eighth in 0..8usize {
-                        let at = |axis: usize| if eighth >> axis & 1 == 1 { 0.25 } else { -0.25 };
-                        let offset = DVec3::new(at(0), at(1), at(2));
-                        let h = h + rise.dot(offset);
-                        if (0.0..=1.0).contains(&h) {
-                            part.add(w / 8.0, h, normal, p + offset * step);
-                        }
-                    }
-                }
-            }
-        }
-        let tau = self.settings.tau;
-        out.extend((0..8).zip(parts).filter(|(_, p)| p.measure > 0.0).map(|(octant, p)| Bin {
-            centroid: self.place(p.centroid / p.measure).as_vec3(),
-            measure: p.measure as f32,
-            normal: p.normal.normalize_or_zero().as_vec3(),
-            isovalue: (p.isovalue / p.measure) as f32,
-            reach: tau.max(0.5 * (p.highest - p.lowest)) as f32,
-            octant,
-        }));
-    }
-
     /// Calls `visit(bin, d², d)` for the numbers of the bins within `radius` of `place`, at offset d; all in bins.
     #[inline]
     fn around(&self, place: Vec3, radius: f32, mut visit: impl FnMut(usize, f32, Vec3)) {
         // How far a coordinate is from a cell's span.
         let beyond = |at: f32, cell: usize| (cell as f32 - at).max(at - cell as f32 - 1.0).max(0.0);
         let r2 = radius * radius;
-        for k in self.cell(2, place.z - radius)..=self.cell(2, place.z + radius) {
+        for k in self.cells.cell(2, place.z - radius)..=self.cells.cell(2, place.z + radius) {
             let left = r2 - beyond(place.z, k).powi(2);
-            for j in self.cell(1, place.y - radius)..=self.cell(1, place.y + radius) {
+            for j in self.cells.cell(1, place.y - radius)..=self.cells.cell(1, place.y + radius) {
                 let left = left - beyond(place.y, j).powi(2);
                 if left <= 0.0 {
                     continue;
                 }
                 let half = left.sqrt();
-                for n in self.row(self.cell(0, place.x - half), self.cell(0, place.x + half), j, k) {
+                for n in self.row(self.cells.cell(0, place.x - half), self.cells.cell(0, place.x + half), j, k) {
                     let d = self.bins[n].centroid - place;
                     let d2 = d.length_squared();
                     if d2 < r2 {
@@ -296,42 +178,52 @@ impl<'a> PhotonDensity<'a> {
         (bin.isovalue - isovalue).abs() <= bin.reach && bin.normal.dot(normal) >= self.settings.cone as f32
     }
 
-    /// The radius around a bin that holds the photons asked for, so far as bins allow.
+    /// The bins within `radius` of one that are alike.
+    #[allow(clippy::cast_possible_truncation, reason = "numbers of bins are 32 bits wide")]
+    fn alike(&self, at: &Bin, radius: f32, near: &mut Vec<Neighbour>) {
+        near.clear();
+        self.around(at.centroid, radius, |n, d2, d| {
+            if self.accepts(&self.bins[n], at.isovalue, at.normal) {
+                near.push(Neighbour { number: n as u32, d2, d });
+            }
+        });
+    }
+
+    /// The light that the bins around one that are alike have, within the radius that holds the photons asked for, so far as
+    /// bins allow.
     #[allow(clippy::cast_possible_truncation, reason = "f32 does")]
-    fn radius(&self, at: &Bin, tallies: &[Tally]) -> f32 {
+    fn fitted(&self, at: &Bin, tallies: &[Tally], near: &mut Vec<Neighbour>) -> Light {
         let wanted = self.settings.photons as f32;
-        // Photons of equal power that would be as noisy as those within a radius.
-        let count = |radius: f32| {
+        // Photons of equal power that would be as noisy as those around.
+        let count = |near: &[Neighbour]| {
             let (mut sum, mut squares) = (0.0f32, 0.0f32);
-            self.around(at.centroid, radius, |n, _, _| {
-                if self.accepts(&self.bins[n], at.isovalue, at.normal) {
-                    sum += luminance(tallies[n].power.as_dvec3()) as f32;
-                    squares += tallies[n].squares;
-                }
-            });
+            for neighbour in near {
+                let tally = &tallies[neighbour.number as usize];
+                sum += tally.luminance;
+                squares += tally.squares;
+            }
             if squares > 0.0 { sum * sum / squares } else { 0.0 }
         };
         // Their number grows as the cube of the radius; where too few tell how fast, one more look.
-        let mut n = count(FIRST);
-        let mut radius = FIRST;
-        if n < 0.2 * wanted {
-            radius = MOST;
-            n = count(MOST);
+        let mut known = FIRST;
+        self.alike(at, known, near);
+        let mut photons = count(near);
+        if photons < 0.2 * wanted {
+            known = MOST;
+            self.alike(at, known, near);
+            photons = count(near);
         }
-        (radius * (wanted / n.max(1.0)).cbrt()).clamp(LEAST, MOST)
-    }
-
-    /// The light that the bins around one that are alike have.
-    fn fitted(&self, at: &Bin, tallies: &[Tally]) -> Light {
-        let radius = self.radius(at, tallies);
+        let radius = (known * (wanted / photons.max(1.0)).cbrt()).clamp(LEAST, MOST);
+        if radius > known {
+            self.alike(at, radius, near);
+        }
         let scale = 1.0 / radius;
         let mut fit = Fit::default();
-        self.around(at.centroid, radius, |n, d2, d| {
-            let bin = &self.bins[n];
-            if self.accepts(bin, at.isovalue, at.normal) {
-                fit.add(bin.measure, &tallies[n], 1.0 - d2 * scale * scale, d * scale);
-            }
-        });
+        for neighbour in near.iter().filter(|n| n.d2 < radius * radius) {
+            let n = neighbour.number as usize;
+            let kernel = 1.0 - neighbour.d2 * scale * scale;
+            fit.add(self.bins[n].measure, &tallies[n], kernel, neighbour.d * scale);
+        }
         let (value, slope, variance) = fit.solve();
         Light { value, slope: slope.map(|s| s * scale), variance, radius }
     }
@@ -340,7 +232,7 @@ impl<'a> PhotonDensity<'a> {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "storage is f32; cells are clamped")]
     pub(super) fn irradiance(&self, position: DVec3, isovalue: f64) -> Irradiance {
         let (normal, own) = self.own(position);
-        let place = self.place(position).as_vec3();
+        let place = self.cells.place(position);
         let low = (place - 0.5).floor();
         let high = place - 0.5 - low;
         let (mut mean, mut variance, mut weight) = (Vec3::ZERO, 0.0, 0.0);
@@ -348,7 +240,7 @@ impl<'a> PhotonDensity<'a> {
             let step = Vec3::new((corner & 1) as f32, (corner >> 1 & 1) as f32, (corner >> 2) as f32);
             let cell = low + step;
             let part = (1.0 - (high - step).abs()).element_product();
-            if part <= 0.0 || (0..3).any(|a| cell[a] < 0.0 || cell[a] as usize >= self.dims[a]) {
+            if part <= 0.0 || (0..3).any(|a| cell[a] < 0.0 || cell[a] as usize >= self.cells.dims[a]) {
                 continue;
             }
             let [i, j, k] = cell.to_array().map(|x| x as usize);
@@ -374,35 +266,6 @@ impl<'a> PhotonDensity<'a> {
             variance: f64::from(variance),
             radius: f64::from(own.map_or(MOST, |l| l.radius)) * self.edge,
         }
-    }
-}
-
-/// Sums over the points of a cell that face one octant, weighted by |∇h| dV.
-#[derive(Clone, Copy)]
-struct Part {
-    measure: f64,
-    isovalue: f64,
-    normal: DVec3,
-    centroid: DVec3,
-    lowest: f64,
-    highest: f64,
-}
-
-impl Default for Part {
-    fn default() -> Self {
-        let (lowest, highest) = (f64::INFINITY, f64::NEG_INFINITY);
-        Self { measure: 0.0, isovalue: 0.0, normal: DVec3::ZERO, centroid: DVec3::ZERO, lowest, highest }
-    }
-}
-
-impl Part {
-    #[inline]
-    fn add(&mut self, w: f64, h: f64, normal: DVec3, p: DVec3) {
-        self.measure += w;
-        self.isovalue += w * h;
-        self.normal += w * normal;
-        self.centroid += w * p;
-        (self.lowest, self.highest) = (self.lowest.min(h), self.highest.max(h));
     }
 }
 
