@@ -1,0 +1,135 @@
+use super::*;
+use crate::field::{Field, Sweep};
+use crate::rng::{Rng, Stage};
+use crate::sweep::half::Half4;
+use crate::sweep::half::{decode, encode};
+use crate::sweep::pack::{ASLEEP, LANES, OUTSIDE};
+use crate::volume::{Lattice, Samples, Volume};
+use glam::DVec3;
+
+/// A pack of noise with plateaus, gaps, rows that were not read, ends outside and cuts.
+fn noise(seed: u64) -> Pack {
+    let mut rng = Rng::stream(seed, Stage::Test, 0);
+    let rows = 50;
+    let mut pack = Pack::with_rows(rows);
+    for row in 0..rows {
+        if row % 11 != 7 {
+            pack.awake.push(row as u32);
+        }
+        for lane in 0..LANES {
+            let x = (rng.unit() * 12.0).floor() as f32 / 12.0;
+            let out = row < lane % 5 || row + lane % 3 >= rows;
+            let kind = rng.unit();
+            pack.h[row][lane] = if out {
+                OUTSIDE
+            } else if kind < 0.03 {
+                f32::NAN
+            } else if row % 11 == 7 {
+                ASLEEP
+            } else {
+                x
+            };
+            pack.node[row][lane] = (rng.unit() * 30.0) as u32;
+        }
+    }
+    pack.lasts = std::array::from_fn(|_| std::array::from_fn(|_| (rng.unit() * 17.0) as u32));
+    pack.cuts = (0..2)
+        .map(|i| crate::sweep::pack::Cut { row: 17 + i, lane: 3, places: [3 + 2 * i as u32, 4 + 2 * i as u32] })
+        .collect();
+    pack
+}
+
+/// Numbers for thirty nodes, or five ends over four isovalues and more.
+fn random(seed: u64) -> Vec<Half4> {
+    let mut rng = Rng::stream(seed, Stage::Test, 0);
+    (0..30).map(|_| std::array::from_fn(|_| encode(rng.unit() as f32))).collect()
+}
+
+#[test]
+fn every_instruction_set_scans_to_the_same_bits() {
+    for seed in 0..20 {
+        for way in 0..4 {
+            let way = Way { strict: way & 2 == 2, sign: if way & 1 == 1 { 1.0 } else { -1.0 } };
+            let scan = |isa: Isa| {
+                let mut out = vec![vec![0f32; 48 * LANES]; 3];
+                let light = Light { b: &random(9), flats: &random(10), isovalues: 4 };
+                isa.scan(&mut noise(seed), way, light, &mut out, (LANES, 0));
+                out.iter().flatten().map(|x| x.to_bits()).collect::<Vec<_>>()
+            };
+            assert_eq!(scan(Isa::PLAIN), scan(Isa::detect()), "{way:?}");
+        }
+    }
+}
+
+#[test]
+fn every_instruction_set_marches_to_the_same_bits() {
+    let mut rng = Rng::stream(5, Stage::Test, 0);
+    for count in [1, 15, 16, 17, 100] {
+        let mut row: Vec<f32> = (0..40).map(|_| rng.unit() as f32).collect();
+        row[13] = f32::NAN;
+        let start: Vec<f32> = (0..count).map(|_| rng.unit() as f32).collect();
+        let run = |isa: Isa| {
+            let (mut most, mut least, mut out) = (start.clone(), start.clone(), vec![9u8; count]);
+            isa.march(&row, [-0.3, 0.371], &mut most, &mut least, &mut out);
+            (most.iter().chain(&least).map(|x| x.to_bits()).collect::<Vec<_>>(), out)
+        };
+        assert_eq!(run(Isa::PLAIN), run(Isa::detect()), "{count} lines");
+    }
+}
+
+#[test]
+fn every_instruction_set_finds_the_same_extrema() {
+    let mut rng = Rng::stream(6, Stage::Test, 0);
+    let lattice = Lattice::aligned([9, 14, 11], DVec3::ZERO, DVec3::ONE).unwrap();
+    let mut samples: Vec<f64> = (0..lattice.len()).map(|_| rng.unit()).collect();
+    samples[700] = f64::NAN;
+    let volume = Volume::new("noise", lattice, Samples::F64(samples)).unwrap();
+    let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+    for _ in 0..200 {
+        let mut segments = Segments::NONE;
+        // Partly outside; the last lanes stay empty.
+        let mut point = || DVec3::new(rng.unit(), rng.unit(), rng.unit()) * 20.0 - 4.0;
+        (0..13).for_each(|lane| segments.set(lane, &field, point(), point()));
+        let run = |isa: Isa| {
+            let mut segments = segments.clone();
+            isa.extrema(field.samples(), &mut segments);
+            [segments.least, segments.most].map(|x| x.map(f32::to_bits))
+        };
+        assert_eq!(run(Isa::PLAIN), run(Isa::detect()));
+    }
+}
+
+#[test]
+fn scans_find_the_next_greater_value() {
+    // Against looking at every later sample: [BSV93] is only a faster way to do that.
+    let mut pack = noise(7);
+    pack.cuts.clear();
+    let reference = noise(7);
+    let mut out = vec![vec![0f32; 48 * LANES]; 3];
+    let b = random(9);
+    let light = Light { b: &b, flats: &random(10), isovalues: 4 };
+    Isa::detect().scan(&mut pack, Way { strict: false, sign: 1.0 }, light, &mut out, (LANES, 0));
+    let mut found = [0; 2];
+    let h = |row: usize, lane: usize| reference.h[row][lane];
+    for lane in 0..LANES {
+        for row in (1..49).filter(|r| r % 11 != 7) {
+            let value = h(row, lane);
+            let forward = h((row + 1).min(48), lane) < h((row - 1).max(1), lane);
+            let next = if forward {
+                (row + 1..50).find(|&r| h(r, lane) >= value)
+            } else {
+                (0..row).rev().find(|&r| h(r, lane) >= value)
+            };
+            if let (true, Some(r)) = (value.is_finite(), next) {
+                let before = if forward { r - 1 } else { r + 1 };
+                let h0 = h(before, lane);
+                let first = !h0.is_nan() && (value - h0) < 0.5 * (h(r, lane) - h0);
+                let node = reference.node[if first { before } else { r }][lane];
+                let expected = decode(b[node as usize][1]);
+                assert_eq!(out[1][(row - 1) * LANES + lane], expected, "lane {lane} row {row}");
+                found[usize::from(forward)] += 1;
+            }
+        }
+    }
+    assert!(found[0] > 200 && found[1] > 200, "{found:?}");
+}
