@@ -20,7 +20,8 @@ const MAGIC: &[u8] = b"isolume checkpoint 6\n";
 /// What the magic of any version starts with.
 const ANY_MAGIC: &[u8] = b"isolume checkpoint ";
 
-/// Bytes that may wait to be written, however long ago the last writing was.
+/// Bytes that may wait to be written beside the largest block, however long ago the last writing was. The largest was whole in
+/// memory anyway.
 pub const MOST_WAITING: usize = 128 << 20;
 
 /// Writing may take this share of the time.
@@ -176,13 +177,13 @@ impl Checkpoint {
         state.drop_waiting(key);
         state.waiting_bytes += bytes.len();
         state.waiting.insert(key, bytes);
-        if Instant::now() < state.due && state.waiting_bytes < MOST_WAITING {
+        if Instant::now() < state.due && !state.full() {
             return;
         }
         // A full disk ends no work: the result may still find room, or another checkpoint may.
         if let Err(e) = self.write(&mut state) {
             // What can be computed again is not worth the memory.
-            if state.waiting_bytes >= MOST_WAITING {
+            if state.full() {
                 (state.waiting, state.waiting_bytes) = (BTreeMap::new(), 0);
             }
             if !state.warned {
@@ -236,6 +237,12 @@ impl State {
         if let Some(bytes) = self.waiting.remove(&key) {
             self.waiting_bytes -= bytes.len();
         }
+    }
+
+    /// Whether so much waits that it is written before it is due.
+    fn full(&self) -> bool {
+        let largest = self.waiting.values().map(Vec::len).max().unwrap_or(0);
+        self.waiting_bytes - largest >= MOST_WAITING
     }
 
     fn load(&self, key: Key) -> Option<Vec<u8>> {
@@ -505,10 +512,11 @@ mod tests {
         assert_eq!(c.blocks(), 1);
         // Not due, but too much to hold.
         let c = Checkpoint::new(&folder.path().join("b"), job(1), Duration::from_secs(3600)).unwrap();
-        c.stage(1).save(0, || vec![1; MOST_WAITING / 2]);
-        assert!(!c.path().exists());
+        c.stage(1).save(0, || vec![1; MOST_WAITING + 1]);
         c.stage(1).save(1, || vec![2; MOST_WAITING / 2]);
+        assert!(!c.path().exists(), "the largest block waits whatever its size, others beside it");
+        c.stage(1).save(2, || vec![3; MOST_WAITING / 2]);
         assert!(c.path().exists() && c.state.lock().unwrap().waiting_bytes == 0);
-        assert_eq!(c.stage(1).read(1, |b| (b.len(), b[7])), Some((MOST_WAITING / 2, 2)));
+        assert_eq!(c.stage(1).read(2, |b| (b.len(), b[7])), Some((MOST_WAITING / 2, 3)));
     }
 }

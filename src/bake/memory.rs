@@ -54,8 +54,10 @@ const SWEPT: u64 = 13;
 const SWEPT_SIDE: u64 = 26;
 const SUMMED_SIDE: u64 = 9;
 
-/// Bytes per point and side that its checkpoint holds while a replicate is under way, besides the sums.
+/// Bytes per point and side that its checkpoint holds while a replicate is under way, besides the sums; and per stored side,
+/// when all are done.
 const KEPT_SIDE: u64 = 14;
+const DONE_SIDE: u64 = 15;
 
 /// Bytes per fitted point: seven vectors of conjugate gradients.
 const FITTED: u64 = 84;
@@ -284,8 +286,8 @@ impl Parts {
             ],
             Engine::Sweep => vec![
                 ("sweep", base + self.swept + flats * 4),
-                // What rays gather, and which points are lit.
-                ("samples", light + grids / GRID * CACHED + self.points + beside * SAMPLE + fitting),
+                // What rays gather, which points are lit, and the sweep's light that waits to be written.
+                ("samples", light + grids / GRID * (CACHED + DONE_SIDE) + self.points + beside * SAMPLE + fitting),
             ],
         };
         let export = ("export", base + grids + flats + self.export);

@@ -52,6 +52,7 @@ pub(super) fn direct(
         let per = sides.len();
         let mut sums: Vec<[f32; 2]> = (0..per * n).into_par_iter().with_min_len(1 << 14).map(|_| [0.0; 2]).collect();
         let place = [Side::Lower, Side::Higher].map(|s| sides.iter().position(|x| *x == s).unwrap_or(0));
+        let mut fans = Fans::default();
         for &world in &points {
             if !tick() {
                 return (planes, false);
@@ -60,7 +61,7 @@ pub(super) fn direct(
             let inside = (0..3).all(|a| y[a] >= 0.0 && y[a] <= lattice.far()[a]);
             let start = if inside { scene.field.value(y) as f32 } else { f32::NEG_INFINITY };
             let start = if start.is_nan() { f32::NEG_INFINITY } else { start };
-            let fans = Fans::march((geometry, isa, sides), y, start);
+            fans.march((geometry, isa, sides), y, start);
             let axes = lattice.axes();
             let step = axes.x_axis.as_vec3();
             let facing = light.normal().as_vec3();
@@ -88,6 +89,7 @@ pub(super) fn direct(
                 });
             });
         }
+        drop(fans);
         if !open.whole() {
             sums.par_iter_mut().enumerate().with_min_len(1 << 12).filter(|(_, sum)| sum[0] > 0.0).for_each(
                 |(at, sum)| {

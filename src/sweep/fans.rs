@@ -12,6 +12,8 @@ use rayon::prelude::*;
 pub(super) const SAMPLED: u8 = 1;
 pub(super) const LOWER: u8 = 2;
 pub(super) const HIGHER: u8 = 4;
+/// One of a turn, in the bits above: what is left of turns before is like no sample.
+const TURN: u8 = 8;
 
 /// The lines from a point through the unit lattice of the farthest slice of one of the six pyramids around it.
 struct Fan {
@@ -25,10 +27,9 @@ struct Fan {
     /// First line and their number along u and v, numbered by where they meet the lattice's plane.
     first: [isize; 2],
     count: [usize; 2],
+    /// Where what they see begins.
+    begin: usize,
 }
-
-/// What the lines of a fan see: [row][slice][line].
-type Seen = Vec<u8>;
 
 impl Fan {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
@@ -47,7 +48,7 @@ impl Fan {
         let slices = (k0 as usize, (plane - k0).abs() as usize + 1);
         let first = [0, 1].map(|x| (source[x] - depth.abs()).floor() as isize);
         let count = [0, 1].map(|x| ((source[x] + depth.abs()).ceil() as isize - first[x] + 1).unsigned_abs());
-        Some(Self { layout, source, depth, slices, first, count })
+        Some(Self { layout, source, depth, slices, first, count, begin: 0 })
     }
 
     /// Bytes of a row of lines.
@@ -71,7 +72,7 @@ impl Fan {
         start: f32,
         row: usize,
         [most, least, mixed]: &mut [Vec<f32>; 3],
-        out: &mut [u8],
+        (out, turn): (&mut [u8], u8),
     ) {
         let [nu, nv, _] = self.layout.dims;
         let [sv, sa] = self.layout.stride;
@@ -111,14 +112,14 @@ impl Fan {
             mixed.clear();
             mixed.extend(near.iter().zip(far).map(|(a, b)| a + fv * (b - a)));
             let place = [u0 + lo as f32 * du - i0 as f32, du];
-            isa.march(mixed, place, &mut most[lo..hi], &mut least[lo..hi], &mut out[lo..hi]);
+            isa.march(mixed, place, [&mut most[lo..hi], &mut least[lo..hi]], &mut out[lo..hi], turn);
         }
     }
 
     /// The share of the four lines around local `x` that see the source at their own isovalue there: lower, higher side.
     #[inline]
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the fan")]
-    fn visibility(&self, seen: &Seen, x: [f64; 3]) -> Option<[f32; 2]> {
+    fn visibility(&self, seen: &[u8], turn: u8, x: [f64; 3]) -> Option<[f32; 2]> {
         let [u, v, a] = self.layout.axes;
         let inverse = self.depth / (x[a] - self.source[2]);
         let p = self.source[0] + (x[u] - self.source[0]) * inverse - self.first[0] as f64;
@@ -126,12 +127,13 @@ impl Fan {
         let step = (x[a] as usize).abs_diff(self.slices.0);
         let (i, j) = ((p as usize).min(self.count[0] - 2), (q as usize).min(self.count[1] - 2));
         let (f, g) = ((p - i as f64) as f32, (q - j as f64) as f32);
-        let at = |dj: usize| &seen[((j + dj) * self.slices.1 + step) * self.count[0] + i..][..2];
+        let at = |dj: usize| &seen[self.begin + ((j + dj) * self.slices.1 + step) * self.count[0] + i..][..2];
         let (near, far) = (at(0), at(1));
         let mut sum = [0f32; 3];
         let lines =
             [(near[0], (1.0 - f) * (1.0 - g)), (near[1], f * (1.0 - g)), (far[0], (1.0 - f) * g), (far[1], f * g)];
         for (seen, w) in lines {
+            let seen = if seen & !(TURN - 1) == turn { seen } else { 0 };
             for (s, bit) in sum.iter_mut().zip([SAMPLED, LOWER, HIGHER]) {
                 *s += if seen & bit != 0 { w } else { 0.0 };
             }
@@ -141,33 +143,52 @@ impl Fan {
 }
 
 /// The six fans of a point, and what their lines see.
+#[derive(Default)]
 pub(super) struct Fans {
     source: DVec3,
     fans: [Option<Fan>; 6],
-    seen: [Seen; 6],
+    /// What their lines see, [fan][row][slice][line], and what is left of other points' fans.
+    seen: Vec<u8>,
+    /// A multiple of [`TURN`].
+    turn: u8,
 }
 
 impl Fans {
     /// Marches along all lines of the fans of local point `y`, where h is `start`, side by side: the rows of one fan alone are too few
-    /// for threads to share well.
-    pub(super) fn march((geometry, isa, sides): (&Geometry, Isa, &[Side]), y: DVec3, start: f32) -> Self {
-        let fans: [Option<Fan>; 6] = std::array::from_fn(|f| Fan::new(geometry.dims, y, f % 3, f >= 3));
-        // Of the widest fans most lines miss Ω: what they would see stays untouched.
-        let mut seen = fans.each_ref().map(|fan| vec![0; fan.as_ref().map_or(0, |fan| fan.count[1] * fan.row())]);
-        let mut rows = Vec::new();
-        for (fan, seen) in fans.iter().zip(&mut seen) {
-            let Some(fan) = fan else { continue };
+    /// for threads to share well. They take the place of another point's: most of the lines of the widest miss Ω, and memory that
+    /// is new, or cleared, for every point would be written as a whole.
+    pub(super) fn march(&mut self, (geometry, isa, sides): (&Geometry, Isa, &[Side]), y: DVec3, start: f32) {
+        self.source = y;
+        self.fans = std::array::from_fn(|f| Fan::new(geometry.dims, y, f % 3, f >= 3));
+        self.turn = self.turn.wrapping_add(TURN);
+        if self.turn == 0 {
+            self.seen.par_chunks_mut(1 << 20).for_each(|seen| seen.fill(0));
+            self.turn = TURN;
+        }
+        let turn = self.turn;
+        let mut length = 0;
+        for fan in self.fans.iter_mut().flatten() {
+            fan.begin = length;
+            length += fan.count[1] * fan.row();
+        }
+        if self.seen.len() < length {
+            self.seen = Vec::new();
+            self.seen = vec![0; length];
+        }
+        let (mut rows, mut rest) = (Vec::new(), &mut self.seen[..]);
+        for fan in self.fans.iter().flatten() {
+            let (seen, after) = rest.split_at_mut(fan.count[1] * fan.row());
             rows.extend(seen.chunks_exact_mut(fan.row()).enumerate().map(|(row, out)| (fan, row, out)));
+            rest = after;
         }
         rows.into_par_iter().with_max_len(8).for_each_init(
             || [const { Vec::new() }; 3],
             |scratch, (fan, row, out)| {
                 let awake: [Option<&Blocks>; 2] =
                     std::array::from_fn(|s| Some(geometry.awake(&fan.layout, *sides.get(s)?)));
-                fan.march(isa, geometry.h(&fan.layout), awake, start, row, scratch, out);
+                fan.march(isa, geometry.h(&fan.layout), awake, start, row, scratch, (out, turn));
             },
         );
-        Self { source: y, fans, seen }
     }
 
     /// The share of the four lines around local `x` that see the source at their own isovalue there: lower, higher side. `None`
@@ -178,7 +199,7 @@ impl Fans {
         let [a, b, c] = [(x[0] - y.x).abs(), (x[1] - y.y).abs(), (x[2] - y.z).abs()];
         let axis = if c >= a && c >= b { 2 } else { usize::from(b >= a) };
         let f = axis + if x[axis] > y[axis] { 3 } else { 0 };
-        self.fans[f].as_ref()?.visibility(&self.seen[f], x)
+        self.fans[f].as_ref()?.visibility(&self.seen, self.turn, x)
     }
 }
 
@@ -187,19 +208,70 @@ fn join(a: (usize, usize), b: (usize, usize)) -> (usize, usize) {
     (a.0.min(b.0), a.1.max(b.1))
 }
 
-/// What lines see that meet u = place\[0\] + n · place\[1\] (line n) in a row of samples; takes the row into their extrema.
+/// What lines see that meet u = place\[0\] + n · place\[1\] (line n) in a row of samples, in this turn; takes the row into their extrema.
 #[inline(always)]
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the row")]
-pub(super) fn march_row(row: &[f32], [u0, du]: [f32; 2], most: &mut [f32], least: &mut [f32], out: &mut [u8]) {
+pub(super) fn march_row(row: &[f32], [u0, du]: [f32; 2], [most, least]: [&mut [f32]; 2], out: &mut [u8], turn: u8) {
     let last = row.len() - 2;
     for (n, ((most, least), out)) in most.iter_mut().zip(least).zip(out).enumerate() {
         let u = (u0 + n as f32 * du).max(0.0);
         let i = (u as usize).min(last);
         let (a, b) = (row[i], row[i + 1]);
         let x = a + (u - i as f32) * (b - a);
-        *out = if x.is_nan() { 0 } else { u8::from(x > *most) * LOWER + u8::from(x <= *least) * HIGHER + SAMPLED };
+        let seen = u8::from(x > *most) * LOWER + u8::from(x <= *least) * HIGHER + SAMPLED;
+        *out = if x.is_nan() { 0 } else { seen + turn };
         // f32::max and min pass over NaN.
         *most = most.max(x);
         *least = least.min(x);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::{Field, Sweep};
+    use crate::rng::{Rng, Stage};
+    use crate::volume::{Lattice, Samples, Volume};
+
+    /// Noise, of which x ≤ `most` is in the sweep: elsewhere lines are not marched along, and what others saw stays.
+    fn noise(dims: [usize; 3], most: usize) -> Field {
+        let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::ONE).unwrap();
+        let mut rng = Rng::stream(3, Stage::Test, 0);
+        let low = |at: usize| if at % dims[0] > most { -7.0 } else { 0.0 };
+        let mut samples: Vec<f32> = (0..lattice.len()).map(|at| low(at) + rng.unit() as f32).collect();
+        samples[dims[0] + 1] = f32::NAN;
+        Field::new(&Volume::new("noise", lattice, Samples::F32(samples)).unwrap(), Sweep::new(0.0, 1.0).unwrap())
+            .unwrap()
+    }
+
+    /// From sources within the lattice and outside, one after the other and whole rounds of turns apart.
+    #[test]
+    fn fans_of_other_points_leave_nothing() {
+        let (field, small) = (noise([17, 12, 14], 8), noise([3, 3, 3], 3));
+        let (geometry, small) = (Geometry::new(&field), Geometry::new(&small));
+        let (isa, sides) = (Isa::detect(), [Side::Lower, Side::Higher]);
+        let mut rng = Rng::stream(4, Stage::Test, 0);
+        let mut fans = Fans::default();
+        let mut partial = 0;
+        for n in 0..60 {
+            let mut y = DVec3::new(rng.unit(), rng.unit(), rng.unit()) * DVec3::new(16.0, 11.0, 13.0);
+            if n % 3 == 0 {
+                y.z = 14.0 + rng.unit();
+            }
+            let mut new = Fans::default();
+            fans.march((&geometry, isa, &sides), y, 0.3);
+            new.march((&geometry, isa, &sides), y, 0.3);
+            for at in (0..geometry.h.len()).filter(|&at| geometry.lit(at)) {
+                let x = field.lattice().ijk(at).map(|i| i as f64);
+                let seen = fans.visibility(x);
+                assert_eq!(seen, new.visibility(x), "point {n}, {x:?}");
+                partial += usize::from(seen.is_some_and(|s| s[0] > 0.0 && s[0] < 1.0));
+            }
+            // Until the next has the same turn.
+            for _ in 0..if n % 2 == 0 { u8::MAX / TURN - 1 } else { 0 } {
+                fans.march((&small, isa, &sides), DVec3::splat(1.3), 0.3);
+            }
+        }
+        assert!(partial > 1000, "{partial}");
     }
 }

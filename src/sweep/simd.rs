@@ -105,12 +105,12 @@ impl Isa {
     ));
 
     /// [`march_row`].
-    pub(super) fn march(self, row: &[f32], place: [f32; 2], most: &mut [f32], least: &mut [f32], out: &mut [u8]) {
+    pub(super) fn march(self, row: &[f32], place: [f32; 2], extrema: [&mut [f32]; 2], out: &mut [u8], turn: u8) {
         match self.0 {
             // SAFETY: `detect` made this kind on a machine with the features that `march` enables.
             #[cfg(target_arch = "x86_64")]
-            Kind::Avx512 => unsafe { avx512::march(row, place, most, least, out) },
-            _ => march_row(row, place, most, least, out),
+            Kind::Avx512 => unsafe { avx512::march(row, place, extrema, out, turn) },
+            _ => march_row(row, place, extrema, out, turn),
         }
     }
 
@@ -160,14 +160,14 @@ mod avx512 {
     /// [`super::march_row`].
     #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
     #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, reason = "places in a row")]
-    pub(super) fn march(row: &[f32], [u0, du]: [f32; 2], most: &mut [f32], least: &mut [f32], out: &mut [u8]) {
+    pub(super) fn march(row: &[f32], [u0, du]: [f32; 2], [most, least]: [&mut [f32]; 2], out: &mut [u8], turn: u8) {
         let count = out.len();
         assert!(most.len() == count && least.len() == count && row.len() >= 2);
         let last = _mm512_set1_epi32(row.len() as i32 - 2);
         let (u0, du) = (_mm512_set1_ps(u0), _mm512_set1_ps(du));
         let zero = _mm512_setzero_ps();
         let lane = _mm512_setr_ps(0., 1., 2., 3., 4., 5., 6., 7., 8., 9., 10., 11., 12., 13., 14., 15.);
-        let [sampled, lower, higher] = [SAMPLED, LOWER, HIGHER].map(|b| _mm_set1_epi8(b as i8));
+        let [sampled, lower, higher] = [SAMPLED | turn, LOWER, HIGHER].map(|b| _mm_set1_epi8(b as i8));
         for start in (0..count).step_by(LANES) {
             let mask: __mmask16 = if count - start >= LANES { u16::MAX } else { (1 << (count - start)) - 1 };
             let n = _mm512_add_ps(lane, _mm512_set1_ps(start as f32));

@@ -70,7 +70,7 @@ fn every_instruction_set_marches_to_the_same_bits() {
         let start: Vec<f32> = (0..count).map(|_| rng.unit() as f32).collect();
         let run = |isa: Isa| {
             let (mut most, mut least, mut out) = (start.clone(), start.clone(), vec![9u8; count]);
-            isa.march(&row, [-0.3, 0.371], &mut most, &mut least, &mut out);
+            isa.march(&row, [-0.3, 0.371], [&mut most, &mut least], &mut out, 24);
             (most.iter().chain(&least).map(|x| x.to_bits()).collect::<Vec<_>>(), out)
         };
         assert_eq!(run(Isa::PLAIN), run(Isa::detect()), "{count} lines");
