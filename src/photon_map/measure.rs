@@ -1,10 +1,10 @@
 //! The measure ∫|∇h| dV of level sets in the cells of a grid, by the octants that they face: what photons' power is divided by.
 //!
-//! One point stands for each octant of a voxel. Points of a row share their place along y and z, so that a row of the lattice is
-//! interpolated across once, and then along x.
+//! One point stands for each eighth of a voxel, or in cells of many voxels for each voxel. Points of a row share their place along
+//! y and z, so that a row of the lattice is interpolated across once, and then along x.
 
 use crate::field::Field;
-use glam::{DVec3, Mat3A, Vec3, Vec3A, Vec4};
+use glam::{DVec3, DVec4, Mat3A, Vec3, Vec3A};
 use rayon::prelude::*;
 
 /// The level sets in a cell that face one octant.
@@ -62,7 +62,7 @@ impl Cells {
 
 /// The bins of all cells, in the cells' order, and the first bin of each cell, with one more entry than cells. `tau`: see
 /// [`Bin::reach`].
-#[allow(clippy::cast_possible_truncation, reason = "fewer bins than voxels times eight")]
+#[allow(clippy::cast_possible_truncation, reason = "2³² bins take 240 GB")]
 pub(super) fn bins(field: &Field, cells: &Cells, tau: f64) -> (Vec<u32>, Vec<Bin>) {
     let points = Points::new(field, cells, tau);
     let [_, ny, nz] = cells.dims;
@@ -87,14 +87,28 @@ struct Points<'a> {
     tau: f64,
     /// Points per lattice step along each axis: cells of many voxels need fewer.
     fine: [usize; 3],
-    /// Lattice steps between points.
-    step: Vec3A,
-    /// World volume of a point.
-    volume: f32,
+    /// Along each axis, as many per cell as a cell has; `None` outside Ω.
+    slots: [Vec<Option<Slot>>; 3],
+    /// World volume of a voxel.
+    volume: f64,
     /// From gradients in index space to the world.
     to_world: Mat3A,
     /// What is known of each row of the lattice.
     rows: Vec<LatticeRow>,
+}
+
+/// What a point stands for along one axis.
+#[derive(Clone, Copy, Debug)]
+struct Slot {
+    /// The point's place, its cell of the lattice, and where in that.
+    at: f64,
+    cell: usize,
+    inside: f32,
+    /// The middle of what it stands for, and its width.
+    centre: f32,
+    width: f32,
+    /// The first and the last node of the cells that this lies in.
+    nodes: [usize; 2],
 }
 
 /// The samples of a row of the lattice.
@@ -135,67 +149,77 @@ impl LatticeRow {
     }
 }
 
+impl Slot {
+    /// Where points lie, in steps beside a node: two to a cell are exact for cubics, such as |∇h|² [Gauss]. At nodes gradients
+    /// are differences of single pairs of samples, which noise makes larger than they are between them.
+    const BESIDE: f64 = 0.211_324_865_405_187_1;
+
+    /// Slot `n` of an axis of `count` nodes with `fine` slots a node.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within the lattice")]
+    fn new(n: usize, fine: usize, count: usize) -> Option<Self> {
+        let (node, last) = (n / fine, count - 1);
+        let middle = node as f64;
+        // Halves of a voxel, or one by turns on either side of its node.
+        let (low, high, up) = match (fine, n % 2) {
+            (2, 0) => (middle - 0.5, middle, false),
+            (2, _) => (middle, middle + 0.5, true),
+            (_, odd) => (middle - 0.5, middle + 0.5, node == 0 || (odd == 0 && node != last)),
+        };
+        let (low, high) = (low.max(0.0), high.min(last as f64));
+        let at = middle + if up { Self::BESIDE } else { -Self::BESIDE };
+        let cell = at as usize;
+        (low < high).then(|| Self {
+            at,
+            cell,
+            inside: (at - cell as f64) as f32,
+            centre: (0.5 * (low + high)) as f32,
+            width: (high - low) as f32,
+            nodes: [low.floor() as usize, high.ceil() as usize],
+        })
+    }
+}
+
 impl<'a> Points<'a> {
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     fn new(field: &'a Field, cells: &'a Cells, tau: f64) -> Self {
         let lattice = field.lattice();
+        let dims = lattice.dims();
         let fine = cells.factor.map(|f| if f < 3 { 2 } else { 1 });
-        let step = Vec3A::from_array(fine.map(|f| 1.0 / f as f32));
+        let slots =
+            [0, 1, 2].map(|a| (0..fine[a] * dims[a]).map(|n| Slot::new(n, fine[a], dims[a])).collect::<Vec<_>>());
         let world = |g: DVec3| lattice.gradient_to_world(g).as_vec3a();
-        let rows = field.samples().par_chunks(lattice.dims()[0]).with_min_len(64).map(LatticeRow::new).collect();
+        let rows = field.samples().par_chunks(dims[0]).with_min_len(64).map(LatticeRow::new).collect();
         Self {
             field,
             cells,
             tau,
             fine,
-            step,
-            volume: step.element_product() * lattice.axes().determinant().abs() as f32,
+            slots,
+            volume: lattice.axes().determinant().abs(),
             to_world: Mat3A::from_cols(world(DVec3::X), world(DVec3::Y), world(DVec3::Z)),
             rows,
         }
     }
 
-    /// The place of point `n` along an axis, in lattice steps; `None` outside Ω.
-    #[inline]
-    fn place(&self, axis: usize, n: usize) -> Option<f64> {
-        let place = (n as f64 + 0.5) * f64::from(self.step[axis]) - 0.5;
-        (place >= 0.0 && place <= self.field.lattice().cells()[axis] as f64).then_some(place)
-    }
-
-    /// How much of what a point stands for lies in Ω.
-    fn share(&self, axis: usize, place: f64) -> f32 {
-        let face = place == 0.0 || place == self.field.lattice().cells()[axis] as f64;
-        if face { 0.5 } else { 1.0 }
-    }
-
-    /// The lattice's cell along an axis that holds a place, and where in it.
-    #[inline]
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within the lattice")]
-    fn cell(&self, axis: usize, place: f64) -> (usize, f32) {
-        let cell = (place as usize).min(self.field.lattice().cells()[axis] - 1);
-        (cell, (place - cell as f64) as f32)
-    }
-
     /// The bins of row (j, k) of the cells: the end of each cell's, and the bins.
-    #[allow(clippy::cast_possible_truncation, reason = "fewer bins than voxels times eight")]
+    #[allow(clippy::cast_possible_truncation, reason = "2³² bins take 240 GB")]
     fn bins_of_row(&self, [j, k]: [usize; 2], row: &mut Row) -> (Vec<u32>, Vec<Bin>) {
         let Row { nodes, parts } = row;
         parts.clear();
         parts.resize(self.cells.dims[0], Default::default());
-        let points = |axis: usize, cell: usize| {
+        let slots = |axis: usize, cell: usize| {
             let count = self.cells.factor[axis] * self.fine[axis];
-            (cell * count..(cell + 1) * count).filter_map(move |n| self.place(axis, n))
+            self.slots[axis].iter().skip(cell * count).take(count).flatten()
         };
         let mut met = false;
-        for (y, z) in points(2, k).flat_map(|z| points(1, j).map(move |y| (y, z))) {
-            let ((j, v), (k, w)) = (self.cell(1, y), self.cell(2, z));
-            let Some(range) = self.reach(j, k) else { continue };
+        for (y, z) in slots(2, k).flat_map(|z| slots(1, j).map(move |y| (y, z))) {
+            let Some(range) = self.reach(y, z) else { continue };
             met = true;
-            if self.regular(j, k) {
-                self.read_nodes([j, k], [v, w], range, nodes);
+            if self.regular(y.cell, z.cell) {
+                self.read_nodes([y, z], range, nodes);
                 self.add([y, z], range, |x| Some(self.between(nodes, x)), parts);
             } else {
-                self.add([y, z], range, |x| self.point(DVec3::new(x, y, z)), parts);
+                self.add([y, z], range, |x| self.point(DVec3::new(x.at, y.at, z.at)), parts);
             }
         }
         let (mut ends, mut bins) = (vec![0; self.cells.dims[0]], Vec::new());
@@ -208,14 +232,18 @@ impl<'a> Points<'a> {
         (ends, bins)
     }
 
-    /// From which to behind which node along x level sets of the sweep may pass between rows j, j + 1 and k, k + 1.
-    fn reach(&self, j: usize, k: usize) -> Option<[usize; 2]> {
+    /// From which to behind which node along x those points lie in whose share level sets of the sweep may pass.
+    fn reach(&self, y: &Slot, z: &Slot) -> Option<[usize; 2]> {
         let [nx, ny, _] = self.field.lattice().dims();
-        let rows = [(j, k), (j + 1, k), (j, k + 1), (j + 1, k + 1)].map(|(j, k)| self.rows[k * ny + j]);
-        let first = rows.iter().map(|r| r.reach[0]).min()?;
-        let last = rows.iter().map(|r| r.reach[1]).max()?;
-        let any = first < last && rows.iter().any(|r| r.lowest <= 1.0);
-        any.then(|| [first.saturating_sub(1), (last + 1).min(nx)])
+        let (mut first, mut last, mut lowest) = (nx, 0, f32::INFINITY);
+        for row in (z.nodes[0]..=z.nodes[1]).flat_map(|k| (y.nodes[0]..=y.nodes[1]).map(move |j| k * ny + j)) {
+            let row = self.rows[row];
+            (first, last) = (first.min(row.reach[0]), last.max(row.reach[1]));
+            lowest = lowest.min(row.lowest);
+        }
+        // A voxel lies in the cells on both sides of its node, its point in one.
+        let beside = 3 - self.fine[0];
+        (first < last && lowest <= 1.0).then(|| [first.saturating_sub(beside), (last + beside).min(nx)])
     }
 
     /// Whether all samples that gradients there look at are finite, and normals are those of these samples.
@@ -225,9 +253,10 @@ impl<'a> Points<'a> {
         self.field.has_own_normals() && around(k, nz).all(|k| around(j, ny).all(|j| self.rows[k * ny + j].finite))
     }
 
-    /// [`Row::nodes`] at y = j + v, z = k + w over a range of x.
-    fn read_nodes(&self, [j, k]: [usize; 2], [v, w]: [f32; 2], range: [usize; 2], nodes: &mut [Vec<f32>; 6]) {
+    /// [`Row::nodes`] at y and z over a range of x.
+    fn read_nodes(&self, [y, z]: [&Slot; 2], range: [usize; 2], nodes: &mut [Vec<f32>; 6]) {
         let [nx, ny, nz] = self.field.lattice().dims();
+        let ((j, v), (k, w)) = ((y.cell, y.inside), (z.cell, z.inside));
         // Differences along x look one node further.
         let (from, to) = (range[0].saturating_sub(1), (range[1] + 1).min(nx));
         let len = to - from;
@@ -278,8 +307,8 @@ impl<'a> Points<'a> {
 
     /// A point between the nodes of a row.
     #[inline(always)]
-    fn between(&self, [h, dy, dz, rx, ry, rz]: &[Vec<f32>; 6], x: f64) -> Point {
-        let (i, u) = self.cell(0, x);
+    fn between(&self, [h, dy, dz, rx, ry, rz]: &[Vec<f32>; 6], x: &Slot) -> Point {
+        let (i, u) = (x.cell, x.inside);
         let at = |n: &[f32]| (1.0 - u) * n[i] + u * n[i + 1];
         Point {
             h: at(h),
@@ -303,32 +332,35 @@ impl<'a> Points<'a> {
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     fn add(
         &self,
-        [y, z]: [f64; 2],
+        [y, z]: [&Slot; 2],
         [first, end]: [usize; 2],
-        point: impl Fn(f64) -> Option<Point>,
+        point: impl Fn(&Slot) -> Option<Point>,
         parts: &mut [[Part; 8]],
     ) {
-        let across = self.volume * self.share(1, y) * self.share(2, z);
+        let volume = self.volume * f64::from(y.width * z.width);
         let per_cell = self.cells.factor[0] * self.fine[0];
-        let within = first as f64..=(end - 1) as f64;
         for n in self.fine[0] * first..self.fine[0] * end {
-            let Some(x) = self.place(0, n).filter(|x| within.contains(x)) else { continue };
+            let Some(x) = self.slots[0][n].as_ref().filter(|x| x.cell >= first && x.cell + 1 < end) else { continue };
             let Some(Point { h, slope, receiver }) = point(x) else { continue };
-            // How far h goes within the octant.
-            let rise = slope * self.step;
+            // h in the middle of what the point stands for, and how far it goes there.
+            let centre = Vec3A::new(x.centre, y.centre, z.centre);
+            let h = h + slope.dot(centre - Vec3A::new(x.at as f32, y.at as f32, z.at as f32));
+            let width = Vec3A::new(x.width, y.width, z.width);
+            let rise = slope * width;
             let spread = 0.5 * rise.abs().element_sum();
             if !(h + spread >= 0.0 && h - spread <= 1.0) {
                 continue;
             }
-            let w = (self.to_world * slope).length() * across * self.share(0, x);
-            let Some(normal) = (self.to_world * -receiver).try_normalize() else { continue };
-            if !(w > 0.0 && w < f32::INFINITY) {
+            // Squares of steep slopes are too large.
+            let (steep, most) = (slope.abs().max_element(), receiver.abs().max_element());
+            let w = volume * f64::from(x.width * steep * (self.to_world * (slope / steep)).length());
+            let Some(normal) = (self.to_world * -(receiver / most)).try_normalize() else { continue };
+            if !(w > 0.0 && w < f64::INFINITY) {
                 continue;
             }
-            let p = Vec3A::new(x as f32, y as f32, z as f32);
             let part = &mut parts[n / per_cell][usize::from(octant(normal))];
             if h - spread >= 0.0 && h + spread <= 1.0 {
-                part.add(w, h, normal, p);
+                part.add(w, h, normal, centre);
                 continue;
             }
             // Where the sweep ends, eight points of the tangent.
@@ -337,7 +369,7 @@ impl<'a> Points<'a> {
                 let offset = Vec3A::new(at(0), at(1), at(2));
                 let h = h + rise.dot(offset);
                 if (0.0..=1.0).contains(&h) {
-                    part.add(w / 8.0, h, normal, p + offset * self.step);
+                    part.add(w / 8.0, h, normal, centre + offset * width);
                 }
             }
         }
@@ -348,24 +380,24 @@ impl<'a> Points<'a> {
 #[derive(Clone, Copy)]
 struct Part {
     /// Of the normal, and the measure.
-    normal: Vec4,
+    normal: DVec4,
     /// Of the place, and of h.
-    place: Vec4,
+    place: DVec4,
     lowest: f32,
     highest: f32,
 }
 
 impl Default for Part {
     fn default() -> Self {
-        Self { normal: Vec4::ZERO, place: Vec4::ZERO, lowest: f32::INFINITY, highest: f32::NEG_INFINITY }
+        Self { normal: DVec4::ZERO, place: DVec4::ZERO, lowest: f32::INFINITY, highest: f32::NEG_INFINITY }
     }
 }
 
 impl Part {
     #[inline]
-    fn add(&mut self, w: f32, h: f32, normal: Vec3A, p: Vec3A) {
-        self.normal += w * normal.extend(1.0);
-        self.place += w * p.extend(h);
+    fn add(&mut self, w: f64, h: f32, normal: Vec3A, p: Vec3A) {
+        self.normal += w * normal.extend(1.0).as_dvec4();
+        self.place += w * p.extend(h).as_dvec4();
         (self.lowest, self.highest) = (self.lowest.min(h), self.highest.max(h));
     }
 
@@ -374,10 +406,10 @@ impl Part {
     fn bin(&self, octant: u8, cells: &Cells, tau: f64) -> Option<Bin> {
         let measure = self.normal.w;
         (measure > 0.0).then(|| Bin {
-            centroid: cells.place((self.place.truncate() / measure).as_dvec3()),
-            measure,
-            normal: self.normal.truncate().normalize_or_zero(),
-            isovalue: self.place.w / measure,
+            centroid: cells.place(self.place.truncate() / measure),
+            measure: measure as f32,
+            normal: (self.normal.truncate() / measure).as_vec3().normalize_or_zero(),
+            isovalue: (self.place.w / measure) as f32,
             reach: (tau as f32).max(0.5 * (self.highest - self.lowest)),
             octant,
         })
@@ -410,24 +442,19 @@ mod tests {
         for factor in [1, 2, 3] {
             let cells = Cells::new([factor; 3], noise.lattice().dims());
             let points = Points::new(&noise, &cells, 0.1);
-            let places = |axis: usize| {
-                let count = points.fine[axis] * noise.lattice().dims()[axis];
-                (0..count).filter_map(|n| points.place(axis, n)).collect::<Vec<_>>()
-            };
+            let slots = |axis: usize| points.slots[axis].iter().flatten();
             let (mut nodes, mut compared) = (Default::default(), 0);
-            for (y, z) in places(2).into_iter().flat_map(|z| places(1).into_iter().map(move |y| (y, z))) {
-                let ((j, v), (k, w)) = (points.cell(1, y), points.cell(2, z));
-                assert!(points.regular(j, k) && points.reach(j, k) == Some([0, 9]));
-                for (range, x) in [[0, 9], [2, 7]].into_iter().flat_map(|r| places(0).into_iter().map(move |x| (r, x)))
-                {
-                    if x < range[0] as f64 || x > (range[1] - 1) as f64 {
+            for (y, z) in slots(2).flat_map(|z| slots(1).map(move |y| (y, z))) {
+                assert!(points.regular(y.cell, z.cell) && points.reach(y, z) == Some([0, 9]));
+                for (range, x) in [[0, 9], [2, 7]].into_iter().flat_map(|r| slots(0).map(move |x| (r, x))) {
+                    if x.cell < range[0] || x.cell + 1 >= range[1] {
                         continue;
                     }
-                    points.read_nodes([j, k], [v, w], range, &mut nodes);
-                    let (fast, slow) = (points.between(&nodes, x), points.point(DVec3::new(x, y, z)).unwrap());
+                    points.read_nodes([y, z], range, &mut nodes);
+                    let (fast, slow) = (points.between(&nodes, x), points.point(DVec3::new(x.at, y.at, z.at)).unwrap());
                     let gradients = [(fast.slope, slow.slope), (fast.receiver, slow.receiver)];
                     let far = gradients.iter().map(|(a, b)| (*a - *b).abs().max_element()).fold(0.0, f32::max);
-                    assert!((fast.h - slow.h).abs().max(far) < 1e-5, "{factor}: {x} {y} {z}: {fast:?} {slow:?}");
+                    assert!((fast.h - slow.h).abs().max(far) < 1e-5, "{factor}: {x:?} {y:?} {z:?}: {fast:?} {slow:?}");
                     compared += 1;
                 }
             }
@@ -438,20 +465,101 @@ mod tests {
     #[test]
     fn the_measure_of_a_ramp_is_its_slope_times_its_volume() {
         let dims = [13, 11, 12];
-        for (axis, factor) in (0..3).flat_map(|axis| [(axis, 1), (axis, 2), (axis, 3), (axis, 5)]) {
-            let lattice = oblique(dims);
-            let axes = lattice.axes();
-            // Runs along one axis, from outside the sweep through all of it.
-            let ramp = field(lattice, |ijk| (ijk[axis] as f64 - 3.3) / 5.1);
-            let slope = ramp.lattice().gradient_to_world(DVec3::AXES[axis]).length() / 5.1;
-            let across: f64 = (0..3).filter(|&a| a != axis).map(|a| (dims[a] - 1) as f64).product();
-            let expected = slope * across * 5.1 * axes.determinant().abs();
-            let (starts, found) = bins(&ramp, &Cells::new([factor; 3], dims), 0.1);
-            assert_eq!(*starts.last().unwrap() as usize, found.len());
-            let measure: f64 = found.iter().map(|b| f64::from(b.measure)).sum();
-            assert!((measure / expected - 1.0).abs() < 0.05, "{axis} {factor}: {measure} {expected}");
-            assert!(found.iter().all(|b| (0.0..=1.0).contains(&b.isovalue) && (b.normal.length() - 1.0).abs() < 1e-5));
+        let cases = (0..3).flat_map(|axis| [1, 2, 3, 5].map(|factor| (axis, factor)));
+        for ((axis, factor), begin) in cases.flat_map(|case| [3.0, 3.3, 3.55, 3.8, 4.05].map(|begin| (case, begin))) {
+            for falling in [false, true] {
+                let lattice = oblique(dims);
+                let axes = lattice.axes();
+                // Runs along one axis, from outside the sweep through all of it.
+                let ramp = field(lattice, |ijk| {
+                    let h = (ijk[axis] as f64 - begin) / 5.1;
+                    if falling { 1.0 - h } else { h }
+                });
+                let slope = ramp.lattice().gradient_to_world(DVec3::AXES[axis]).length() / 5.1;
+                let across: f64 = (0..3).filter(|&a| a != axis).map(|a| (dims[a] - 1) as f64).product();
+                let expected = slope * across * 5.1 * axes.determinant().abs();
+                let (starts, found) = bins(&ramp, &Cells::new([factor; 3], dims), 0.1);
+                assert_eq!(*starts.last().unwrap() as usize, found.len());
+                let measure: f64 = found.iter().map(|b| f64::from(b.measure)).sum();
+                let error = measure / expected - 1.0;
+                // A quarter of a voxel at either end is all that eight points of a tangent leave open.
+                assert!(error.abs() < 0.05, "axis {axis}, factor {factor}, from {begin}, {falling}: {error}");
+                assert!(
+                    found.iter().all(|b| (0.0..=1.0).contains(&b.isovalue) && (b.normal.length() - 1.0).abs() < 1e-5)
+                );
+                // The mean place is the middle, to half of what is left open.
+                let mean = found.iter().map(|b| f64::from(b.centroid[axis]) * f64::from(b.measure)).sum::<f64>();
+                let place = mean / measure * factor as f64 - 0.5;
+                let within = if factor < 3 { 0.13 } else { 0.26 };
+                assert!((place - begin - 2.55).abs() < within, "axis {axis}, factor {factor}, from {begin}: {place}");
+            }
         }
+    }
+
+    /// Against all points one by one, on balls that bulge towards all sides, beside a sample that is no number, and within Ω's faces.
+    #[test]
+    fn rows_and_ranges_leave_nothing_out() {
+        let dims = [15, 14, 16];
+        for (bulge, hole, factor) in [1.0, -1.0]
+            .into_iter()
+            .flat_map(|bulge| [false, true].map(|hole| (bulge, hole)))
+            .flat_map(|(bulge, hole)| [[1; 3], [3; 3], [1, 3, 4], [16; 3]].map(|factor| (bulge, hole, factor)))
+        {
+            let ball = field(oblique(dims), |[i, j, k]| {
+                let r = (DVec3::new(i as f64, j as f64, k as f64) - DVec3::new(6.3, 7.1, 8.4)).length();
+                let here = hole && [i, j, k] == [9, 7, 8];
+                if here { f64::NAN } else { 0.5 + bulge * (0.4 - 0.2 * (r - 2.0)) }
+            });
+            let cells = Cells::new(factor, dims);
+            let points = Points::new(&ball, &cells, 0.1);
+            let (_, found) = bins(&ball, &cells, 0.1);
+            let mut all = vec![[Part::default(); 8]; cells.dims[0]];
+            let slots = |axis: usize| points.slots[axis].iter().flatten();
+            for (y, z) in slots(2).flat_map(|z| slots(1).map(move |y| (y, z))) {
+                points.add([y, z], [0, dims[0]], |x| points.point(DVec3::new(x.at, y.at, z.at)), &mut all);
+            }
+            for n in 0..8 {
+                let expected: f64 = all.iter().map(|parts| parts[n].normal.w).sum();
+                let measure: f64 =
+                    found.iter().filter(|b| usize::from(b.octant) == n).map(|b| f64::from(b.measure)).sum();
+                assert!(expected > 0.0);
+                assert!((measure / expected - 1.0).abs() < 1e-5, "{bulge} {hole} {factor:?} {n}: {measure} {expected}");
+            }
+        }
+    }
+
+    /// The mean of |∇h| over noise is the same whatever the cells: points that lie at nodes find it half as large again.
+    #[test]
+    fn noise_has_the_same_measure_in_cells_of_any_size() {
+        let dims = [24, 22, 26];
+        let mut rng = Rng::stream(5, Stage::Test, 0);
+        let noise = field(Lattice::aligned(dims, DVec3::ZERO, DVec3::ONE).unwrap(), |_| 0.4 + 0.2 * rng.unit());
+        // ∫ |∇h| dV by 6³ points a cell.
+        let mut expected = 0.0;
+        let fine = |axis: usize| (0..6 * (dims[axis] - 1)).map(|n| (n as f64 + 0.5) / 6.0);
+        for (y, z) in fine(2).flat_map(|z| fine(1).map(move |y| (y, z))) {
+            expected += fine(0).map(|x| noise.value_and_gradient(DVec3::new(x, y, z)).1.length()).sum::<f64>() / 216.0;
+        }
+        for factor in [1, 2, 3, 5, 30] {
+            let (_, found) = bins(&noise, &Cells::new([factor; 3], dims), 0.1);
+            let measure = found.iter().map(|b| f64::from(b.measure)).sum::<f64>();
+            assert!((measure / expected - 1.0).abs() < 0.03, "{factor}: {measure} {expected}");
+        }
+    }
+
+    #[test]
+    fn slopes_as_large_as_fill_values_have_a_measure() {
+        let dims = [9, 9, 9];
+        let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::ONE).unwrap();
+        let cells = Cells::new([1; 3], dims);
+        // The normal of a node beside a fill value is that of the fill value.
+        let filled = field(lattice, |ijk| if ijk[0] == 0 { 1e20 } else { ijk[0] as f64 / 8.0 });
+        let measure = |at: f32| -> f64 {
+            let (_, found) = bins(&filled, &cells, 0.1);
+            let in_layer = |b: &&Bin| (b.centroid.x - 0.5 - at).abs() < 0.3;
+            found.iter().filter(in_layer).map(|b| f64::from(b.measure)).sum()
+        };
+        assert!((measure(1.25) - 4.0).abs() < 0.01 && (measure(4.0) - 8.0).abs() < 0.01, "{}", measure(1.25));
     }
 
     #[test]
