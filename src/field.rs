@@ -70,8 +70,12 @@ pub struct Field {
     coarse: Option<Arc<Field>>,
 }
 
+/// Samples are stored up to this: so far from the sweep only the side counts, and sums and differences of a few stay finite.
+const FARTHEST: f32 = f32::MAX / 16.0;
+
 impl Field {
-    /// Maps a volume's samples to the sweep's units, in f64, and stores f32. Non-finite samples become NaN.
+    /// Maps a volume's samples to the sweep's units, in f64, and stores f32. Non-finite samples become NaN; those 2·10³⁷ times the
+    /// sweep and more away are stored as that.
     ///
     /// # Errors
     /// `Invalid` if no sample is finite, if the sweep does not overlap the data, or if the samples in units of the
@@ -102,10 +106,10 @@ impl Field {
             .with_min_len(1 << 14)
             .map(|i| {
                 let v = volume.value(i);
-                if v.is_finite() { sweep.isovalue(v) } else { f32::NAN }
+                if v.is_finite() { sweep.isovalue(v).clamp(-FARTHEST, FARTHEST) } else { f32::NAN }
             })
             .collect();
-        Ok(Self { lattice: volume.lattice.clone(), sweep, samples, largest, coarse: None })
+        Ok(Self { lattice: volume.lattice.clone(), sweep, samples, largest: largest.min(FARTHEST), coarse: None })
     }
 
     /// The same function on another lattice over the same Ω: exactly the same where that divides this one's cells.

@@ -171,6 +171,12 @@ pub fn supported(scene: &Scene) -> Result<()> {
             "{polygons} polygons: sweeps test each line against all, {MOST_POLYGONS} at most; use --engine photon"
         )));
     }
+    let [nx, ny, nz] = scene.lattice().dims();
+    if !numbered([nx, ny, nz]) {
+        return Err(Error::NotSupported(format!(
+            "{nx}×{ny}×{nz} points: sweeps number points in 31 bits; take a coarser grid or --engine photon"
+        )));
+    }
     let inside = ends::inside(scene);
     if let Some((_, p)) = inside.iter().zip(scene.polygons()).find(|(inside, p)| **inside && !p.opaque_back) {
         return Err(Error::NotSupported(format!(
@@ -181,12 +187,18 @@ pub fn supported(scene: &Scene) -> Result<()> {
     Ok(())
 }
 
+/// Whether 31 bits number all points, and those that the sixteen lines of a pack would meet beyond the last.
+fn numbered([nx, ny, nz]: [usize; 3]) -> bool {
+    let stride = nx.saturating_mul(ny).max(ny.saturating_mul(nz)).max(nx.saturating_mul(nz));
+    nx.saturating_mul(ny).saturating_mul(nz).saturating_add(stride.saturating_mul(16)) <= i32::MAX as usize
+}
+
 /// Lights every node of the lattice for every isovalue of the sweep. `tick` receives the fraction done (an estimate while
 /// bounces converge); returning false stops early with what there is.
 ///
 /// # Errors
 /// `NotSupported` for several fields that light each other, if a polygon that is not a luminaire stands inside the volume,
-/// or if there are more than [`MOST_POLYGONS`]: that needs the photon engine.
+/// if there are more than [`MOST_POLYGONS`], or about 2³¹ points or more: that needs the photon engine.
 pub fn sweep(scene: &Scene, settings: &SweepSettings, tick: &(dyn Fn(f64) -> bool + Sync)) -> Result<SweepResult> {
     sweep_resumable(scene, settings, Stage::UNSAVED, tick)
 }
@@ -485,5 +497,17 @@ impl Run<'_> {
             chunks.iter().sum()
         };
         std::array::from_fn(|c| planes.iter().map(|p| sum(&p[c])).sum())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn what_31_bits_cannot_number_is_not_numbered() {
+        assert!(super::numbered([1024; 3]) && super::numbered([1280, 1280, 1290]));
+        // The last has fewer points than that, but packs of lines would go on beyond them.
+        assert!(
+            !super::numbered([1291; 3]) && !super::numbered([usize::MAX; 3]) && !super::numbered([11_000, 11_000, 17])
+        );
     }
 }

@@ -466,6 +466,38 @@ fn one_bounce_near_a_luminaire_keeps_its_energy() {
     assert!((got / expected - 1.0).abs() < 0.01);
 }
 
+/// The number that files have where there are no data, on either side of the sweep, is as good as any other so far away.
+#[test]
+fn the_farthest_numbers_are_only_far() {
+    let settings = SweepSettings { directions: 32, light_points: 4, max_bounces: 2, replicates: 1, ..ONE_BOUNCE };
+    let lit = |fill: f32| {
+        let lattice = Lattice::aligned([17; 3], DVec3::ZERO, DVec3::splat(1.0 / 16.0)).unwrap();
+        let samples = (0..lattice.len()).map(|o| {
+            let x = lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|x| x as f64)));
+            // A block of several cells, where interpolation of equal numbers overflows.
+            if x.min_element() > 0.4 && x.max_element() < 0.8 { fill } else { bumps_at(x) as f32 / 95.0 }
+        });
+        let volume = Volume::new("filled", lattice.clone(), Samples::F32(samples.collect())).unwrap();
+        // In units of the sweep, too, it is that number.
+        let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+        let walls = cornell_box(&lattice, 0.0).unwrap();
+        let surface = Surface { both_sides: true, ..Surface::default() };
+        run(&Scene::new(field, surface, Boundary::Open, walls).unwrap(), settings)
+    };
+    for side in [-1.0, 1.0] {
+        let (far, farthest) = (lit(side * 1e30), lit(side * f32::MAX));
+        assert_eq!(far.lit, farthest.lit);
+        let mut light = 0.0;
+        for (far, farthest) in far.sides.iter().zip(&farthest.sides) {
+            for (a, b) in far.irradiance.iter().flatten().zip(farthest.irradiance.iter().flatten()) {
+                assert!((a - b).abs() <= 1e-4 * a.abs(), "{side}: {a} {b}");
+                light += f64::from(*a);
+            }
+        }
+        assert!(light > 0.0);
+    }
+}
+
 #[test]
 fn polygons_in_the_volume_are_refused() {
     let f = bumps(9);

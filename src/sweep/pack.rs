@@ -475,7 +475,7 @@ impl Pack {
                     (at[lane], top[lane]) = (default[lane], f32::INFINITY);
                     continue;
                 }
-                if value.is_nan() {
+                if !value.is_finite() {
                     continue;
                 }
                 let (mut j, mut t) = (at[lane], top[lane]);

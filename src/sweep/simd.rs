@@ -41,6 +41,11 @@ pub(super) fn prefetch<T>(x: &[T]) {
     let _ = x;
 }
 
+/// Whether all places below `length` are numbers that gathers, which take signed ones, find.
+fn signed(length: usize) -> bool {
+    i32::try_from(length).is_ok()
+}
+
 /// Defines a method of [`Isa`] that runs `$inner` compiled for its instruction set.
 macro_rules! dispatch {
     ($name:ident, $inner:path, ($($arg:ident: $type:ty),*) $(-> $out:ty)?) => {
@@ -119,7 +124,7 @@ impl Isa {
         match self.0 {
             // SAFETY: `detect` made this kind on a machine with the features that `extrema` enables.
             #[cfg(target_arch = "x86_64")]
-            Kind::Avx512 if i32::try_from(h.len()).is_ok() => unsafe { avx512::extrema(h, segments) },
+            Kind::Avx512 if signed(h.len()) => unsafe { avx512::extrema(h, segments) },
             _ => segments.march(h),
         }
     }
@@ -129,7 +134,9 @@ impl Isa {
         match self.0 {
             // SAFETY: `detect` made this kind on a machine with the features that `scan` enables.
             #[cfg(target_arch = "x86_64")]
-            Kind::Avx512 => unsafe { avx512::scan(pack, way, light, out, place) },
+            Kind::Avx512 if signed(light.b.len()) && signed(pack.ends() + light.flats.len()) => unsafe {
+                avx512::scan(pack, way, light, out, place)
+            },
             _ => pack.scan(way, light, out, place),
         }
     }
@@ -163,7 +170,9 @@ mod avx512 {
     pub(super) fn march(row: &[f32], [u0, du]: [f32; 2], [most, least]: [&mut [f32]; 2], out: &mut [u8], turn: u8) {
         let count = out.len();
         assert!(most.len() == count && least.len() == count && row.len() >= 2);
+        assert!(super::signed(row.len()));
         let last = _mm512_set1_epi32(row.len() as i32 - 2);
+        let end = _mm512_set1_ps(row.len() as f32);
         let (u0, du) = (_mm512_set1_ps(u0), _mm512_set1_ps(du));
         let zero = _mm512_setzero_ps();
         let lane = _mm512_setr_ps(0., 1., 2., 3., 4., 5., 6., 7., 8., 9., 10., 11., 12., 13., 14., 15.);
@@ -172,9 +181,10 @@ mod avx512 {
             let mask: __mmask16 = if count - start >= LANES { u16::MAX } else { (1 << (count - start)) - 1 };
             let n = _mm512_add_ps(lane, _mm512_set1_ps(start as f32));
             let u = _mm512_max_ps(_mm512_add_ps(u0, _mm512_mul_ps(n, du)), zero);
-            let i = _mm512_min_epi32(_mm512_cvttps_epi32(u), last);
-            // SAFETY: 0 ≤ i ≤ row.len() − 2 in every lane of the mask; the others are not touched, nor are most, least and out
-            // beyond `count`, their common length.
+            // Of what is beyond all integers the conversion would make the least.
+            let i = _mm512_min_epi32(_mm512_cvttps_epi32(_mm512_min_ps(u, end)), last);
+            // SAFETY: u is 0 or more, 0 for NaN, so 0 ≤ i ≤ row.len() − 2 in every lane of the mask; the others are not
+            // touched, nor are most, least and out beyond `count`, their common length.
             unsafe {
                 let a = _mm512_mask_i32gather_ps::<4>(zero, mask, i, row.as_ptr());
                 let b = _mm512_mask_i32gather_ps::<4>(zero, mask, i, row.as_ptr().add(1));
@@ -195,9 +205,9 @@ mod avx512 {
         }
     }
 
-    /// [`Segments::march`] for at most 2³¹ samples.
+    /// [`Segments::march`] for less than 2³¹ samples.
     #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
-    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, reason = "at most 2³¹ samples")]
+    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, reason = "less than 2³¹ samples")]
     pub(super) fn extrema(h: &[f32], s: &mut Segments) {
         // SAFETY: sixteen numbers each.
         let floats = |x: &[f32; LANES]| unsafe { _mm512_loadu_ps(x.as_ptr()) };
@@ -276,7 +286,8 @@ mod avx512 {
             let out_of = _mm512_cmp_ps_mask::<_CMP_EQ_OQ>(h, outside);
             at = _mm512_mask_mov_epi32(at, out_of, default);
             top = _mm512_mask_mov_ps(top, out_of, infinity);
-            let active = _mm512_cmp_ps_mask::<_CMP_ORD_Q>(h, h) & !out_of;
+            // Neither NaN nor infinite.
+            let active = !_mm512_fpclass_ps_mask::<0x99>(h);
             let (mut j, mut t) = (at, top);
             let lower = |t: __m512| {
                 if STRICT { _mm512_cmp_ps_mask::<_CMP_LE_OQ>(t, h) } else { _mm512_cmp_ps_mask::<_CMP_LT_OQ>(t, h) }
@@ -287,8 +298,8 @@ mod avx512 {
             t = _mm512_mask_mov_ps(t, pop, after_top);
             pop &= lower(t);
             while pop != 0 {
-                // SAFETY: a lane that pops has t below its own finite h, so j is no end (their t is ∞) but a sample that
-                // this scan has linked, and `next` and `h_next` hold a number for each.
+                // SAFETY: a lane that pops has t at most its own h, which `active` says is finite, so j is no end (their t
+                // is ∞) but a sample that this scan has linked, and `next` and `h_next` hold a number for each.
                 unsafe {
                     t = _mm512_mask_i32gather_ps::<4>(t, pop, j, pack.h_next[d].as_ptr().cast());
                     j = _mm512_mask_i32gather_epi32::<4>(j, pop, j, pack.next[d].as_ptr().cast());
