@@ -40,7 +40,7 @@ impl Camera {
         let distance = 0.5 * size.z / f64::to_radians(0.5 * fov).tan();
         let eye = DVec3::new(centre.x, lo.y - distance, centre.z);
         let width = ((height as f64 * size.x / size.z).round() as usize).max(1);
-        Self { eye, target: eye + DVec3::Y, up: DVec3::Z, fov, size: [width, height] }
+        Self { eye, target: centre, up: DVec3::Z, fov, size: [width, height] }
     }
 
     /// Unit direction through image coordinates: x from the left, y from the top, in pixels.

@@ -15,7 +15,11 @@ use crate::polygon::Polygon;
 use crate::reflectance::Reflectance;
 use crate::volume::Lattice;
 use glam::{DVec3, Vec3};
+use std::ops::RangeInclusive;
 use std::sync::Arc;
+
+/// Widths of cells whose areas fit 32-bit floats, photon by photon.
+const WIDTHS: RangeInclusive<f64> = 1e-16..=1e16;
 
 /// What the faces of Ω do to a level set that runs into them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -75,6 +79,17 @@ pub struct Scene {
 /// Whether a field can stand among `polygons`.
 fn check(surface: &Surface, boundary: Boundary, lattice: &Lattice, polygons: &[Polygon]) -> Result<()> {
     let fail = |what: String| Err(Error::Invalid(what));
+    let spacing = lattice.spacing();
+    if !(WIDTHS.contains(&spacing.min_element()) && WIDTHS.contains(&spacing.max_element())) {
+        return fail(format!(
+            "cells are {:e} × {:e} × {:e} wide: give lengths in a unit in which that is {:e} to {:e}; light does not depend on it",
+            spacing.x,
+            spacing.y,
+            spacing.z,
+            WIDTHS.start(),
+            WIDTHS.end()
+        ));
+    }
     for (_, albedo) in surface.albedo.stops() {
         if !(albedo.cmpge(DVec3::ZERO).all() && albedo.cmple(DVec3::ONE).all()) {
             return fail(format!("surface albedo {albedo}: every channel must lie in [0, 1]"));
@@ -107,7 +122,8 @@ impl Scene {
     /// Puts a scene together; polygons that emit are its luminaires. Luminaires are numbered first.
     ///
     /// # Errors
-    /// `Invalid` for an albedo outside [0, 1], a negative emission, too many polygons, or capped faces that touch a wall.
+    /// `Invalid` for an albedo outside [0, 1], a negative emission, too many polygons, capped faces that touch a wall, or cells
+    /// narrower than 10⁻¹⁶ or wider than 10¹⁶.
     pub fn new(
         field: impl Into<Arc<Field>>,
         surface: Surface,

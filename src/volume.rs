@@ -113,6 +113,11 @@ impl Lattice {
         self.axes.determinant().abs()
     }
 
+    /// The power of two next to the width of a cell: in it the world's lengths fit f32, and no bits change.
+    pub fn unit(&self) -> f64 {
+        (self.cell_volume().log2() / 3.0).round().exp2()
+    }
+
     /// World volume of Ω, the whole lattice.
     pub fn world_volume(&self) -> f64 {
         self.cell_volume() * self.cells().iter().map(|&n| n as f64).product::<f64>()

@@ -466,6 +466,31 @@ fn one_bounce_near_a_luminaire_keeps_its_energy() {
     assert!((got / expected - 1.0).abs() < 0.01);
 }
 
+/// Volumes in metres and in parsecs: what light does is the same, to the last bit in units of powers of two.
+#[test]
+fn light_does_not_depend_on_the_unit_of_length() {
+    let settings = SweepSettings { directions: 32, light_points: 4, max_bounces: 3, ..ONE_BOUNCE };
+    let lit = |unit: f64| {
+        let lattice = Lattice::aligned([17, 16, 15], DVec3::splat(3.0 * unit), DVec3::splat(unit)).unwrap();
+        let place = |x: DVec3| (x / unit - 3.0) / 16.0;
+        let field = field(lattice, (3.6, 95.0), |x| bumps_at(place(x)));
+        let walls = cornell_box(field.lattice(), 0.1).unwrap();
+        run(&Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap(), settings)
+    };
+    let bits = |result: SweepResult| -> Vec<u32> {
+        let walls = result.flats.iter().flatten().flat_map(|f| f.texels.iter().flatten()).copied().collect::<Vec<_>>();
+        let nodes = result.sides.into_iter().flat_map(|s| s.irradiance).flatten();
+        nodes.chain(walls).map(f32::to_bits).collect()
+    };
+    let one = bits(lit(1.0));
+    for unit in [2f64.powi(-50), 2f64.powi(-30), 2f64.powi(30), 2f64.powi(50)] {
+        assert!(one == bits(lit(unit)), "cells {unit:e} wide");
+    }
+    let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::splat(1e20)).unwrap();
+    let scene = Scene::new(field(lattice, (0.0, 1.0), |x| x.x / 8e20), Surface::default(), Boundary::Open, Vec::new());
+    assert!(scene.unwrap_err().to_string().contains("lengths"));
+}
+
 /// The number that files have where there are no data, on either side of the sweep, is as good as any other so far away.
 #[test]
 fn the_farthest_numbers_are_only_far() {

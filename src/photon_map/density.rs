@@ -21,7 +21,7 @@ use glam::{DVec3, DVec4, Vec3};
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// The photons of a bin.
+/// The photons of a bin, power per [`unit`](crate::volume::Lattice::unit) squared as its measure is.
 #[derive(Clone, Copy, Debug, Default)]
 struct Tally {
     /// Σ w.
@@ -102,10 +102,12 @@ impl<'a> PhotonDensity<'a> {
         let mut density = Self { field, settings, cells, starts, bins, light: Vec::new(), edge };
         let places: Vec<Option<usize>> =
             kept.par_iter().with_min_len(1024).map(|p| density.own(p.position.as_dvec3()).1).collect();
+        // Squares of a photon's power, of the world's fourth power of length, do not fit f32.
+        let unit = lattice.unit().powi(-2) as f32;
         let mut tallies = vec![Tally::default(); density.bins.len()];
         for (p, place) in kept.iter().zip(places) {
             let Some(bin) = place.map(|n| &mut tallies[n]) else { continue };
-            let power = p.power * p.foreshortening;
+            let power = unit * p.power * p.foreshortening;
             bin.power += power;
             bin.squares += luminance(power.as_dvec3()).powi(2) as f32;
         }

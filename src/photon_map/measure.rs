@@ -12,7 +12,7 @@ use rayon::prelude::*;
 pub(super) struct Bin {
     /// Centroid by `measure`, in coordinates of the cells.
     pub centroid: Vec3,
-    /// ∫ |∇h| dV over what lies in Ω and in the sweep.
+    /// ∫ |∇h| dV over what lies in Ω and in the sweep, per [`unit`](crate::volume::Lattice::unit) squared.
     pub measure: f32,
     /// Mean unit receiver normal by that measure, towards falling h, normalised.
     pub normal: Vec3,
@@ -89,7 +89,7 @@ struct Points<'a> {
     fine: [usize; 3],
     /// Along each axis, as many per cell as a cell has; `None` outside Ω.
     slots: [Vec<Option<Slot>>; 3],
-    /// World volume of a voxel.
+    /// World volume of a voxel, per unit squared.
     volume: f64,
     /// From gradients in index space to the world.
     to_world: Mat3A,
@@ -195,7 +195,7 @@ impl<'a> Points<'a> {
             tau,
             fine,
             slots,
-            volume: lattice.axes().determinant().abs(),
+            volume: lattice.cell_volume() / lattice.unit().powi(2),
             to_world: Mat3A::from_cols(world(DVec3::X), world(DVec3::Y), world(DVec3::Z)),
             rows,
         }

@@ -67,6 +67,8 @@ impl<'a> Walls<'a> {
             Rng::stream(shear.offset[0].to_bits() ^ shear.offset[1].to_bits().rotate_left(32), Stage::Sweep, 0);
         let phase = [0, 1].map(|_| (rng.unit() * stride as f64) as isize);
         let none = flats.none();
+        // Only ratios of weights count.
+        let area = shear.area / pass.scene.lattice().unit().powi(2);
         Self {
             plan,
             ends,
@@ -75,7 +77,7 @@ impl<'a> Walls<'a> {
             columns: range(0),
             stride: if none { 0 } else { stride },
             phase,
-            weight: (4.0 * std::f64::consts::PI / (2 * families) as f64 * shear.area * (stride * stride) as f64) as f32,
+            weight: (4.0 * std::f64::consts::PI / (2 * families) as f64 * area * (stride * stride) as f64) as f32,
             capped: super::flats::capped(pass.scene),
             primary: side == pass.primary,
             margin,

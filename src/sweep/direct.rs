@@ -33,6 +33,7 @@ pub(super) fn direct(
 ) -> (Vec<Planes>, bool) {
     let n = geometry.h.len();
     let lattice = scene.lattice();
+    let unit = lattice.unit();
     let mut planes: Vec<Planes> = sides.iter().map(|_| spare.black(n)).collect();
     let [nx, ny, _] = geometry.dims;
     let corners: Vec<DVec3> = (0..8)
@@ -62,13 +63,14 @@ pub(super) fn direct(
             let start = if inside { scene.field.value(y) as f32 } else { f32::NEG_INFINITY };
             let start = if start.is_nan() { f32::NEG_INFINITY } else { start };
             fans.march((geometry, isa, sides), y, start);
-            let axes = lattice.axes();
+            // Fourth powers of the world's lengths do not fit f32; the unit falls out.
+            let axes = lattice.axes() / unit;
             let step = axes.x_axis.as_vec3();
             let facing = light.normal().as_vec3();
             sums.par_chunks_mut(per * nx).enumerate().with_max_len(32).for_each(|(row, sums)| {
                 let (j, k) = (row % ny, row / ny);
                 let begin = DVec3::new(0.0, j as f64, k as f64);
-                let start = (world - lattice.to_world(begin)).as_vec3();
+                let start = ((world - lattice.to_world(begin)) / unit).as_vec3();
                 geometry.lit_nodes(row, |i| {
                     // Its length falls out of Σ V g / Σ g.
                     let normal = geometry.along_normal(row * nx + i);
