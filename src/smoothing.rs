@@ -1,10 +1,14 @@
-//! Gathered light smoothed over neighbouring grid points.
+//! Gathered light smoothed over neighbouring grid points, or over places scattered beside them.
 //!
 //! Each point's gather is unbiased and noisy, and its neighbours' know nearly the same light. A linear function fitted to
 //! those around a point, and what that leaves fitted once more, has a small part of the noise and a bias of fourth order in
 //! the radius \[Tukey77\]. How far to trust it is decided at each place by cross-validation: what half of the rays gives,
 //! smoothed by a share λ, is compared with the other half at the points around, whose noise is independent; the λ that
 //! predicts best wins. \[Rousselle12\]
+
+mod scattered;
+
+pub use scattered::{Scattered, smooth_scattered};
 
 use crate::direct::luminance;
 use crate::field::Field;
@@ -41,6 +45,85 @@ struct Tap {
 
 /// Two independent estimates of one irradiance; NaN: none.
 pub type Halves = [Vec3; 2];
+
+/// Places among which light is smoothed.
+trait Surroundings {
+    type Place: Copy;
+
+    /// Calls `visit` for the places that share the light of one, itself among them, with their offset in radii and its square.
+    fn around(&self, at: Self::Place, visit: impl FnMut(Self::Place, Vec3, f32));
+
+    /// What a linear fit of `values` around a place says there.
+    fn fit(&self, at: Self::Place, values: impl Fn(Self::Place) -> Halves) -> Halves {
+        let mut moments = Moments::default();
+        // Σ K v (1, d) of either half.
+        let mut sums = [[Vec3::ZERO; 4]; 2];
+        self.around(at, |n, d, d2| {
+            let w = 1.0 - d2;
+            moments.add(w, d);
+            for (sums, v) in sums.iter_mut().zip(values(n)) {
+                let terms = [1.0, d.x, d.y, d.z];
+                sums.iter_mut().zip(terms).for_each(|(s, t)| *s += w * t * v);
+            }
+        });
+        let g = moments.at_origin().as_vec4();
+        sums.map(|[s, x, y, z]| g.x * s + g.y * x + g.z * y + g.w * z)
+    }
+
+    /// [`Surroundings::fit`] to what it left of `raw` is added to it; `once`: the first fits.
+    fn fit_again(
+        &self,
+        at: Self::Place,
+        raw: impl Fn(Self::Place) -> Halves,
+        once: impl Fn(Self::Place) -> Halves,
+    ) -> Halves {
+        let rest = self.fit(at, |m| {
+            let (raw, once) = (raw(m), once(m));
+            [0, 1].map(|h| raw[h] - once[h])
+        });
+        let once = once(at);
+        [0, 1].map(|h| once[h] + rest[h])
+    }
+
+    /// `raw` and the share of the way to `fitted` that predicts best.
+    fn blend(
+        &self,
+        at: Self::Place,
+        raw: impl Fn(Self::Place) -> Halves,
+        fitted: impl Fn(Self::Place) -> Halves,
+    ) -> Halves {
+        // Σ (a + λ (ã − a) − b)² over the places around and both ways is least at −Σ (ã − a)(a − b) / Σ (ã − a)².
+        let (mut along, mut squares) = (0.0f32, 0.0f32);
+        self.around(at, |m, _, d2| {
+            let (raw, fitted) = (raw(m), fitted(m));
+            for h in [0, 1] {
+                let change = light(fitted[h] - raw[h]);
+                along += (1.0 - d2) * change * light(raw[1 - h] - raw[h]);
+                squares += (1.0 - d2) * change * change;
+            }
+        });
+        let share = if squares > 0.0 { (along / squares).clamp(0.0, 1.0) } else { 0.0 };
+        let (raw, fitted) = (raw(at), fitted(at));
+        [0, 1].map(|h| raw[h] + share * (fitted[h] - raw[h]))
+    }
+
+    /// The mean of both halves, and how far they are apart around.
+    fn mean(&self, at: Self::Place, blended: impl Fn(Self::Place) -> Halves) -> Smoothed {
+        let (mut sum, mut weight) = (0.0f32, 0.0f32);
+        self.around(at, |m, _, d2| {
+            let [a, b] = blended(m);
+            sum += (1.0 - d2) * (0.5 * light(a - b)).powi(2);
+            weight += 1.0 - d2;
+        });
+        let [a, b] = blended(at);
+        Smoothed { mean: 0.5 * (a + b), variance: sum / weight }
+    }
+}
+
+#[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+fn light(v: Vec3) -> f32 {
+    luminance(v.as_dvec3()) as f32
+}
 
 /// Where the points stand.
 struct Points<'a> {
@@ -96,7 +179,6 @@ pub fn smooth(
     let (area, reach) = (nx * ny, points.reach);
     let (mut raw, mut once, mut twice, mut blended) =
         (Slices::default(), Slices::default(), Slices::default(), Slices::default());
-    let light = |v: Vec3| luminance(v.as_dvec3()) as f32;
     // Each stage looks `reach` slices ahead into the one before.
     for k in 0..nz + 4 * reach {
         let before = |stages: usize| k.checked_sub(stages * reach).filter(|&z| z < nz);
@@ -111,41 +193,13 @@ pub fn smooth(
             once.push(points.each(z, |n| points.fit((z, n), |m| *raw.at(m))), keep(3));
         }
         if let Some(z) = before(2) {
-            let slice = points.each(z, |n| {
-                let rest = points.fit((z, n), |m| [0, 1].map(|h| raw.at(m)[h] - once.at(m)[h]));
-                [0, 1].map(|h| once.at((z, n))[h] + rest[h])
-            });
-            twice.push(slice, keep(4));
+            twice.push(points.each(z, |n| points.fit_again((z, n), |m| *raw.at(m), |m| *once.at(m))), keep(4));
         }
         if let Some(z) = before(3) {
-            let slice = points.each(z, |n| {
-                // Σ (a + λ (ã − a) − b)² over the points around and both ways is least at −Σ (ã − a)(a − b) / Σ (ã − a)².
-                let (mut along, mut squares) = (0.0f32, 0.0f32);
-                points.around((z, n), |m, tap| {
-                    let (raw, twice): (&Halves, &Halves) = (raw.at(m), twice.at(m));
-                    for h in [0, 1] {
-                        let change = light(twice[h] - raw[h]);
-                        along += (1.0 - tap.d2) * change * light(raw[1 - h] - raw[h]);
-                        squares += (1.0 - tap.d2) * change * change;
-                    }
-                });
-                let share = if squares > 0.0 { (along / squares).clamp(0.0, 1.0) } else { 0.0 };
-                let (raw, twice): (&Halves, &Halves) = (raw.at((z, n)), twice.at((z, n)));
-                [0, 1].map(|h| raw[h] + share * (twice[h] - raw[h]))
-            });
-            blended.push(slice, keep(5));
+            blended.push(points.each(z, |n| points.blend((z, n), |m| *raw.at(m), |m| *twice.at(m))), keep(5));
         }
         if let Some(z) = before(4) {
-            let slice = points.each(z, |n| {
-                let (mut sum, mut weight) = (0.0f32, 0.0f32);
-                points.around((z, n), |m, tap| {
-                    let [a, b]: Halves = *blended.at(m);
-                    sum += (1.0 - tap.d2) * (0.5 * light(a - b)).powi(2);
-                    weight += 1.0 - tap.d2;
-                });
-                let [a, b] = *blended.at((z, n));
-                Smoothed { mean: 0.5 * (a + b), variance: sum / weight }
-            });
+            let slice = points.each(z, |n| points.mean((z, n), |m| *blended.at(m)));
             out(z, slice);
         }
     }
@@ -155,8 +209,7 @@ impl<'a> Points<'a> {
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     fn new(scene: &'a Scene, lattice: &'a Lattice, side: Side, tau: f64) -> Self {
         let axes = lattice.axes();
-        let shortest = (0..3).map(|a| axes.col(a).length()).fold(f64::INFINITY, f64::min);
-        let radius = RADIUS * shortest;
+        let radius = RADIUS * shortest(lattice);
         let inverse = axes.inverse();
         let reach: [isize; 3] = std::array::from_fn(|a| (inverse.row(a).length() * radius).floor() as isize);
         let mut taps = Vec::new();
@@ -199,10 +252,14 @@ impl<'a> Points<'a> {
         let of = |n: usize| if self.places.at((z, n)).0 == Vec3::ZERO { T::default() } else { f(n) };
         (0..self.area()).into_par_iter().with_min_len(256).map(of).collect()
     }
+}
 
-    /// Calls `visit` for the points that share the light of point `n` of slice `z`, itself among them.
+impl Surroundings for Points<'_> {
+    /// Slice and number in it.
+    type Place = (usize, usize);
+
     #[inline]
-    fn around(&self, (z, n): (usize, usize), mut visit: impl FnMut((usize, usize), &Tap)) {
+    fn around(&self, (z, n): (usize, usize), mut visit: impl FnMut((usize, usize), Vec3, f32)) {
         let [nx, ny, nz] = self.lattice.dims().map(|n| n as isize);
         let at = [(n as isize) % nx, (n as isize) / nx, z as isize];
         let &(normal, isovalue) = self.places.at((z, n));
@@ -214,27 +271,15 @@ impl<'a> Points<'a> {
             let m = (z as usize, (y * nx + x) as usize);
             let &(other, c) = self.places.at(m);
             if other.dot(normal) >= CONE && (c - isovalue).abs() <= self.tau {
-                visit(m, tap);
+                visit(m, tap.d, tap.d2);
             }
         }
     }
+}
 
-    /// What a linear fit of `values` around point `o` says there.
-    fn fit(&self, o: (usize, usize), values: impl Fn((usize, usize)) -> Halves) -> Halves {
-        let mut moments = Moments::default();
-        // Σ K v (1, d) of either half.
-        let mut sums = [[Vec3::ZERO; 4]; 2];
-        self.around(o, |n, tap| {
-            let w = 1.0 - tap.d2;
-            moments.add(w, tap.d);
-            for (sums, v) in sums.iter_mut().zip(values(n)) {
-                let terms = [1.0, tap.d.x, tap.d.y, tap.d.z];
-                sums.iter_mut().zip(terms).for_each(|(s, t)| *s += w * t * v);
-            }
-        });
-        let g = moments.at_origin().as_vec4();
-        sums.map(|[s, x, y, z]| g.x * s + g.y * x + g.z * y + g.w * z)
-    }
+/// The shortest step of a lattice.
+fn shortest(lattice: &Lattice) -> f64 {
+    (0..3).map(|a| lattice.axes().col(a).length()).fold(f64::INFINITY, f64::min)
 }
 
 #[cfg(test)]

@@ -6,14 +6,14 @@ use crate::brdf::reflected;
 use crate::checkpoint;
 use crate::direct::luminance;
 use crate::field::Field;
-use crate::fitted_grid::{Wish, fit};
+use crate::fitted_grid::{PULL, Wish, fit};
 use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, local_position, own_light, stand_ins};
 use crate::node_set::NodeSet;
 use crate::radiance::{BLOCK, RadianceSample, RadianceSamples, Sampler, sample_places};
 use crate::scene::Scene;
-use crate::smoothing::{Halves, smooth};
+use crate::smoothing::{Halves, Scattered, smooth, smooth_scattered};
 use crate::tracer::Tracer;
 use crate::volume::Lattice;
 use glam::{DVec3, Vec3};
@@ -244,6 +244,9 @@ pub(super) struct Beside<'a> {
     positions: Vec<Vec3>,
     /// Of each position, the point it stands for, in rising order.
     owners: Vec<u64>,
+    /// These points, and the first position of each; one more entry than points.
+    points: NodeSet,
+    starts: Vec<u32>,
 }
 
 /// Light at a place beside.
@@ -252,10 +255,16 @@ pub(super) struct BesideLight {
     radiance: Vec3,
     /// Of its luminance; negative where there is no light.
     variance: f32,
+    /// The part of it that is the gather's, and the part that places around have in common: none before it is smoothed.
+    indirect_variance: f32,
+    common: f32,
+    /// What was gathered.
+    halves: Packed,
 }
 
 impl BesideLight {
-    const NONE: Self = Self { radiance: Vec3::ZERO, variance: -1.0 };
+    const NONE: Self =
+        Self { radiance: Vec3::ZERO, variance: -1.0, indirect_variance: 0.0, common: 0.0, halves: Packed::NONE };
 }
 
 impl<'a> Beside<'a> {
@@ -269,6 +278,7 @@ impl<'a> Beside<'a> {
     ) -> Self {
         let points = lattice.len();
         let set = NodeSet::new(points, stand_in);
+        assert!(STAND_INS * set.len() < u32::MAX as usize, "places are numbered in 32 bits");
         let mut found = vec![[None; STAND_INS]; set.len()];
         const ROW: usize = 4096;
         set.split(&mut found, ROW).into_par_iter().enumerate().for_each(|(row, found)| {
@@ -278,11 +288,13 @@ impl<'a> Beside<'a> {
         });
         let count = found.iter().flatten().flatten().count();
         let (mut positions, mut owners) = (Vec::with_capacity(count), Vec::with_capacity(count));
+        let mut starts = vec![0];
         for (o, found) in set.members(0..points).zip(&found) {
             positions.extend(found.iter().flatten());
             owners.resize(positions.len(), o as u64);
+            starts.push(positions.len() as u32);
         }
-        Self { field, lattice, positions, owners }
+        Self { field, lattice, positions, owners, points: set, starts }
     }
 
     /// Places.
@@ -318,11 +330,31 @@ impl<'a> Beside<'a> {
         let first = band.number * self.len().div_ceil(BLOCK);
         let sampled = sample_places(sampler, own.len(), &place, saved, first, tick);
         for (&n, s) in own.iter().zip(&sampled.samples) {
-            if let Some(RadianceSample { radiance, variance, .. }) = *s {
-                light[n as usize] = BesideLight { radiance, variance };
+            if let Some(RadianceSample { radiance, variance, indirect, indirect_variance, .. }) = *s {
+                let halves = Packed::new(indirect);
+                light[n as usize] = BesideLight { radiance, variance, indirect_variance, common: 0.0, halves };
             }
         }
         Counts::from(&sampled)
+    }
+
+    /// Smooths what was gathered over the places around ([`smooth_scattered`]): where little arrives, few rays bring it, and
+    /// the fit would show them as specks.
+    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+    pub(super) fn smooth(&self, scene: &Scene, side: Side, tau: f64, light: &mut [BesideLight]) {
+        let scattered =
+            Scattered { lattice: self.lattice, owners: &self.points, starts: &self.starts, positions: &self.positions };
+        let smoothed = smooth_scattered(scene, &scattered, side, tau, &|n| light[n].halves.unpack());
+        let places = light.par_iter_mut().zip(smoothed).zip(&self.positions).with_min_len(1024);
+        places.filter(|((l, _), _)| l.halves != Packed::NONE).for_each(|((l, smoothed), p)| {
+            let [a, b] = l.halves.unpack();
+            let albedo = scene.surface.albedo.at(f64::from(self.field.value(p.as_dvec3()) as f32));
+            let change = reflected(albedo, (smoothed.mean - 0.5 * (a + b)).as_dvec3());
+            l.radiance = (l.radiance + change.as_vec3()).max(Vec3::ZERO);
+            let scale = (luminance(albedo) / PI) as f32;
+            l.common = smoothed.variance * scale * scale;
+            l.variance = (l.variance - l.indirect_variance).max(0.0) + l.common;
+        });
     }
 
     /// Gives the points without a level set of their own what makes interpolation come nearest to the light in the cells
@@ -332,14 +364,15 @@ impl<'a> Beside<'a> {
     pub(super) fn fit(&self, mut grid: IlluminationGrid, light: &[BesideLight]) -> IlluminationGrid {
         let mut start = 0;
         for run in self.owners.chunk_by(|a, b| a == b) {
-            let (mut sum, mut variance, mut count) = (Vec3::ZERO, 0.0, 0.0);
+            let (mut sum, mut own, mut common, mut count) = (Vec3::ZERO, 0.0, 0.0, 0.0);
             for l in light[start..start + run.len()].iter().filter(|l| l.variance >= 0.0) {
-                (sum, variance, count) = (sum + l.radiance, variance + l.variance, count + 1.0);
+                (sum, own, common) = (sum + l.radiance, own + (l.variance - l.common), common + l.common);
+                count += 1.0;
             }
             let owner = usize::try_from(run[0]).expect("a point's number");
             if count > 0.0 {
                 grid.radiance[owner] = (sum / count).to_array();
-                grid.std_error[owner] = variance.sqrt() / count;
+                grid.std_error[owner] = (own / (count * count) + common / count).sqrt();
                 grid.mask[owner] = Mask::Filled;
             }
             start += run.len();
@@ -353,7 +386,7 @@ impl<'a> Beside<'a> {
             .collect();
         let lit = |o: usize| grid.mask[o] == Mask::Filled && self.owners.binary_search(&(o as u64)).is_ok();
         let free = NodeSet::new(self.lattice.len(), lit);
-        fit(self.field, self.lattice, &wishes, grid, &free, &|_| true)
+        fit(self.field, self.lattice, &wishes, grid, &free, PULL, &|_| true)
     }
 }
 

@@ -1,7 +1,7 @@
 //! How much memory a bake takes, before it takes it.
 
 use super::bands::{Band, Levels};
-use super::grid_points::STAND_INS;
+use super::grid_points::{BesideLight, STAND_INS};
 use super::{BakeSettings, Engine, Interpolation, MOST_BANDS, StrategyName};
 use crate::checkpoint;
 use crate::embree::{Device, GraphTracer};
@@ -39,7 +39,11 @@ const SHEPARD: u64 = 12 + 16 + 12 + size_of::<RadianceSample>() as u64;
 /// The same while irradiance caching looks at them.
 const CACHING: u64 = 12 + 16 + irradiance_caching::BYTES;
 
-/// Bytes per place beside the grid's points while they are fitted: the wish, and sorted by cells with what cells say.
+/// Bytes per place beside the grid's points, and its light.
+const PLACE: u64 = 12 + 8 + 4;
+const BESIDE: u64 = size_of::<BesideLight>() as u64;
+
+/// Bytes of them while they are fitted: the wish, and sorted by cells with what cells say. Smoothing before takes 68.
 const WISH: u64 = 24;
 const SORTED: u64 = 40 + 40 + 12;
 
@@ -171,7 +175,7 @@ impl Parts {
         // Of all fields; sides stored of any.
         let (mut voxels, mut points, mut filled, mut samples, mut grids, mut stored) = (0, 0, 0, 0, 0, 0);
         let (mut halves, mut slices) = (0, 0);
-        let smoothing = settings.smoothing && settings.gather_rays > 1 && settings.strategy == StrategyName::Nodes;
+        let smoothing = settings.smooths() && settings.strategy == StrategyName::Nodes;
         let mut all_masks = Vec::new();
         let members = scene.members();
         for (member, volume) in members.iter().zip(volumes) {
@@ -263,7 +267,7 @@ impl Parts {
         let sets = 2 * NodeSet::bytes(self.voxels) + NodeSet::bytes(2 * self.points);
         let Self { base, flats, photons, maps, grids, halves, beside, .. } = *self;
         let fitting = beside * (WISH + SORTED) + self.filled * FITTED;
-        let light = base + flats + grids + beside * (20 + 16);
+        let light = base + flats + grids + beside * (PLACE + BESIDE);
         let bands = bands.len() as u64;
         let waiting = checkpoint::MOST_WAITING as u64;
         let written = self.samples * RadianceSample::SAVED as u64 + self.cached * 12 * self.levels.needed(Band::WHOLE);

@@ -6,7 +6,7 @@ use super::{BakeSettings, Interpolation, Lit, PhotonCounts, stages};
 use crate::checkpoint::{self, Checkpoint};
 use crate::embree::{Device, GraphTracer, pyramids};
 use crate::error::{Error, Result};
-use crate::fitted_grid::{Wish, fit};
+use crate::fitted_grid::{PULL, Wish, fit};
 use crate::flattened::Side;
 use crate::illumination_grid::{IlluminationGrid, shepard};
 use crate::irradiance_caching::interpolate;
@@ -176,11 +176,12 @@ impl<'a> FieldLight<'a> {
                 Places::Grid(points, beside)
             }
         };
-        let smoothing = settings.smoothing && settings.gather_rays > 1;
         let sides = scene.surface.stored_sides().into_iter().map(|side| match &places {
-            Places::Grid(points, beside) => {
-                SideLight { side, points: Some((points.dark(smoothing), beside.dark())), scattered: Vec::new() }
-            }
+            Places::Grid(points, beside) => SideLight {
+                side,
+                points: Some((points.dark(settings.smooths()), beside.dark())),
+                scattered: Vec::new(),
+            },
             Places::Scattered(at) => SideLight { side, points: None, scattered: vec![None; at.len()] },
         });
         let sides = sides.collect();
@@ -247,7 +248,10 @@ impl<'a> FieldLight<'a> {
         let Self { job: Job { scene, lattice, masks, .. }, places, sides } = self;
         let each = |SideLight { side, points, scattered }: SideLight| {
             let grid = match (&places, points) {
-                (Places::Grid(grid, beside), Some((at_points, at_beside))) => {
+                (Places::Grid(grid, beside), Some((at_points, mut at_beside))) => {
+                    if settings.smooths() {
+                        beside.smooth(scene, side, settings.tau, &mut at_beside);
+                    }
                     beside.fit(grid.finish(scene, side, settings.tau, at_points, tick), &at_beside)
                 }
                 _ => {
@@ -263,7 +267,7 @@ impl<'a> FieldLight<'a> {
                             let wishes: Vec<Wish> = samples.iter().map(Wish::from).collect();
                             drop(samples);
                             let free = NodeSet::new(lattice.len(), |o| grid.mask[o] != Mask::Empty);
-                            fit(&scene.field, lattice, &wishes, grid, &free, tick)
+                            fit(&scene.field, lattice, &wishes, grid, &free, PULL, tick)
                         }
                     }
                 }

@@ -299,6 +299,11 @@ fn grid_size_text<S: serde::Serializer>(grid: &GridSize, s: S) -> std::result::R
 }
 
 impl BakeSettings {
+    /// Whether the photon engine smooths what it gathers: one ray has no two halves.
+    pub(super) fn smooths(&self) -> bool {
+        self.smoothing && self.gather_rays > 1
+    }
+
     /// The preset with the options that are set, for a scene: it says whether it can be swept, which is the default.
     ///
     /// # Errors
