@@ -9,7 +9,7 @@ use isolume::checkpoint;
 use isolume::embree::{Device, GraphTracer, SurfaceTracer};
 use isolume::export::bake_file;
 use isolume::field::{Field, Sweep};
-use isolume::fitted_grid::{Wish, fit};
+use isolume::fitted_grid::{PULL, Wish, fit};
 use isolume::flattened::Side;
 use isolume::illumination_grid::shepard;
 use isolume::mask::{Mask, masks};
@@ -198,7 +198,7 @@ fn main() {
             "fit",
             Box::new(|| {
                 let free = NodeSet::new(lattice.len(), |o| start.mask[o] != Mask::Empty);
-                drop(black_box(fit(&scene.field, lattice, &wishes, start.clone(), &free, &|_| true)));
+                drop(black_box(fit(&scene.field, lattice, &wishes, start.clone(), &free, PULL, &|_| true)));
             }),
         ),
         ("sweep, direct", Box::new(|| swept(8, 64, 1))),

@@ -43,7 +43,7 @@ const CACHING: u64 = 12 + 16 + irradiance_caching::BYTES;
 const PLACE: u64 = 12 + 8 + 4;
 const BESIDE: u64 = size_of::<BesideLight>() as u64;
 
-/// Bytes of them while they are fitted: the wish, and sorted by cells with what cells say. Smoothing before takes 68.
+/// Bytes of them while they are fitted: the wish, and sorted by cells with what cells say. Smoothing before takes 80.
 const WISH: u64 = 24;
 const SORTED: u64 = 40 + 40 + 12;
 

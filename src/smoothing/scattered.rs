@@ -5,7 +5,7 @@ use crate::flattened::Side;
 use crate::node_set::NodeSet;
 use crate::scene::Scene;
 use crate::volume::Lattice;
-use glam::{DVec3, Mat3, Vec3};
+use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 /// Places of the graph, each of which belongs to a point of a lattice that is at most a step away along every axis.
@@ -23,6 +23,8 @@ pub struct Scattered<'a> {
 /// What is known of a place.
 #[derive(Clone, Copy, Default)]
 struct Place {
+    /// In radii of the fits.
+    position: Vec3,
     /// Of the side in question; 0 where there is no light.
     normal: Vec3,
     isovalue: f32,
@@ -34,8 +36,7 @@ struct Place {
 struct Cloud<'a> {
     scattered: &'a Scattered<'a>,
     places: Vec<Place>,
-    /// From local coordinates of the field to radii, and to the lattice.
-    to_radii: Mat3,
+    /// From local coordinates of the field to the lattice.
     to_lattice: Vec3,
     /// How far places' owners may be from a place, in the lattice.
     reach: Vec3,
@@ -44,7 +45,7 @@ struct Cloud<'a> {
 /// Smooths the irradiance of scattered places whose two `halves` are given by their number, and returns it by that number.
 /// Places share light if their normals agree and their isovalues differ by `tau` at most, or by what h rises in half a step of
 /// the lattice where that is more: a steep edge has few places of one isovalue. Places without light (NaN) or without a normal
-/// take no part and stay 0. 68 bytes per place. The same bits on any number of threads.
+/// take no part and stay 0. 80 bytes per place. The same bits on any number of threads.
 #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
 pub fn smooth_scattered(
     scene: &Scene,
@@ -73,21 +74,22 @@ impl<'a> Cloud<'a> {
     ) -> Self {
         let (field, lattice) = (&scene.field, scattered.lattice);
         let step = shortest(lattice);
+        let to_radii = field.lattice().axes() * (1.0 / (RADIUS * step));
         let place = |(n, p): (usize, &Vec3)| {
             if halves(n)[0].is_nan() {
                 return Place::default();
             }
             let p = p.as_dvec3();
+            let position = (to_radii * p).as_vec3();
             let normal = scene.normal(p, side).unwrap_or_default().as_vec3();
             let rise = 0.5 * step * field.gradient(p).length();
-            Place { normal, isovalue: field.value(p) as f32, tau: tau.max(rise) as f32 }
+            Place { position, normal, isovalue: field.value(p) as f32, tau: tau.max(rise) as f32 }
         };
         let places = scattered.positions.par_iter().enumerate().with_min_len(1024).map(place).collect();
         let inverse = lattice.axes().inverse();
         let reach = DVec3::from_array(std::array::from_fn(|a| inverse.row(a).length() * RADIUS * step)) + 1.0;
-        let to_radii = (field.lattice().axes() * (1.0 / (RADIUS * step))).as_mat3();
         let to_lattice = (lattice.far() / field.lattice().far()).as_vec3();
-        Self { scattered, places, to_radii, to_lattice, reach: reach.as_vec3() }
+        Self { scattered, places, to_lattice, reach: reach.as_vec3() }
     }
 
     /// `f` of every place with light, nothing of the others.
@@ -104,8 +106,8 @@ impl Surroundings for Cloud<'_> {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
     fn around(&self, at: usize, mut visit: impl FnMut(usize, Vec3, f32)) {
         let Scattered { lattice, owners, starts, positions } = self.scattered;
-        let (position, place) = (positions[at], self.places[at]);
-        let centre = position * self.to_lattice;
+        let place = self.places[at];
+        let centre = positions[at] * self.to_lattice;
         let lo = (centre - self.reach).ceil().max(Vec3::ZERO).to_array().map(|x| x as usize);
         let hi = (centre + self.reach).floor().to_array().map(|x| x as usize);
         let last = lattice.dims().map(|n| n - 1);
@@ -114,12 +116,13 @@ impl Surroundings for Cloud<'_> {
                 // The places of points that follow one another do so, too.
                 let row = |x: usize| starts[owners.before(lattice.offset(0, y, z) + x)] as usize;
                 let range = row(lo[0])..row(hi[0].min(last[0]) + 1);
-                for (m, p) in range.clone().zip(&positions[range]) {
-                    let d = self.to_radii * (p - position);
+                for (m, other) in range.clone().zip(&self.places[range]) {
+                    let d = other.position - place.position;
                     let d2 = d.length_squared();
-                    let other = &self.places[m];
-                    let alike = other.normal.dot(place.normal) >= CONE;
-                    if d2 < 1.0 && alike && (other.isovalue - place.isovalue).abs() <= place.tau {
+                    if d2 < 1.0
+                        && other.normal.dot(place.normal) >= CONE
+                        && (other.isovalue - place.isovalue).abs() <= place.tau
+                    {
                         visit(m, d, d2);
                     }
                 }
