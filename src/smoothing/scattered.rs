@@ -1,6 +1,6 @@
 //! Light smoothed over places scattered beside grid points.
 
-use super::{CONE, Halves, RADIUS, Smoothed, Surroundings, shortest};
+use super::{CONE, Halves, Smoothed, Surroundings, shortest};
 use crate::flattened::Side;
 use crate::node_set::NodeSet;
 use crate::scene::Scene;
@@ -23,8 +23,6 @@ pub struct Scattered<'a> {
 /// What is known of a place.
 #[derive(Clone, Copy, Default)]
 struct Place {
-    /// In radii of the fits.
-    position: Vec3,
     /// Of the side in question; 0 where there is no light.
     normal: Vec3,
     isovalue: f32,
@@ -32,10 +30,17 @@ struct Place {
     tau: f32,
 }
 
+/// Radius of the fits, in the lattice's shortest spacing: less than that for points, since a point has several places.
+const RADIUS: f64 = 1.75;
+/// Places whose distance is looked at together.
+const CHUNK: usize = 8;
+
 /// Scattered places at work.
 struct Cloud<'a> {
     scattered: &'a Scattered<'a>,
     places: Vec<Place>,
+    /// x, y and z of the places in radii of the fits, and a whole chunk more.
+    positions: [Vec<f32>; 3],
     /// From local coordinates of the field to the lattice.
     to_lattice: Vec3,
     /// How far places' owners may be from a place, in the lattice.
@@ -74,22 +79,45 @@ impl<'a> Cloud<'a> {
     ) -> Self {
         let (field, lattice) = (&scene.field, scattered.lattice);
         let step = shortest(lattice);
-        let to_radii = field.lattice().axes() * (1.0 / (RADIUS * step));
         let place = |(n, p): (usize, &Vec3)| {
             if halves(n)[0].is_nan() {
                 return Place::default();
             }
             let p = p.as_dvec3();
-            let position = (to_radii * p).as_vec3();
             let normal = scene.normal(p, side).unwrap_or_default().as_vec3();
             let rise = 0.5 * step * field.gradient(p).length();
-            Place { position, normal, isovalue: field.value(p) as f32, tau: tau.max(rise) as f32 }
+            Place { normal, isovalue: field.value(p) as f32, tau: tau.max(rise) as f32 }
         };
         let places = scattered.positions.par_iter().enumerate().with_min_len(1024).map(place).collect();
+        let to_radii = field.lattice().axes() * (1.0 / (RADIUS * step));
+        let positions = [0, 1, 2].map(|a| {
+            let row = to_radii.row(a);
+            let all = scattered.positions.iter().map(|p| row.dot(p.as_dvec3()) as f32);
+            all.chain([f32::INFINITY; CHUNK]).collect()
+        });
         let inverse = lattice.axes().inverse();
         let reach = DVec3::from_array(std::array::from_fn(|a| inverse.row(a).length() * RADIUS * step)) + 1.0;
         let to_lattice = (lattice.far() / field.lattice().far()).as_vec3();
-        Self { scattered, places, to_lattice, reach: reach.as_vec3() }
+        Self { scattered, places, positions, to_lattice, reach: reach.as_vec3() }
+    }
+
+    /// Which of the places from `first` on lie within a radius of one, bit by bit.
+    #[inline(always)]
+    fn near(&self, first: usize, position: Vec3) -> u32 {
+        let chunk = |a: usize| -> &[f32; CHUNK] { self.positions[a][first..][..CHUNK].try_into().expect("a chunk") };
+        let (x, y, z) = (chunk(0), chunk(1), chunk(2));
+        let mut near = 0;
+        for l in 0..CHUNK {
+            let (x, y, z) = (x[l] - position.x, y[l] - position.y, z[l] - position.z);
+            near |= u32::from(x * x + y * y + z * z < 1.0) << l;
+        }
+        near
+    }
+
+    #[inline(always)]
+    fn position(&self, n: usize) -> Vec3 {
+        let [x, y, z] = &self.positions;
+        Vec3::new(x[n], y[n], z[n])
     }
 
     /// `f` of every place with light, nothing of the others.
@@ -106,7 +134,7 @@ impl Surroundings for Cloud<'_> {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
     fn around(&self, at: usize, mut visit: impl FnMut(usize, Vec3, f32)) {
         let Scattered { lattice, owners, starts, positions } = self.scattered;
-        let place = self.places[at];
+        let (place, position) = (self.places[at], self.position(at));
         let centre = positions[at] * self.to_lattice;
         let lo = (centre - self.reach).ceil().max(Vec3::ZERO).to_array().map(|x| x as usize);
         let hi = (centre + self.reach).floor().to_array().map(|x| x as usize);
@@ -116,14 +144,18 @@ impl Surroundings for Cloud<'_> {
                 // The places of points that follow one another do so, too.
                 let row = |x: usize| starts[owners.before(lattice.offset(0, y, z) + x)] as usize;
                 let range = row(lo[0])..row(hi[0].min(last[0]) + 1);
-                for (m, other) in range.clone().zip(&self.places[range]) {
-                    let d = other.position - place.position;
-                    let d2 = d.length_squared();
-                    if d2 < 1.0
-                        && other.normal.dot(place.normal) >= CONE
-                        && (other.isovalue - place.isovalue).abs() <= place.tau
-                    {
-                        visit(m, d, d2);
+                for first in range.clone().step_by(CHUNK) {
+                    let count = (range.end - first).min(CHUNK);
+                    let mut near = self.near(first, position) & ((1 << count) - 1);
+                    while near != 0 {
+                        let m = first + near.trailing_zeros() as usize;
+                        near &= near - 1;
+                        let other = &self.places[m];
+                        let alike = (other.isovalue - place.isovalue).abs() <= place.tau;
+                        if alike && other.normal.dot(place.normal) >= CONE {
+                            let d = self.position(m) - position;
+                            visit(m, d, d.length_squared());
+                        }
                     }
                 }
             }
@@ -139,7 +171,7 @@ mod tests {
     use crate::scene::{Boundary, Surface};
     use crate::volume::{Samples, Volume};
 
-    /// Places about the points of every other plane of x, where h rises by `slope` a step from x = 0 and falls from x = 8 on.
+    /// Four places about most points of three in four planes of x, where h rises by `slope` a step from x = 0 and falls from x = 8 on.
     struct Steep {
         scene: Scene,
         owners: NodeSet,
@@ -154,12 +186,12 @@ mod tests {
             let samples = (0..lattice.len()).map(height).collect();
             let volume = Volume::new("steep", lattice.clone(), Samples::F32(samples)).unwrap();
             let field = Field::new(&volume, Sweep::new(0.0, 8.0).unwrap()).unwrap();
-            let owners = NodeSet::new(lattice.len(), |o| lattice.ijk(o)[0] % 2 == 1);
+            let owners = NodeSet::new(lattice.len(), |o| lattice.ijk(o)[0] % 4 != 0);
             let (mut positions, mut starts) = (Vec::new(), vec![0]);
             for o in owners.members(0..lattice.len()) {
                 let mut rng = Rng::stream(1, Stage::Test, o as u64);
-                // As many as there are, none among them.
-                for _ in 0..o % 5 {
+                // A point may have none.
+                for _ in 0..if o % 5 == 0 { 0 } else { 4 } {
                     let offset = DVec3::from_array(std::array::from_fn(|_| 2.0 * rng.unit() - 1.0));
                     let p = DVec3::from_array(lattice.ijk(o).map(|i| i as f64)) + offset;
                     positions.push(p.clamp(DVec3::ZERO, lattice.far()).as_vec3());
