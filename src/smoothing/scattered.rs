@@ -186,12 +186,12 @@ mod tests {
             let samples = (0..lattice.len()).map(height).collect();
             let volume = Volume::new("steep", lattice.clone(), Samples::F32(samples)).unwrap();
             let field = Field::new(&volume, Sweep::new(0.0, 8.0).unwrap()).unwrap();
-            let owners = NodeSet::new(lattice.len(), |o| lattice.ijk(o)[0] % 4 != 0);
+            let owners = NodeSet::new(lattice.len(), |o| !lattice.ijk(o)[0].is_multiple_of(4));
             let (mut positions, mut starts) = (Vec::new(), vec![0]);
             for o in owners.members(0..lattice.len()) {
                 let mut rng = Rng::stream(1, Stage::Test, o as u64);
                 // A point may have none.
-                for _ in 0..if o % 5 == 0 { 0 } else { 4 } {
+                for _ in 0..if o.is_multiple_of(5) { 0 } else { 4 } {
                     let offset = DVec3::from_array(std::array::from_fn(|_| 2.0 * rng.unit() - 1.0));
                     let p = DVec3::from_array(lattice.ijk(o).map(|i| i as f64)) + offset;
                     positions.push(p.clamp(DVec3::ZERO, lattice.far()).as_vec3());
