@@ -13,7 +13,7 @@ use crate::mask::{Mask, local_position, own_light, stand_ins};
 use crate::node_set::NodeSet;
 use crate::radiance::{BLOCK, RadianceSample, RadianceSamples, Sampler, sample_places};
 use crate::scene::Scene;
-use crate::smoothing::{Halves, Scattered, smooth, smooth_scattered};
+use crate::smoothing::{Halves, Scattered, Smoothed, smooth, smooth_scattered};
 use crate::tracer::Tracer;
 use crate::volume::Lattice;
 use glam::{DVec3, Vec3};
@@ -224,17 +224,25 @@ impl<'a> GridPoints<'a> {
                 if a.is_nan() {
                     return;
                 }
-                let p = local_position(self.field, self.lattice, o).as_vec3().as_dvec3();
-                let albedo = scene.surface.albedo.at(f64::from(scene.field.value(p) as f32));
-                let change = reflected(albedo, (smoothed.mean - 0.5 * (a + b)).as_dvec3());
-                *radiance = (Vec3::from_array(*radiance) + change.as_vec3()).max(Vec3::ZERO).to_array();
-                let scale = (luminance(albedo) / PI) as f32;
-                *std_error = (*std_error + smoothed.variance * scale * scale).max(0.0).sqrt();
+                let p = local_position(self.field, self.lattice, o).as_vec3();
+                let (light, variance) = smoothed_light(scene, p, Vec3::from_array(*radiance), [a, b], smoothed);
+                *radiance = light.to_array();
+                *std_error = (*std_error + variance).max(0.0).sqrt();
             });
             tick(area as u64);
         });
         grid
     }
+}
+
+/// The radiance at local position `p` with what was gathered there, in `halves`, replaced by what is `smoothed`; and the
+/// variance that this part of its luminance has.
+#[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+fn smoothed_light(scene: &Scene, p: Vec3, radiance: Vec3, [a, b]: Halves, smoothed: Smoothed) -> (Vec3, f32) {
+    let albedo = scene.surface.albedo.at(f64::from(scene.field.value(p.as_dvec3()) as f32));
+    let change = reflected(albedo, (smoothed.mean - 0.5 * (a + b)).as_dvec3());
+    let scale = (luminance(albedo) / PI) as f32;
+    ((radiance + change.as_vec3()).max(Vec3::ZERO), smoothed.variance * scale * scale)
 }
 
 /// Places beside the points of a grid that hold no level set of the sweep, while surfaces beside them do.
@@ -339,20 +347,22 @@ impl<'a> Beside<'a> {
     }
 
     /// Smooths what was gathered over the places around ([`smooth_scattered`]): where little arrives, few rays bring it, and
-    /// the fit would show them as specks.
-    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-    pub(super) fn smooth(&self, scene: &Scene, side: Side, tau: f64, light: &mut [BesideLight]) {
+    /// the fit would show them as specks. Leaves all as it is if `tick` says stop.
+    pub(super) fn smooth(
+        &self,
+        scene: &Scene,
+        side: Side,
+        tau: f64,
+        light: &mut [BesideLight],
+        tick: &(dyn Fn(u64) -> bool + Sync),
+    ) {
         let scattered =
             Scattered { lattice: self.lattice, owners: &self.points, starts: &self.starts, positions: &self.positions };
-        let smoothed = smooth_scattered(scene, &scattered, side, tau, &|n| light[n].halves.unpack());
+        let halves = |n: usize| light[n].halves.unpack();
+        let Some(smoothed) = smooth_scattered(scene, &scattered, side, tau, &halves, tick) else { return };
         let places = light.par_iter_mut().zip(smoothed).zip(&self.positions).with_min_len(1024);
-        places.filter(|((l, _), _)| l.halves != Packed::NONE).for_each(|((l, smoothed), p)| {
-            let [a, b] = l.halves.unpack();
-            let albedo = scene.surface.albedo.at(f64::from(self.field.value(p.as_dvec3()) as f32));
-            let change = reflected(albedo, (smoothed.mean - 0.5 * (a + b)).as_dvec3());
-            l.radiance = (l.radiance + change.as_vec3()).max(Vec3::ZERO);
-            let scale = (luminance(albedo) / PI) as f32;
-            l.common = smoothed.variance * scale * scale;
+        places.filter(|((l, _), _)| l.halves != Packed::NONE).for_each(|((l, smoothed), &p)| {
+            (l.radiance, l.common) = smoothed_light(scene, p, l.radiance, l.halves.unpack(), smoothed);
             l.variance = (l.variance - l.indirect_variance).max(0.0) + l.common;
         });
     }

@@ -250,7 +250,7 @@ impl<'a> FieldLight<'a> {
             let grid = match (&places, points) {
                 (Places::Grid(grid, beside), Some((at_points, mut at_beside))) => {
                     if settings.smooths() {
-                        beside.smooth(scene, side, settings.tau, &mut at_beside);
+                        beside.smooth(scene, side, settings.tau, &mut at_beside, tick);
                     }
                     beside.fit(grid.finish(scene, side, settings.tau, at_points, tick), &at_beside)
                 }

@@ -89,7 +89,7 @@ pub(super) fn light(
         let mut light = beside.dark();
         let counts = beside.sample(&sampler, Band::WHOLE, &mut light, saved, &|n| stage.tick(n));
         lit.count(counts);
-        beside.smooth(scene, s.side, settings.tau, &mut light);
+        beside.smooth(scene, s.side, settings.tau, &mut light, &|n| stage.tick(n));
         let (indirect, shadow_rays) = (gather(1), shadow(1));
         let sampler = Sampler { indirect: &indirect, shadow_rays, ..sampler };
         // Keys of a point beside; none of these is one.

@@ -50,7 +50,7 @@ struct Cloud<'a> {
 /// Smooths the irradiance of scattered places whose two `halves` are given by their number, and returns it by that number.
 /// Places share light if their normals agree and their isovalues differ by `tau` at most, or by what h rises in half a step of
 /// the lattice where that is more: a steep edge has few places of one isovalue. Places without light (NaN) or without a normal
-/// take no part and stay 0. 80 bytes per place. The same bits on any number of threads.
+/// take no part and stay 0. 80 bytes per place. The same bits on any number of threads. None once `tick` says stop.
 #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
 pub fn smooth_scattered(
     scene: &Scene,
@@ -58,14 +58,15 @@ pub fn smooth_scattered(
     side: Side,
     tau: f64,
     halves: &(dyn Fn(usize) -> Halves + Sync),
-) -> Vec<Smoothed> {
+    tick: &(dyn Fn(u64) -> bool + Sync),
+) -> Option<Vec<Smoothed>> {
     let cloud = Cloud::new(scene, scattered, side, tau, halves);
-    let once = cloud.each(|n| cloud.fit(n, halves));
-    let twice = cloud.each(|n| cloud.fit_again(n, halves, |m| once[m]));
+    let once = cloud.each(tick, |n| cloud.fit(n, halves))?;
+    let twice = cloud.each(tick, |n| cloud.fit_again(n, halves, |m| once[m]))?;
     drop(once);
-    let blended = cloud.each(|n| cloud.blend(n, halves, |m| twice[m]));
+    let blended = cloud.each(tick, |n| cloud.blend(n, halves, |m| twice[m]))?;
     drop(twice);
-    cloud.each(|n| cloud.mean(n, |m| blended[m]))
+    cloud.each(tick, |n| cloud.mean(n, |m| blended[m]))
 }
 
 impl<'a> Cloud<'a> {
@@ -92,7 +93,7 @@ impl<'a> Cloud<'a> {
         let to_radii = field.lattice().axes() * (1.0 / (RADIUS * step));
         let positions = [0, 1, 2].map(|a| {
             let row = to_radii.row(a);
-            let all = scattered.positions.iter().map(|p| row.dot(p.as_dvec3()) as f32);
+            let all = scattered.positions.par_iter().map(|p| row.dot(p.as_dvec3()) as f32);
             all.chain([f32::INFINITY; CHUNK]).collect()
         });
         let inverse = lattice.axes().inverse();
@@ -120,9 +121,16 @@ impl<'a> Cloud<'a> {
         Vec3::new(x[n], y[n], z[n])
     }
 
-    /// `f` of every place with light, nothing of the others.
-    fn each<T: Default + Send>(&self, f: impl Fn(usize) -> T + Sync) -> Vec<T> {
-        let of = |n: usize| if self.places[n].normal == Vec3::ZERO { T::default() } else { f(n) };
+    /// `f` of every place with light, nothing of the others; none once `tick` says stop.
+    fn each<T: Default + Send>(
+        &self,
+        tick: &(dyn Fn(u64) -> bool + Sync),
+        f: impl Fn(usize) -> T + Sync,
+    ) -> Option<Vec<T>> {
+        let of = |n: usize| match self.places[n].normal {
+            Vec3::ZERO => Some(T::default()),
+            _ => tick(0).then(|| f(n)),
+        };
         (0..self.places.len()).into_par_iter().with_min_len(64).map(of).collect()
     }
 }
@@ -202,6 +210,11 @@ mod tests {
             Self { scene, owners, starts, positions }
         }
 
+        fn scattered(&self) -> Scattered<'_> {
+            let (lattice, owners) = (self.scene.field.lattice(), &self.owners);
+            Scattered { lattice, owners, starts: &self.starts, positions: &self.positions }
+        }
+
         /// `light` with noise of standard deviation 0.1 on either half, as it is and smoothed.
         fn smoothed(&self, light: impl Fn(DVec3) -> f32) -> (Vec<Halves>, Vec<Smoothed>) {
             let noisy = |(n, p): (usize, &Vec3)| {
@@ -210,14 +223,9 @@ mod tests {
                 [noise(), noise()].map(|noise| Vec3::splat(light(p.as_dvec3()) + noise as f32))
             };
             let halves: Vec<Halves> = self.positions.iter().enumerate().map(noisy).collect();
-            let scattered = Scattered {
-                lattice: self.scene.field.lattice(),
-                owners: &self.owners,
-                starts: &self.starts,
-                positions: &self.positions,
-            };
-            let smoothed = smooth_scattered(&self.scene, &scattered, Side::Lower, 0.01, &|n| halves[n]);
-            (halves, smoothed)
+            let get = |n: usize| halves[n];
+            let smoothed = smooth_scattered(&self.scene, &self.scattered(), Side::Lower, 0.01, &get, &|_| true);
+            (halves, smoothed.unwrap())
         }
 
         /// RMS error of the mean before and after, at the places judged.
@@ -275,6 +283,17 @@ mod tests {
         assert_eq!(one, with(3));
         let dark = one.iter().zip(&steep.positions).filter(|(_, p)| light(p.as_dvec3()).is_nan());
         assert!(dark.clone().count() > 100 && dark.clone().all(|(s, _)| *s == Smoothed::default()));
+    }
+
+    #[test]
+    fn a_stop_gives_nothing_rather_than_a_part() {
+        use std::sync::atomic::{AtomicUsize, Ordering};
+        let steep = Steep::new(1.0);
+        // In the midst of the second pass.
+        let left = AtomicUsize::new(3 * steep.positions.len() / 2);
+        let tick = |_: u64| left.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |n| n.checked_sub(1)).is_ok();
+        let bright = |_: usize| [Vec3::ONE; 2];
+        assert_eq!(smooth_scattered(&steep.scene, &steep.scattered(), Side::Lower, 0.01, &bright, &tick), None);
     }
 
     /// The variance told is that of the error, not of what went in.
