@@ -14,9 +14,8 @@ use crate::field::Field;
 use crate::flattened::{FlattenedHit, FlattenedRay};
 
 use glam::Vec4;
-use kernel::Scalar;
 use rayon::prelude::*;
-use simd::Avx512;
+use simd::Isa;
 use std::ops::Range;
 
 /// Levels at most: children are cells, then blocks of 4³, 16³ and 64³ cells.
@@ -100,7 +99,7 @@ pub struct Pyramid {
     /// What a step along y or z adds to a sample's position in memory.
     steps: [usize; 2],
     capped: bool,
-    wide: Option<Avx512>,
+    isa: Isa,
 }
 
 /// A monotone map of isovalues to 8 bits: half linear, half by the share of samples below, so that ranges stay narrow where
@@ -174,13 +173,13 @@ impl Pyramid {
         });
         let roots = levels[levels.len() - 1].tiles.len();
         let steps = [dims[0], dims[0] * dims[1]];
-        Self { cells, far, rounding, ranks, levels, places, roots, steps, capped, wide: Avx512::detect() }
+        Self { cells, far, rounding, ranks, levels, places, roots, steps, capped, isa: Isa::detect() }
     }
 
-    /// The same without SIMD, as on a machine that has none: the same hits, slower.
-    #[must_use]
-    pub fn scalar(mut self) -> Self {
-        self.wide = None;
+    /// The same with another instruction set: the same hits.
+    #[cfg(test)]
+    fn with(mut self, isa: Isa) -> Self {
+        self.isa = isa;
         self
     }
 
@@ -192,19 +191,13 @@ impl Pyramid {
     /// The first hit of `ray` with t ≤ `reach`, or `None`. `field` must be the one the pyramid was built from.
     #[inline]
     pub fn intersect(&self, field: &Field, ray: &FlattenedRay, reach: f64) -> Option<FlattenedHit> {
-        match self.wide {
-            Some(wide) => wide.walk::<false>(self, field, ray, reach),
-            None => self.walk::<false, _>(Scalar, field, ray, reach),
-        }
+        self.isa.walk::<false>(self, field, ray, reach)
     }
 
     /// Whether [`Pyramid::intersect`] would find a hit; cheaper, since a sign change inside the reach proves one.
     #[inline]
     pub fn occluded(&self, field: &Field, ray: &FlattenedRay, reach: f64) -> bool {
-        match self.wide {
-            Some(wide) => wide.walk::<true>(self, field, ray, reach).is_some(),
-            None => self.walk::<true, _>(Scalar, field, ray, reach).is_some(),
-        }
+        self.isa.walk::<true>(self, field, ray, reach).is_some()
     }
 }
 
@@ -219,20 +212,14 @@ impl Pyramid {
         ray: impl Fn(usize) -> FlattenedRay,
         hits: &mut [Option<FlattenedHit>; 16],
     ) {
-        match self.wide {
-            Some(wide) => wide.walk16::<false>(self, field, active, ray, hits),
-            None => self.walk16::<false, _>(Scalar, field, active, ray, hits),
-        }
+        self.isa.walk16::<false>(self, field, active, ray, hits);
     }
 
     /// [`Pyramid::occluded`] for the rays whose bits are set in `active`, as bits.
     #[inline]
     pub fn occluded16(&self, field: &Field, active: u16, ray: impl Fn(usize) -> FlattenedRay) -> u16 {
         let mut hits = [None; 16];
-        match self.wide {
-            Some(wide) => wide.walk16::<true>(self, field, active, ray, &mut hits),
-            None => self.walk16::<true, _>(Scalar, field, active, ray, &mut hits),
-        }
+        self.isa.walk16::<true>(self, field, active, ray, &mut hits);
         hits.iter().enumerate().fold(0, |bits, (n, hit)| bits | u16::from(hit.is_some()) << n)
     }
 }

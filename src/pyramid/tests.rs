@@ -60,19 +60,57 @@ fn with_and_without_simd_hits_are_the_same_bits() {
         let field = field(dims, levels);
         let mut rng = Rng::stream(3, Stage::Test, dims[0] as u64);
         for capped in [false, true] {
-            let wide = Pyramid::new(&field, capped);
-            let scalar = wide.clone().scalar();
+            let pyramid = Pyramid::new(&field, capped);
+            let others: Vec<Pyramid> = Isa::found().into_iter().map(|isa| pyramid.clone().with(isa)).collect();
             let mut hits = 0;
             for _ in 0..100_000 {
                 let ray = ray(&field, &mut rng, levels);
-                let hit = wide.intersect(&field, &ray, f64::from(ray.reach));
-                assert_eq!(hit, scalar.intersect(&field, &ray, f64::from(ray.reach)), "{ray:?}");
-                assert_eq!(hit.is_some(), wide.occluded(&field, &ray, f64::from(ray.reach)), "{ray:?}");
+                let reach = f64::from(ray.reach);
+                let hit = pyramid.intersect(&field, &ray, reach);
+                for other in &others {
+                    assert_eq!(hit, other.intersect(&field, &ray, reach), "{:?}, {ray:?}", other.isa);
+                    assert_eq!(hit.is_some(), other.occluded(&field, &ray, reach), "{:?}, {ray:?}", other.isa);
+                }
                 hits += u32::from(hit.is_some());
             }
             assert!((5_000..95_000).contains(&hits), "{hits} hits of {dims:?} test nothing");
         }
     }
+}
+
+/// A child too many would cost time only, so that no hit tells.
+#[test]
+fn every_instruction_set_finds_the_same_children() {
+    let mut rng = Rng::stream(9, Stage::Test, 0);
+    let mut sizes = [0u64; 65];
+    for _ in 0..50_000 {
+        let d = warp::sphere(rng.unit2()).as_vec3().extend(0.0);
+        let backward = d.cmplt(Vec4::ZERO);
+        let size = if rng.bits().is_multiple_of(2) { 1.0 } else { 4.0 };
+        let base = Vec4::new(4.0, 8.0, 0.0, 0.0);
+        let mut unit = || rng.unit() as f32;
+        let o = base + size * (6.0 * Vec4::new(unit(), unit(), unit(), 0.5) - 1.0);
+        let line = kernel::Line {
+            // Some start on planes and edges.
+            o: if rng.bits().is_multiple_of(3) { o.floor() } else { o },
+            inv: 1.0 / d.with_w(1.0),
+            far: Vec4::select(backward, Vec4::ZERO, Vec4::ONE),
+            flip: (0..3).filter(|&a| backward.test(a)).fold(0, |flip, a| flip | 3 << (2 * a)),
+            end: if rng.bits().is_multiple_of(4) { 20.0 * rng.unit() as f32 } else { f32::INFINITY },
+            most_lo: 100 + (rng.bits() % 60) as u8,
+            least_hi: 90 + (rng.bits() % 60) as u8,
+        };
+        let mut tile = Tile::EMPTY;
+        for n in 0..64 {
+            (tile.lo[n], tile.hi[n]) = ((rng.bits() % 200) as u8, 55 + (rng.bits() % 200) as u8);
+        }
+        let expected = Isa::PLAIN.children(&line, &tile, base, size);
+        for isa in Isa::found() {
+            assert_eq!(isa.children(&line, &tile, base, size), expected, "{isa:?}, {line:?}");
+        }
+        sizes[expected.count_ones() as usize] += 1;
+    }
+    assert!(sizes[2..].iter().sum::<u64>() > 5_000, "{sizes:?}");
 }
 
 #[test]
@@ -81,8 +119,7 @@ fn packets_give_the_bits_of_single_rays() {
         let field = field(dims, levels);
         let mut rng = Rng::stream(5, Stage::Test, dims[0] as u64);
         for capped in [false, true] {
-            let wide = Pyramid::new(&field, capped);
-            for pyramid in [wide.clone().scalar(), wide] {
+            for pyramid in Isa::found().into_iter().map(|isa| Pyramid::new(&field, capped).with(isa)) {
                 for _ in 0..3_000 {
                     let rays: [FlattenedRay; 16] = std::array::from_fn(|_| ray(&field, &mut rng, levels));
                     let active = rng.bits() as u16 | rng.bits() as u16;
