@@ -208,12 +208,20 @@ fn join(a: (usize, usize), b: (usize, usize)) -> (usize, usize) {
     (a.0.min(b.0), a.1.max(b.1))
 }
 
-/// What lines see that meet u = place\[0\] + n · place\[1\] (line n) in a row of samples, in this turn; takes the row into their extrema.
+/// What lines from number `start` on see that meet u = place\[0\] + n · place\[1\] (line n) in a row of samples, in this turn;
+/// takes the row into their extrema.
 #[inline(always)]
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the row")]
-pub(super) fn march_row(row: &[f32], [u0, du]: [f32; 2], [most, least]: [&mut [f32]; 2], out: &mut [u8], turn: u8) {
+pub(super) fn march_row(
+    row: &[f32],
+    [u0, du]: [f32; 2],
+    start: usize,
+    [most, least]: [&mut [f32]; 2],
+    out: &mut [u8],
+    turn: u8,
+) {
     let last = row.len() - 2;
-    for (n, ((most, least), out)) in most.iter_mut().zip(least).zip(out).enumerate() {
+    for (n, ((most, least), out)) in most.iter_mut().zip(least).zip(out).enumerate().skip(start) {
         let u = (u0 + n as f32 * du).max(0.0);
         let i = (u as usize).min(last);
         let (a, b) = (row[i], row[i + 1]);

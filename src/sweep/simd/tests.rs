@@ -56,7 +56,9 @@ fn every_instruction_set_scans_to_the_same_bits() {
                 isa.scan(&mut noise(seed), way, light, &mut out, (LANES, 0));
                 out.iter().flatten().map(|x| x.to_bits()).collect::<Vec<_>>()
             };
-            assert_eq!(scan(Isa::PLAIN), scan(Isa::detect()), "{way:?}");
+            for isa in Isa::found() {
+                assert_eq!(scan(Isa::PLAIN), scan(isa), "{way:?}, {isa:?}");
+            }
         }
     }
 }
@@ -64,18 +66,24 @@ fn every_instruction_set_scans_to_the_same_bits() {
 #[test]
 fn every_instruction_set_marches_to_the_same_bits() {
     let mut rng = Rng::stream(5, Stage::Test, 0);
-    for count in [1, 15, 16, 17, 99, 100] {
+    for count in [1, 7, 8, 9, 15, 16, 17, 98, 99, 100] {
         let mut row: Vec<f32> = (0..40).map(|_| rng.unit() as f32).collect();
         row[13] = f32::NAN;
         let start: Vec<f32> = (0..count).map(|_| rng.unit() as f32).collect();
         // Places in the row, and beyond all integers.
-        let places = if count < 100 { [-0.3, 0.371] } else { [3e9, 1e30] };
+        let places = match count {
+            98 => [-0.3, 2.3],
+            100 => [3e9, 1e30],
+            _ => [-0.3, 0.371],
+        };
         let run = |isa: Isa| {
             let (mut most, mut least, mut out) = (start.clone(), start.clone(), vec![9u8; count]);
             isa.march(&row, places, [&mut most, &mut least], &mut out, 24);
             (most.iter().chain(&least).map(|x| x.to_bits()).collect::<Vec<_>>(), out)
         };
-        assert_eq!(run(Isa::PLAIN), run(Isa::detect()), "{count} lines");
+        for isa in Isa::found() {
+            assert_eq!(run(Isa::PLAIN), run(isa), "{count} lines, {isa:?}");
+        }
     }
 }
 
@@ -97,7 +105,9 @@ fn every_instruction_set_finds_the_same_extrema() {
             isa.extrema(field.samples(), &mut segments);
             [segments.least, segments.most].map(|x| x.map(f32::to_bits))
         };
-        assert_eq!(run(Isa::PLAIN), run(Isa::detect()));
+        for isa in Isa::found() {
+            assert_eq!(run(Isa::PLAIN), run(isa), "{isa:?}");
+        }
     }
 }
 
