@@ -156,8 +156,8 @@ fn children(line: &Line, ray: &Ray, tile: &Tile, base: Vec4, size: f32) -> u64 {
     // Line::time of all planes. `size` is a power of 2 and the numbers are small: planes are exact.
     let (size, base) = (_mm256_set1_ps(size), _mm256_set_m128(base.into(), base.into()));
     let corner = [_mm256_permute_ps::<0x00>(base), _mm256_permute_ps::<0x55>(base), _mm256_permute_ps::<0xaa>(base)];
-    let o = [line.o.x, line.o.y, line.o.z].map(|x| _mm256_set1_ps(x));
-    let inv = [line.inv.x, line.inv.y, line.inv.z].map(|x| _mm256_set1_ps(x));
+    let o = [_mm256_set1_ps(line.o.x), _mm256_set1_ps(line.o.y), _mm256_set1_ps(line.o.z)];
+    let inv = [_mm256_set1_ps(line.inv.x), _mm256_set1_ps(line.inv.y), _mm256_set1_ps(line.inv.z)];
     let times = |n: __m256, a: usize| _mm256_mul_ps(_mm256_sub_ps(_mm256_fmadd_ps(n, size, corner[a]), o[a]), inv[a]);
     // Above 0 is from the smallest positive number on.
     let above = _mm256_castsi256_ps(_mm256_set1_epi32(1));
@@ -234,14 +234,17 @@ fn span(corners: __m256, piece: &Piece) -> [f64; 8] {
     let y = _mm256_permute4x64_pd::<0x50>(y);
     let z = [_mm256_permute4x64_pd::<0xaa>(xz), _mm256_permute4x64_pd::<0xff>(xz)];
     // Axis by axis the corners of the cell give way to those of the box, near and far along z.
-    let s = [_mm256_castps256_ps128(corners), _mm256_extractf128_ps::<1>(corners)].map(|s| _mm256_cvtps_pd(s));
-    let s = s.map(|s| lerp(x, _mm256_permute_pd::<0x0>(s), _mm256_permute_pd::<0xf>(s)));
-    let s = s.map(|s| lerp(y, _mm256_permute4x64_pd::<0x44>(s), _mm256_permute4x64_pd::<0xee>(s)));
+    let (near, far) = (_mm256_castps256_ps128(corners), _mm256_extractf128_ps::<1>(corners));
+    let (near, far) = (_mm256_cvtps_pd(near), _mm256_cvtps_pd(far));
+    let along_x = |s: __m256d| lerp(x, _mm256_permute_pd::<0x0>(s), _mm256_permute_pd::<0xf>(s));
+    let (near, far) = (along_x(near), along_x(far));
+    let along_y = |s: __m256d| lerp(y, _mm256_permute4x64_pd::<0x44>(s), _mm256_permute4x64_pd::<0xee>(s));
+    let (near, far) = (along_y(near), along_y(far));
     let mut values = [0.0; 8];
     // SAFETY: stores into the two halves of the array.
     unsafe {
-        _mm256_storeu_pd(values.as_mut_ptr(), lerp(z[0], s[0], s[1]));
-        _mm256_storeu_pd(values.as_mut_ptr().add(4), lerp(z[1], s[0], s[1]));
+        _mm256_storeu_pd(values.as_mut_ptr(), lerp(z[0], near, far));
+        _mm256_storeu_pd(values.as_mut_ptr().add(4), lerp(z[1], near, far));
     }
     values
 }
@@ -251,7 +254,7 @@ fn span(corners: __m256, piece: &Piece) -> [f64; 8] {
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "eight bits")]
 fn at_least(values: &[f64; 8], c: f64) -> u8 {
     // SAFETY: loads of the two halves of the array.
-    let [near, far] = unsafe { [0, 4].map(|at| _mm256_loadu_pd(values.as_ptr().add(at))) };
+    let (near, far) = unsafe { (_mm256_loadu_pd(values.as_ptr()), _mm256_loadu_pd(values.as_ptr().add(4))) };
     let bits = |x| _mm256_movemask_pd(_mm256_cmp_pd::<_CMP_GE_OQ>(x, _mm256_set1_pd(c)));
     (bits(near) | bits(far) << 4) as u8
 }

@@ -363,9 +363,10 @@ fn meet(pack: &Pack, way: Way, light: Light, (row, side): (usize, usize), met: &
 unsafe fn fetch(base: &[Half4], places: &[u32; HALF]) -> [__m256; 3] {
     let four = |lane: usize| {
         // SAFETY: the caller keeps the places inside `base`, whose elements are eight bytes.
-        let [low, high] =
-            unsafe { [lane, lane + 4].map(|lane| _mm_loadl_epi64(base.as_ptr().add(places[lane] as usize).cast())) };
-        _mm256_cvtph_ps(_mm_unpacklo_epi64(low, high))
+        unsafe {
+            let one = |lane: usize| _mm_loadl_epi64(base.as_ptr().add(places[lane] as usize).cast());
+            _mm256_cvtph_ps(_mm_unpacklo_epi64(one(lane), one(lane + 4)))
+        }
     };
     let (a, b, c, d) = (four(0), four(1), four(2), four(3));
     let (rg, rg2) = (_mm256_unpacklo_ps(a, b), _mm256_unpacklo_ps(c, d));
