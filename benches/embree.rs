@@ -4,6 +4,7 @@
 use isolume::embree::{
     Device, Ray, Ray16, RayHit, RayHit16, RayView, Scene, SceneBuilder, UserGeometry, UserHit, Valid16,
 };
+use isolume::isa::Isa;
 use std::hint::black_box;
 use std::time::Instant;
 
@@ -95,7 +96,7 @@ fn main() {
             *best = best.min(start.elapsed().as_secs_f64());
         }
     }
-    println!("Embree {}", device.version());
+    println!("Embree {}, {}", device.version(), Isa::current().name());
     for ((name, ..), best) in runs.iter().zip(best) {
         println!("{name:38} {:7.1} ns per ray", best / RAYS as f64 * 1e9);
     }

@@ -15,6 +15,7 @@ use isolume::embree::{
 };
 use isolume::field::{Field, Sweep};
 use isolume::flattened::{Departure, FlattenedRay, Side};
+use isolume::isa::Isa;
 use isolume::isosurface::extract;
 use isolume::pyramid::Pyramid;
 use isolume::rng::{Rng, Stage};
@@ -348,7 +349,7 @@ fn main() {
     let data = arguments.iter().position(|a| a == "--data").and_then(|i| arguments.get(i + 1));
     rayon::ThreadPoolBuilder::new().num_threads(2).build_global().expect("two threads");
     let device = Device::new(2).expect("Embree starts");
-    println!("Embree {}, 2 threads", device.version());
+    println!("Embree {}, 2 threads, {}", device.version(), Isa::current().name());
 
     let mut cases = vec![bumps()];
     if let Some(dir) = data.map(Path::new) {

@@ -8,6 +8,7 @@ use isolume::embree::{Device, GraphTracer, SurfaceTracer};
 use isolume::field::{Field, Sweep};
 use isolume::flattened::{Departure, Side};
 use isolume::gather::gathered_irradiance;
+use isolume::isa::Isa;
 use isolume::nearest::Neighbours;
 use isolume::photon::{PhotonSettings, trace_photons};
 use isolume::photon_map::{EstimateSettings, Estimator, PhotonMap};
@@ -43,7 +44,12 @@ fn main() {
     let device = Device::new(1).expect("Embree starts");
     let tracer = GraphTracer::new(&device, &scene).expect("a tracer");
     let emission = |count, seed| PhotonSettings { count, max_bounces: u16::MAX, seed, fixed_isovalue: None };
-    println!("per CPU second, {} threads, Embree {}; bumps 101³", rayon::current_num_threads(), device.version());
+    println!(
+        "per CPU second, {} threads, {}, Embree {}; bumps 101³",
+        rayon::current_num_threads(),
+        Isa::current().name(),
+        device.version()
+    );
     let (photons, seconds) = timed(|| trace_photons(&scene, &tracer, &emission(1 << 21, 1), &|_| true));
     let millions = |n: u64, seconds: f64| n as f64 / seconds / 1e6;
     println!(

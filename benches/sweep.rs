@@ -8,6 +8,7 @@
 use glam::{DVec3, Vec3};
 use isolume::embree::{Device, Ray, RayHit, Scene as Bvh, SceneBuilder};
 use isolume::field::{Field, Sweep};
+use isolume::isa::Isa;
 use isolume::isosurface::extract;
 use isolume::progress::processor_seconds;
 use isolume::rng::{Rng, Stage};
@@ -157,7 +158,12 @@ fn main() {
     let full = arguments.iter().any(|a| a == "--full");
     let data = arguments.iter().position(|a| a == "--data").and_then(|i| arguments.get(i + 1));
     let device = Device::new(1).expect("Embree starts");
-    println!("per CPU second (all threads), {} threads, Embree {}", rayon::current_num_threads(), device.version());
+    println!(
+        "per CPU second (all threads), {} threads, {}, Embree {}",
+        rayon::current_num_threads(),
+        Isa::current().name(),
+        device.version()
+    );
     let mut passes = Vec::new();
     for n in if full { vec![64, 101, 128, 256] } else { vec![101] } {
         let scene = bumps(n);

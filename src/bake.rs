@@ -18,6 +18,7 @@ use crate::error::{Error, Result};
 use crate::flat::FlatTexture;
 use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
+use crate::isa::Isa;
 use crate::mask::{Mask, masks};
 use crate::progress::{Clock, Progress};
 use crate::scene::{Policy, Scene};
@@ -89,6 +90,8 @@ pub struct BakeReport {
     pub non_finite_voxels: u64,
     /// Threads.
     pub threads: usize,
+    /// Instruction set of the vector kernels, one of [`Isa::NAMES`].
+    pub isa: &'static str,
     /// Seed.
     pub seed: u64,
     /// Embree's version.
@@ -288,6 +291,7 @@ fn finish(
             non_finite,
             non_finite_voxels: job.scene.field.samples().par_iter().filter(|s| !s.is_finite()).count() as u64,
             threads: rayon::current_num_threads(),
+            isa: Isa::current().name(),
             seed: settings.seed,
             embree: device.version(),
             commit: env!("ISOLUME_COMMIT"),

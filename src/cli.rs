@@ -16,6 +16,7 @@ mod view;
 use crate::embree::Device;
 use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
+use crate::isa::Isa;
 use crate::progress::{self, Progress};
 use crate::render::{Camera, Rendered, Shading, render};
 use crate::scene::{Policy, Scene};
@@ -51,6 +52,9 @@ pub struct Cli {
     /// Worker threads (default: all cores)
     #[arg(long, global = true, value_name = "N")]
     threads: Option<usize>,
+    /// Instruction set of the vector kernels, at most (default: the widest that the machine has)
+    #[arg(long, global = true, value_name = "SET", value_parser = clap::builder::PossibleValuesParser::new(Isa::NAMES))]
+    isa: Option<String>,
     /// No progress and no summary
     #[arg(long, short, global = true)]
     quiet: bool,
@@ -183,6 +187,9 @@ impl Cli {
                 .num_threads(threads)
                 .build_global()
                 .map_err(|e| Error::Failed(format!("cannot start {threads} threads: {e}")))?;
+        }
+        if let Some(name) = &self.isa {
+            Isa::from_name(name)?.choose();
         }
         // A second signal ends the process at once.
         let _ = ctrlc::set_handler(|| {

@@ -12,10 +12,10 @@ mod walk;
 
 use crate::field::Field;
 use crate::flattened::{FlattenedHit, FlattenedRay};
+use crate::isa::Isa;
 
 use glam::Vec4;
 use rayon::prelude::*;
-use simd::Isa;
 use std::ops::Range;
 
 /// Levels at most: children are cells, then blocks of 4³, 16³ and 64³ cells.
@@ -173,7 +173,7 @@ impl Pyramid {
         });
         let roots = levels[levels.len() - 1].tiles.len();
         let steps = [dims[0], dims[0] * dims[1]];
-        Self { cells, far, rounding, ranks, levels, places, roots, steps, capped, isa: Isa::detect() }
+        Self { cells, far, rounding, ranks, levels, places, roots, steps, capped, isa: Isa::current() }
     }
 
     /// The same with another instruction set: the same hits.

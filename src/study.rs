@@ -152,11 +152,12 @@ fn provenance(study: &Study) -> String {
         .find_map(|l| l.strip_prefix("model name"))
         .map_or("unknown CPU", |l| l.trim_start_matches([' ', '\t', ':']));
     format!(
-        "isolume {} ({}), Embree {}, {} threads, {cpu}{}",
+        "isolume {} ({}), Embree {}, {} threads, {}, {cpu}{}",
         env!("CARGO_PKG_VERSION"),
         env!("ISOLUME_COMMIT"),
         study.device.version(),
         rayon::current_num_threads(),
+        crate::isa::Isa::current().name(),
         if study.quick { ", --quick" } else { "" }
     )
 }

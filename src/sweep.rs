@@ -41,6 +41,7 @@ use crate::checkpoint::Stage;
 use crate::error::{Error, Result};
 use crate::flat::FlatTexture;
 use crate::flattened::Side;
+use crate::isa::Isa;
 use crate::scene::{Boundary, Scene};
 use ends::Standing;
 use flats::Flats;
@@ -51,7 +52,6 @@ use planes::{NodeLight, Planes, Spare};
 use points::Points;
 use rayon::prelude::*;
 use reflect::Mirror;
-use simd::Isa;
 use state::{Passes, State};
 use std::sync::Mutex;
 
@@ -237,7 +237,7 @@ pub fn sweep_resumable(
         standing: mirror.standing(),
         mirror,
         sides: &sides,
-        isa: Isa::detect(),
+        isa: Isa::current(),
         saved,
         spare: &spare,
     };

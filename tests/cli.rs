@@ -64,6 +64,7 @@ fn generate_info_bake_render() {
     assert_eq!(report["photons"]["emitted"], 4000);
     assert!(report["photons"]["stored"].as_u64().unwrap() > 4000, "photons land more than once");
     assert!(report["embree"].as_str().unwrap().starts_with("4."));
+    assert_eq!(report["isa"], isolume::isa::Isa::current().name());
     assert!(report["commit"].is_string() && report["settings"]["gather_rays"] == 8);
 
     let file = VtiFile::read(&dir.join("out.vti")).unwrap();
@@ -344,4 +345,40 @@ fn a_pipe_that_nobody_reads_is_no_fault() {
     drop(child.stdout.take());
     let output = child.wait_with_output().unwrap();
     assert!(output.status.success() && output.stderr.is_empty(), "{}", text(&output.stderr));
+}
+
+/// Every kernel gives the same bits; what the machine lacks is refused before any work.
+#[test]
+fn every_instruction_set_bakes_the_same_light() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "21", "-o", "b.nrrd", "--quiet"]);
+    let found = isolume::isa::Isa::found();
+    for engine in ["sweep", "photon"] {
+        let effort: &[&str] =
+            if engine == "sweep" { &["--directions", "16", "--light-points", "4"] } else { &["--photons", "4000"] };
+        let light = |isa: &str| {
+            let mut args = vec!["bake", "b.nrrd", "--isovalues", "3.6", "95", "-o", "out.vti", "--engine", engine];
+            args.extend(effort);
+            args.extend(["--isa", isa, "--report", "r.json", "--quiet"]);
+            ok(dir, &args);
+            let report: serde_json::Value = serde_json::from_slice(&fs::read(dir.join("r.json")).unwrap()).unwrap();
+            assert_eq!(report["isa"], isa);
+            let file = VtiFile::read(&dir.join("out.vti")).unwrap();
+            fs::remove_file(dir.join("out.vti")).unwrap();
+            let radiance = file.point_data.into_iter().find(|a| a.name == "radiance").unwrap();
+            format!("{:?}", radiance.samples)
+        };
+        let plain = light("plain");
+        assert!(plain.len() > 20_000, "{} letters are no light", plain.len());
+        for isa in &found[1..] {
+            assert!(light(isa.name()) == plain, "{engine}: {} is not plain", isa.name());
+        }
+    }
+    for name in isolume::isa::Isa::NAMES.into_iter().skip(found.len()) {
+        refused(dir, &["bake", "b.nrrd", "-o", "out.vti", "--isa", name], &[name, "this machine has plain"]);
+    }
+    let output = isolume(dir, &["bake", "b.nrrd", "-o", "out.vti", "--isa", "sse9"]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(text(&output.stderr).contains("avx512"), "{}", text(&output.stderr));
 }

@@ -8,6 +8,7 @@ use crate::checkpoint::Checkpoint;
 use crate::error::{Error, Result};
 use crate::export::bake_file;
 use crate::field::Sweep;
+use crate::isa::Isa;
 use crate::progress::Progress;
 use crate::scene::{Policy, Scene};
 use crate::scene_file::{SceneOptions, load, load_series};
@@ -156,13 +157,14 @@ impl Bake {
             for member in &members {
                 let ([nx, ny, nz], sweep) = (member.field.lattice().dims(), member.field.sweep());
                 eprintln!(
-                    "{}{}: {nx}×{ny}×{nz}, isovalues {} … {}, {} luminaire(s), {} threads",
+                    "{}{}: {nx}×{ny}×{nz}, isovalues {} … {}, {} luminaire(s), {} threads, {}",
                     self.input.display(),
                     if members.len() > 1 { format!(" '{}'", member.name) } else { String::new() },
                     sweep.lo(),
                     sweep.hi(),
                     loaded.scene.luminaires().len(),
-                    rayon::current_num_threads()
+                    rayon::current_num_threads(),
+                    Isa::current().name()
                 );
             }
             let dark = members.iter().all(|m| m.surface.emission == DVec3::ZERO);

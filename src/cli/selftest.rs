@@ -51,6 +51,7 @@ impl SelfTest {
                 "commit": env!("ISOLUME_COMMIT"),
                 "embree": device.version(),
                 "threads": rayon::current_num_threads(),
+                "isa": crate::isa::Isa::current().name(),
                 "passed": verdict(&cases).is_ok(),
                 "cases": cases,
             });

@@ -2,6 +2,7 @@
 
 use super::abi::raw;
 use crate::error::{Error, Result};
+use crate::isa::{Isa, Kind};
 use std::ffi::{CStr, CString, c_char, c_void};
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -25,14 +26,23 @@ unsafe impl Sync for Inner {}
 impl Device {
     /// Opens Embree with `threads` threads for building scenes (0: one per core). Queries run on their callers' threads.
     ///
+    /// It uses the widest vectors that the processor has, or at most those of [`Isa::chosen`].
+    ///
     /// The library shares its threads between the devices of a process: the largest number among those alive counts.
     ///
     /// # Errors
     /// `Embree` if the library is not a 4.x, or lacks triangles, user geometry or ray masks, or cannot start (an
     /// unknown CPU, no memory).
     pub fn new(threads: usize) -> Result<Self> {
-        let config = if threads == 0 { String::new() } else { format!("threads={threads}") };
-        let device = Self::with_config(&config)?;
+        let threads = if threads == 0 { String::new() } else { format!("threads={threads},") };
+        // Its names of what was chosen; unknown to it, it would say so.
+        let isa = match Isa::chosen().map(Isa::kind) {
+            None => "",
+            Some(Kind::Plain) => "max_isa=sse2",
+            Some(Kind::Avx2) => "max_isa=avx2",
+            Some(Kind::Avx512) => "max_isa=avx512",
+        };
+        let device = Self::with_config(&(threads + isa))?;
         check_version(device.property(embree4_sys::RTCDeviceProperty::VERSION))?;
         for (property, what) in [
             (embree4_sys::RTCDeviceProperty::TRIANGLE_GEOMETRY_SUPPORTED, "triangles"),

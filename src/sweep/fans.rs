@@ -3,8 +3,8 @@
 
 use super::directions::Layout;
 use super::grid::{Blocks, Geometry};
-use super::simd::Isa;
 use crate::flattened::Side;
+use crate::isa::Isa;
 use glam::DVec3;
 use rayon::prelude::*;
 
@@ -257,7 +257,7 @@ mod tests {
     fn fans_of_other_points_leave_nothing() {
         let (field, small) = (noise([17, 12, 14], 8), noise([3, 3, 3], 3));
         let (geometry, small) = (Geometry::new(&field), Geometry::new(&small));
-        let (isa, sides) = (Isa::detect(), [Side::Lower, Side::Higher]);
+        let (isa, sides) = (Isa::current(), [Side::Lower, Side::Higher]);
         let mut rng = Rng::stream(4, Stage::Test, 0);
         let mut fans = Fans::default();
         let mut partial = 0;

@@ -18,19 +18,7 @@ use super::gather::{COSINES, accumulate_row, sum_cosines};
 use super::grid::Source;
 use super::pack::{Light, Pack, Plan, Way};
 use super::segments::Segments;
-
-/// An instruction set that this machine was found to have.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Isa(Kind);
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Kind {
-    Plain,
-    #[cfg(target_arch = "x86_64")]
-    Avx2,
-    #[cfg(target_arch = "x86_64")]
-    Avx512,
-}
+use crate::isa::{Isa, Kind};
 
 /// Brings `x`, which is needed soon, into the cache.
 #[inline(always)]
@@ -68,49 +56,20 @@ macro_rules! dispatch {
             fn avx2($($arg: $type),*) $(-> $out)? {
                 $inner($($arg),*)
             }
-            match self.0 {
-                Kind::Plain => $inner($($arg),*),
-                // SAFETY: an `Isa` of this kind is only made by `found` after the machine was asked for exactly these
-                // features.
+            match self.kind() {
+                // SAFETY: an `Isa` of this kind exists, so the machine has at least these features.
                 #[cfg(target_arch = "x86_64")]
                 Kind::Avx2 => unsafe { avx2($($arg),*) },
                 // SAFETY: as above.
                 #[cfg(target_arch = "x86_64")]
                 Kind::Avx512 => unsafe { avx512($($arg),*) },
+                _ => $inner($($arg),*),
             }
         }
     };
 }
 
 impl Isa {
-    /// Plain code.
-    pub(super) const PLAIN: Self = Self(Kind::Plain);
-
-    /// All that this machine has, from plain code to the widest.
-    pub(super) fn found() -> Vec<Self> {
-        #[allow(unused_mut, reason = "there may be no other")]
-        let mut found = vec![Self::PLAIN];
-        #[cfg(target_arch = "x86_64")]
-        {
-            if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("f16c") {
-                found.push(Self(Kind::Avx2));
-            }
-            if is_x86_feature_detected!("avx512f")
-                && is_x86_feature_detected!("avx512bw")
-                && is_x86_feature_detected!("avx512dq")
-                && is_x86_feature_detected!("avx512vl")
-            {
-                found.push(Self(Kind::Avx512));
-            }
-        }
-        found
-    }
-
-    /// The widest.
-    pub(super) fn detect() -> Self {
-        Self::found().pop().unwrap_or(Self::PLAIN)
-    }
-
     dispatch!(read, Pack::read, (pack: &mut Pack, plan: &Plan, source: &Source, first: isize, q: isize) -> bool);
     dispatch!(end, Pack::end, (pack: &mut Pack, plan: &Plan, ends: &Ends, flats: &Flats, first: isize, q: isize));
     dispatch!(cosines, sum_cosines, (omega: &[[f32; 3]], n: &[u32], sum: &mut [f32; COSINES]));
@@ -121,21 +80,21 @@ impl Isa {
 
     /// [`march_row`].
     pub(super) fn march(self, row: &[f32], place: [f32; 2], extrema: [&mut [f32]; 2], out: &mut [u8], turn: u8) {
-        match self.0 {
-            // SAFETY: `found` made this kind on a machine with the features that `march` enables.
+        match self.kind() {
+            // SAFETY: an `Isa` of this kind exists, so the machine has the features that `march` enables.
             #[cfg(target_arch = "x86_64")]
             Kind::Avx512 => unsafe { avx512::march(row, place, extrema, out, turn) },
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
             Kind::Avx2 => unsafe { avx2::march(row, place, extrema, out, turn) },
-            Kind::Plain => march_row(row, place, 0, extrema, out, turn),
+            _ => march_row(row, place, 0, extrema, out, turn),
         }
     }
 
     /// [`Segments::march`].
     pub(super) fn extrema(self, h: &[f32], segments: &mut Segments) {
-        match self.0 {
-            // SAFETY: `found` made this kind on a machine with the features that `extrema` enables.
+        match self.kind() {
+            // SAFETY: an `Isa` of this kind exists, so the machine has the features that `extrema` enables.
             #[cfg(target_arch = "x86_64")]
             Kind::Avx512 if signed(h.len()) => unsafe { avx512::extrema(h, segments) },
             // SAFETY: as above.
@@ -147,17 +106,17 @@ impl Isa {
 
     /// [`Pack::scan`].
     pub(super) fn scan(self, pack: &mut Pack, way: Way, light: Light, out: &mut [Vec<f32>], place: (usize, usize)) {
-        match self.0 {
+        match self.kind() {
             _ if !(signed(light.b.len()) && signed(pack.ends() + light.flats.len())) => {
                 pack.scan(way, light, out, place)
             }
-            // SAFETY: `found` made this kind on a machine with the features that `scan` enables.
+            // SAFETY: an `Isa` of this kind exists, so the machine has the features that `scan` enables.
             #[cfg(target_arch = "x86_64")]
             Kind::Avx512 => unsafe { avx512::scan(pack, way, light, out, place) },
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
             Kind::Avx2 => unsafe { avx2::scan(pack, way, light, out, place) },
-            Kind::Plain => pack.scan(way, light, out, place),
+            _ => pack.scan(way, light, out, place),
         }
     }
 }

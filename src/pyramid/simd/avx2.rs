@@ -2,12 +2,13 @@
 
 use crate::field::Field;
 use crate::flattened::{FlattenedHit, FlattenedRay};
+use crate::isa::{Isa, Kind};
 use crate::pyramid::kernel::{Kernel, Line, Piece};
 use crate::pyramid::{Pyramid, Tile};
 use glam::Vec4;
 use std::arch::x86_64::*;
 
-/// Proof that the processor has what `#[target_feature]` asks for below: made by [`Avx2::detect`] only.
+/// Proof that the processor has what `#[target_feature]` asks for below: made by [`Avx2::of`] only, of an [`Isa`].
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Avx2(());
 
@@ -43,12 +44,10 @@ const COUNT: [i8; 32] = {
 };
 
 impl Avx2 {
-    pub(super) fn detect() -> Option<Self> {
-        let all = is_x86_feature_detected!("avx2")
-            && is_x86_feature_detected!("fma")
-            && is_x86_feature_detected!("bmi1")
-            && is_x86_feature_detected!("bmi2");
-        all.then_some(Self(()))
+    /// The kernel of `isa`, if it is this one.
+    #[inline]
+    pub(super) fn of(isa: Isa) -> Option<Self> {
+        (isa.kind() == Kind::Avx2).then_some(Self(()))
     }
 }
 
@@ -60,20 +59,20 @@ impl Kernel for Avx2 {
 
     #[inline(always)]
     fn ray(self, line: &Line) -> Ray {
-        // SAFETY: `self` exists, so `detect` found the features.
+        // SAFETY: `self` exists, so the machine has the features.
         unsafe { ray(line) }
     }
 
     #[inline(always)]
     fn children(self, line: &Line, ray: &Ray, tile: &Tile, base: Vec4, size: f32) -> u64 {
-        // SAFETY: `self` exists, so `detect` found the features.
+        // SAFETY: `self` exists, so the machine has the features.
         unsafe { children(line, ray, tile, base, size) }
     }
 
     #[inline(always)]
     fn corners(self, samples: &[f32], at: usize, [y, z]: [usize; 2]) -> __m256 {
         let s = &samples[at..at + z + y + 2];
-        // SAFETY: `self` exists, so `detect` found the features; pairs of samples lie within `s`, and any bits are an f64.
+        // SAFETY: `self` exists, so the machine has the features; pairs of samples lie within `s`, and any bits are an f64.
         unsafe {
             let pair = |at: usize| s.as_ptr().add(at).cast::<f64>().read_unaligned();
             _mm256_castpd_ps(_mm256_setr_pd(pair(0), pair(y), pair(z), pair(z + y)))
@@ -82,19 +81,19 @@ impl Kernel for Avx2 {
 
     #[inline(always)]
     fn inside(self, corners: &__m256, c: f32) -> u8 {
-        // SAFETY: `self` exists, so `detect` found the features.
+        // SAFETY: `self` exists, so the machine has the features.
         unsafe { mask(_mm256_cmp_ps::<_CMP_GE_OQ>(*corners, _mm256_set1_ps(c))) }
     }
 
     #[inline(always)]
     fn span(self, corners: &__m256, piece: &Piece) -> [f64; 8] {
-        // SAFETY: `self` exists, so `detect` found the features.
+        // SAFETY: `self` exists, so the machine has the features.
         unsafe { span(*corners, piece) }
     }
 
     #[inline(always)]
     fn at_least(self, values: &[f64; 8], c: f64) -> u8 {
-        // SAFETY: `self` exists, so `detect` found the features.
+        // SAFETY: `self` exists, so the machine has the features.
         unsafe { at_least(values, c) }
     }
 
@@ -105,7 +104,7 @@ impl Kernel for Avx2 {
         fn inner<T>(f: impl FnOnce() -> T) -> T {
             f()
         }
-        // SAFETY: `self` exists, so `detect` found the features.
+        // SAFETY: `self` exists, so the machine has the features.
         unsafe { inner(f) }
     }
 

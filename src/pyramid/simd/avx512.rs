@@ -2,12 +2,13 @@
 
 use crate::field::Field;
 use crate::flattened::{FlattenedHit, FlattenedRay};
+use crate::isa::{Isa, Kind};
 use crate::pyramid::kernel::{Kernel, Line, Piece};
 use crate::pyramid::{Pyramid, Tile};
 use glam::Vec4;
 use std::arch::x86_64::*;
 
-/// Proof that the processor has what `#[target_feature]` asks for below: made by [`Avx512::detect`] only. Refers to [`Z`]:
+/// Proof that the processor has what `#[target_feature]` asks for below: made by [`Avx512::of`] only, of an [`Isa`]. Refers to [`Z`]:
 /// what the compiler knows it turns into two shuffles each.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Avx512(&'static [[i32; 16]; 5]);
@@ -49,14 +50,10 @@ const EIGHT: [i64; 8] = [0, 1, 2, 3, 4, 5, 6, 7];
 static Z: [[i32; 16]; 5] = [[10; 16], [11; 16], [12; 16], [13; 16], [14; 16]];
 
 impl Avx512 {
-    pub(super) fn detect() -> Option<Self> {
-        let all = is_x86_feature_detected!("avx512f")
-            && is_x86_feature_detected!("avx512bw")
-            && is_x86_feature_detected!("avx512dq")
-            && is_x86_feature_detected!("avx512vl")
-            && is_x86_feature_detected!("bmi1")
-            && is_x86_feature_detected!("bmi2");
-        all.then_some(Self(&Z))
+    /// The kernel of `isa`, if it is this one.
+    #[inline]
+    pub(super) fn of(isa: Isa) -> Option<Self> {
+        (isa.kind() == Kind::Avx512).then_some(Self(&Z))
     }
 }
 
@@ -68,20 +65,20 @@ impl Kernel for Avx512 {
 
     #[inline(always)]
     fn ray(self, line: &Line) -> Ray {
-        // SAFETY: `self` exists, so `detect` found the features.
+        // SAFETY: `self` exists, so the machine has the features.
         unsafe { ray(line) }
     }
 
     #[inline(always)]
     fn children(self, _: &Line, ray: &Ray, tile: &Tile, base: Vec4, size: f32) -> u64 {
-        // SAFETY: `self` exists, so `detect` found the features.
+        // SAFETY: `self` exists, so the machine has the features.
         unsafe { children(self.0, ray, tile, base, size) }
     }
 
     #[inline(always)]
     fn corners(self, samples: &[f32], at: usize, [y, z]: [usize; 2]) -> __m256 {
         let s = &samples[at..at + z + y + 2];
-        // SAFETY: `self` exists, so `detect` found the features; pairs of samples lie within `s`, and any bits are an f64.
+        // SAFETY: `self` exists, so the machine has the features; pairs of samples lie within `s`, and any bits are an f64.
         unsafe {
             let pair = |at: usize| s.as_ptr().add(at).cast::<f64>().read_unaligned();
             _mm256_castpd_ps(_mm256_setr_pd(pair(0), pair(y), pair(z), pair(z + y)))
@@ -90,19 +87,19 @@ impl Kernel for Avx512 {
 
     #[inline(always)]
     fn inside(self, corners: &__m256, c: f32) -> u8 {
-        // SAFETY: `self` exists, so `detect` found the features.
+        // SAFETY: `self` exists, so the machine has the features.
         unsafe { _mm256_cmp_ps_mask::<_CMP_GE_OQ>(*corners, _mm256_set1_ps(c)) }
     }
 
     #[inline(always)]
     fn span(self, corners: &__m256, piece: &Piece) -> [f64; 8] {
-        // SAFETY: `self` exists, so `detect` found the features.
+        // SAFETY: `self` exists, so the machine has the features.
         unsafe { span(*corners, piece) }
     }
 
     #[inline(always)]
     fn at_least(self, values: &[f64; 8], c: f64) -> u8 {
-        // SAFETY: `self` exists, so `detect` found the features; the load is of the array.
+        // SAFETY: `self` exists, so the machine has the features; the load is of the array.
         unsafe { _mm512_cmp_pd_mask::<_CMP_GE_OQ>(_mm512_loadu_pd(values.as_ptr()), _mm512_set1_pd(c)) }
     }
 
@@ -113,7 +110,7 @@ impl Kernel for Avx512 {
         fn inner<T>(f: impl FnOnce() -> T) -> T {
             f()
         }
-        // SAFETY: `self` exists, so `detect` found the features.
+        // SAFETY: `self` exists, so the machine has the features.
         unsafe { inner(f) }
     }
 

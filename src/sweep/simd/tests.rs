@@ -120,7 +120,7 @@ fn scans_find_the_next_greater_value() {
     let mut out = vec![vec![0f32; 48 * LANES]; 3];
     let b = random(9);
     let light = Light { b: &b, flats: &random(10), isovalues: 4 };
-    Isa::detect().scan(&mut pack, Way { strict: false, sign: 1.0 }, light, &mut out, (LANES, 0));
+    Isa::current().scan(&mut pack, Way { strict: false, sign: 1.0 }, light, &mut out, (LANES, 0));
     let mut found = [0; 2];
     let h = |row: usize, lane: usize| reference.h[row][lane];
     for lane in 0..LANES {
