@@ -7,7 +7,7 @@
 //! triangles in Embree (quality HIGH, the faster of rtcIntersect1 and rtcIntersect16). "any c": they leave random
 //! points x of Ω with c = h(x), over the whole sweep. "random": every ray from another place; "gather64": 64 rays per
 //! place, places in Morton order. Two threads; medians of interleaved repetitions, since machines are shared: only the
-//! ratios mean anything. The isovalue rays pay for the set-up, spread over 10 M rays; the triangle rays do not.
+//! ratios mean anything. At random places with any c every instruction set of the machine is compared with plain code. The isovalue rays pay for the set-up, spread over 10 M rays; the triangle rays do not.
 
 use glam::DVec3;
 use isolume::embree::{
@@ -339,7 +339,48 @@ fn run(case: &Case, device: &Device, count: usize, repetitions: usize, summary: 
                 "",
                 100.0 * agree
             );
+            compare_sets(device, &scene, &any, repetitions);
         }
+    }
+}
+
+/// The same rays with every instruction set that this machine has, interleaved: rates relative to plain code.
+fn compare_sets(device: &Device, scene: &Scene, rays: &[FlattenedRay], repetitions: usize) {
+    let found = Isa::found();
+    let widest = Isa::current();
+    let tracers: Vec<GraphTracer> = found
+        .iter()
+        .map(|isa| {
+            isa.choose();
+            GraphTracer::new(device, scene).expect("a tracer")
+        })
+        .collect();
+    widest.choose();
+    let kernels: Vec<[Kernel; 4]> = tracers.iter().map(|tracer| graph_kernels(tracer)).collect();
+    // Per set: single and in packets.
+    let mut times = vec![[vec![], vec![]]; found.len()];
+    for repetition in 0..=repetitions {
+        for (times, kernels) in times.iter_mut().zip(&kernels) {
+            for (times, kernel) in times.iter_mut().zip(kernels) {
+                let (time, _) = seconds(|| rays.par_chunks(TASK).map(kernel).sum());
+                if repetition > 0 {
+                    times.push(time);
+                }
+            }
+        }
+    }
+    let gain = |set: usize, way: usize| {
+        median(times[0][way].iter().zip(&times[set][way]).map(|(plain, time)| plain / time).collect())
+    };
+    for (set, isa) in found.iter().enumerate().skip(1) {
+        println!(
+            "  {:10} {:8} {} : plain code {:.2}, in packets {:.2}",
+            "",
+            "",
+            isa.name(),
+            gain(set, 0),
+            gain(set, 1)
+        );
     }
 }
 

@@ -12,6 +12,11 @@ const FAR: f32 = f32::INFINITY;
 const CORNERS: [[f32; 3]; 4] = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
 const SQUARE: [[u32; 3]; 2] = [[0, 1, 2], [0, 2, 3]];
 
+/// Of triangles Embree divides by a reciprocal whose last bits are the processor's.
+fn near(a: f32, b: f32) -> bool {
+    (a - b).abs() <= 4.0 * f32::EPSILON * b.abs()
+}
+
 fn device() -> Device {
     Device::new(1).unwrap()
 }
@@ -73,10 +78,11 @@ fn a_triangle_is_hit_where_it_is() {
     let scene = square(&device());
     let mut rayhit = RayHit::new(Ray::new([0.75, 0.25, 3.0], [0.0, 0.0, -2.0], 0.0, FAR));
     scene.intersect1(&mut rayhit);
-    assert_eq!((rayhit.hit.geometry, rayhit.hit.prim, rayhit.ray.tfar), (0, 0, 1.5));
+    assert_eq!((rayhit.hit.geometry, rayhit.hit.prim), (0, 0));
+    assert!(near(rayhit.ray.tfar, 1.5), "{rayhit:?}");
     // Embree's normal is the cross product of two edges: here (0, 0, 1) for counter-clockwise.
     assert_eq!(rayhit.hit.normal, [0.0, 0.0, 1.0]);
-    assert_eq!((rayhit.hit.u, rayhit.hit.v), (0.5, 0.25));
+    assert!(near(rayhit.hit.u, 0.5) && near(rayhit.hit.v, 0.25), "{rayhit:?}");
 }
 
 #[test]
@@ -118,12 +124,13 @@ fn embree_writes_nothing_behind_our_structs() {
         let ray = Ray::new([x, 0.0, 5.0], [0.0, 0.0, -1.0], 0.0, FAR);
         let mut one = Guarded { rayhit: RayHit::new(ray), guard: [GUARD; 4] };
         scene.intersect1(&mut one.rayhit);
-        assert_eq!((one.rayhit.hit.geometry, one.rayhit.ray.tfar), (geometry, t));
+        assert!(one.rayhit.hit.geometry == geometry && near(one.rayhit.ray.tfar, t), "{:?}", one.rayhit);
         assert_eq!(one.guard, [GUARD; 4]);
 
         let mut sixteen = Guarded16 { rayhit: RayHit16::new(Ray16::new(&[ray; 16])), guard: [GUARD; 16] };
         scene.intersect16(&Valid16::ALL, &mut sixteen.rayhit);
-        assert_eq!((sixteen.rayhit.hit.geometry, sixteen.rayhit.ray.tfar), ([geometry; 16], [t; 16]));
+        assert_eq!(sixteen.rayhit.hit.geometry, [geometry; 16]);
+        assert!(sixteen.rayhit.ray.tfar.iter().all(|&tfar| near(tfar, t)), "{:?}", sixteen.rayhit.ray.tfar);
         assert_eq!(sixteen.guard, [GUARD; 16]);
 
         let mut row = vec![RayHit::new(ray); 4];
@@ -131,7 +138,8 @@ fn embree_writes_nothing_behind_our_structs() {
             scene.intersect1(rayhit);
         }
         for rayhit in &row {
-            assert_eq!((rayhit.hit.geometry, rayhit.ray.tfar, rayhit.ray.org), (geometry, t, ray.org));
+            assert_eq!((rayhit.hit.geometry, rayhit.ray.org), (geometry, ray.org));
+            assert!(near(rayhit.ray.tfar, t), "{rayhit:?}");
         }
     }
 }
@@ -341,7 +349,7 @@ fn scenes_are_shared_between_threads() {
                     let x = (i as f32 + 0.5) / 1000.0;
                     let mut rayhit = RayHit::new(Ray::new([x, 0.5, 2.0], [0.0, 0.0, -1.0], 0.0, FAR));
                     scene.intersect1(&mut rayhit);
-                    assert_eq!(rayhit.ray.tfar, 2.0);
+                    assert!(near(rayhit.ray.tfar, 2.0), "{rayhit:?}");
                 }
             });
         }
