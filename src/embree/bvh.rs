@@ -133,7 +133,7 @@ impl Quality {
 /// let scene = builder.commit()?;
 /// let mut rayhit = RayHit::new(Ray::new([0.25, 0.25, 2.0], [0.0, 0.0, -1.0], 0.0, f32::INFINITY));
 /// scene.intersect1(&mut rayhit);
-/// assert_eq!((rayhit.hit.geometry, rayhit.ray.tfar), (floor, 2.0));
+/// assert!(rayhit.hit.geometry == floor && (rayhit.ray.tfar - 2.0).abs() < 1e-6);
 /// # Ok::<(), isolume::error::Error>(())
 /// ```
 pub struct SceneBuilder<'a> {
