@@ -7,7 +7,8 @@
 //! triangles in Embree (quality HIGH, the faster of rtcIntersect1 and rtcIntersect16). "any c": they leave random
 //! points x of Ω with c = h(x), over the whole sweep. "random": every ray from another place; "gather64": 64 rays per
 //! place, places in Morton order. Two threads; medians of interleaved repetitions, since machines are shared: only the
-//! ratios mean anything. At random places with any c every instruction set of the machine is compared with plain code. The isovalue rays pay for the set-up, spread over 10 M rays; the triangle rays do not.
+//! ratios mean anything. The isovalue rays pay for the set-up, spread over 10 M rays; the triangle rays do not. At random
+//! places with any c every instruction set of the machine is compared with plain code.
 
 use glam::DVec3;
 use isolume::embree::{
@@ -347,7 +348,7 @@ fn run(case: &Case, device: &Device, count: usize, repetitions: usize, summary: 
 /// The same rays with every instruction set that this machine has, interleaved: rates relative to plain code.
 fn compare_sets(device: &Device, scene: &Scene, rays: &[FlattenedRay], repetitions: usize) {
     let found = Isa::found();
-    let widest = Isa::current();
+    let current = Isa::current();
     let tracers: Vec<GraphTracer> = found
         .iter()
         .map(|isa| {
@@ -355,7 +356,7 @@ fn compare_sets(device: &Device, scene: &Scene, rays: &[FlattenedRay], repetitio
             GraphTracer::new(device, scene).expect("a tracer")
         })
         .collect();
-    widest.choose();
+    current.choose();
     let kernels: Vec<[Kernel; 4]> = tracers.iter().map(|tracer| graph_kernels(tracer)).collect();
     // Per set: single and in packets.
     let mut times = vec![[vec![], vec![]]; found.len()];

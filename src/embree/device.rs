@@ -35,7 +35,7 @@ impl Device {
     /// unknown CPU, no memory).
     pub fn new(threads: usize) -> Result<Self> {
         let threads = if threads == 0 { String::new() } else { format!("threads={threads},") };
-        // Its names of what was chosen; unknown to it, it would say so.
+        // Embree's own names; plain code is what every x86-64 has.
         let isa = match Isa::chosen().map(Isa::kind) {
             None => "",
             Some(Kind::Plain) => "max_isa=sse2",

@@ -118,6 +118,43 @@ macro_rules! walks {
     };
 }
 
+/// Defines what all kernels of [`Kernel`] here have in common; all have AVX2.
+///
+/// [`Kernel`]: super::kernel::Kernel
+#[cfg(target_arch = "x86_64")]
+macro_rules! shared {
+    ($features:literal) => {
+        type Corners = __m256;
+
+        #[inline(always)]
+        fn corners(self, samples: &[f32], at: usize, [y, z]: [usize; 2]) -> __m256 {
+            let s = &samples[at..at + z + y + 2];
+            // SAFETY: `self` exists, so the machine has the features; pairs of samples lie within `s`, and any bits are an f64.
+            unsafe {
+                let pair = |at: usize| s.as_ptr().add(at).cast::<f64>().read_unaligned();
+                _mm256_castpd_ps(_mm256_setr_pd(pair(0), pair(y), pair(z), pair(z + y)))
+            }
+        }
+
+        #[inline(always)]
+        fn outlined<T>(self, f: impl FnOnce() -> T) -> T {
+            #[inline(never)]
+            #[target_feature(enable = $features)]
+            fn inner<T>(f: impl FnOnce() -> T) -> T {
+                f()
+            }
+            // SAFETY: `self` exists, so the machine has the features.
+            unsafe { inner(f) }
+        }
+
+        #[inline(always)]
+        fn ask(self, address: *const u8) {
+            // SAFETY: a hint, which reads nothing and faults nowhere.
+            unsafe { _mm_prefetch::<_MM_HINT_T0>(address.cast()) }
+        }
+    };
+}
+
 #[cfg(target_arch = "x86_64")]
 mod avx2;
 #[cfg(target_arch = "x86_64")]

@@ -55,7 +55,8 @@ walks!(Avx2, "avx2,fma,bmi1,bmi2");
 
 impl Kernel for Avx2 {
     type Ray = Ray;
-    type Corners = __m256;
+
+    shared!("avx2,fma,bmi1,bmi2");
 
     #[inline(always)]
     fn ray(self, line: &Line) -> Ray {
@@ -67,16 +68,6 @@ impl Kernel for Avx2 {
     fn children(self, line: &Line, ray: &Ray, tile: &Tile, base: Vec4, size: f32) -> u64 {
         // SAFETY: `self` exists, so the machine has the features.
         unsafe { children(line, ray, tile, base, size) }
-    }
-
-    #[inline(always)]
-    fn corners(self, samples: &[f32], at: usize, [y, z]: [usize; 2]) -> __m256 {
-        let s = &samples[at..at + z + y + 2];
-        // SAFETY: `self` exists, so the machine has the features; pairs of samples lie within `s`, and any bits are an f64.
-        unsafe {
-            let pair = |at: usize| s.as_ptr().add(at).cast::<f64>().read_unaligned();
-            _mm256_castpd_ps(_mm256_setr_pd(pair(0), pair(y), pair(z), pair(z + y)))
-        }
     }
 
     #[inline(always)]
@@ -95,23 +86,6 @@ impl Kernel for Avx2 {
     fn at_least(self, values: &[f64; 8], c: f64) -> u8 {
         // SAFETY: `self` exists, so the machine has the features.
         unsafe { at_least(values, c) }
-    }
-
-    #[inline(always)]
-    fn outlined<T>(self, f: impl FnOnce() -> T) -> T {
-        #[inline(never)]
-        #[target_feature(enable = "avx2,fma,bmi1,bmi2")]
-        fn inner<T>(f: impl FnOnce() -> T) -> T {
-            f()
-        }
-        // SAFETY: `self` exists, so the machine has the features.
-        unsafe { inner(f) }
-    }
-
-    #[inline(always)]
-    fn ask(self, address: *const u8) {
-        // SAFETY: a hint, which reads nothing and faults nowhere.
-        unsafe { _mm_prefetch::<_MM_HINT_T0>(address.cast()) }
     }
 }
 

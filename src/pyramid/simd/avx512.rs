@@ -61,7 +61,8 @@ walks!(Avx512, "avx512f,avx512bw,avx512dq,avx512vl,bmi1,bmi2");
 
 impl Kernel for Avx512 {
     type Ray = Ray;
-    type Corners = __m256;
+
+    shared!("avx512f,avx512bw,avx512dq,avx512vl,bmi1,bmi2");
 
     #[inline(always)]
     fn ray(self, line: &Line) -> Ray {
@@ -73,16 +74,6 @@ impl Kernel for Avx512 {
     fn children(self, _: &Line, ray: &Ray, tile: &Tile, base: Vec4, size: f32) -> u64 {
         // SAFETY: `self` exists, so the machine has the features.
         unsafe { children(self.0, ray, tile, base, size) }
-    }
-
-    #[inline(always)]
-    fn corners(self, samples: &[f32], at: usize, [y, z]: [usize; 2]) -> __m256 {
-        let s = &samples[at..at + z + y + 2];
-        // SAFETY: `self` exists, so the machine has the features; pairs of samples lie within `s`, and any bits are an f64.
-        unsafe {
-            let pair = |at: usize| s.as_ptr().add(at).cast::<f64>().read_unaligned();
-            _mm256_castpd_ps(_mm256_setr_pd(pair(0), pair(y), pair(z), pair(z + y)))
-        }
     }
 
     #[inline(always)]
@@ -101,23 +92,6 @@ impl Kernel for Avx512 {
     fn at_least(self, values: &[f64; 8], c: f64) -> u8 {
         // SAFETY: `self` exists, so the machine has the features; the load is of the array.
         unsafe { _mm512_cmp_pd_mask::<_CMP_GE_OQ>(_mm512_loadu_pd(values.as_ptr()), _mm512_set1_pd(c)) }
-    }
-
-    #[inline(always)]
-    fn outlined<T>(self, f: impl FnOnce() -> T) -> T {
-        #[inline(never)]
-        #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,bmi1,bmi2")]
-        fn inner<T>(f: impl FnOnce() -> T) -> T {
-            f()
-        }
-        // SAFETY: `self` exists, so the machine has the features.
-        unsafe { inner(f) }
-    }
-
-    #[inline(always)]
-    fn ask(self, address: *const u8) {
-        // SAFETY: a hint, which reads nothing and faults nowhere.
-        unsafe { _mm_prefetch::<_MM_HINT_T0>(address.cast()) }
     }
 }
 
