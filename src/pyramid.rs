@@ -49,37 +49,38 @@ struct Level {
 
 impl Level {
     /// Where the tile of a node stands.
-    #[inline(always)]
-    fn at(&self, [i, j, k]: [u32; 3]) -> usize {
-        (k as usize * self.dims[1] + j as usize) * self.dims[0] + i as usize
+    #[inline]
+    fn at(&self, [i, j, k]: [usize; 3]) -> usize {
+        (k * self.dims[1] + j) * self.dims[0] + i
     }
 }
 
-/// Where the children of a level's nodes stand in memory: tiles, or the first samples of cells.
+/// Where a node or a cell begins, or how far from its parent.
+#[derive(Clone, Copy, Debug, Default)]
+struct Place {
+    /// In memory: its first sample, and its first tile of each level but the last.
+    at: [u32; LEVELS],
+    /// In the lattice: its first corner.
+    corner: Vec4,
+}
+
+impl Place {
+    #[inline(always)]
+    fn plus(&self, step: &Self) -> Self {
+        // Numbers of 31 bits (Lattice): nothing wraps.
+        let at = std::array::from_fn(|level| self.at[level].wrapping_add(step.at[level]));
+        Self { at, corner: self.corner + step.corner }
+    }
+}
+
+/// Where the children of a level's nodes stand.
 #[derive(Clone, Copy, Debug)]
-struct Places {
-    /// What a step along y or z adds.
-    steps: [usize; 2],
-    /// Of all children, from the first on.
-    child: [usize; 64],
+struct Children {
+    /// From the first on.
+    steps: [Place; 64],
     /// What one takes in memory, and where what is read of it lies, in bytes.
     bytes: usize,
     lines: [usize; 4],
-}
-
-impl Places {
-    fn new(dims: [usize; 3]) -> Self {
-        let steps = [dims[0], dims[0] * dims[1]];
-        let child = std::array::from_fn(|n| n % 4 + n / 4 % 4 * steps[0] + n / 16 * steps[1]);
-        Self { steps, child, bytes: size_of::<Tile>(), lines: [0, 64, 0, 64] }
-    }
-
-    /// The same of samples.
-    fn samples(dims: [usize; 3]) -> Self {
-        let places = Self::new(dims);
-        let [y, z] = places.steps.map(|step| size_of::<f32>() * step);
-        Self { bytes: size_of::<f32>(), lines: [0, y, z, y + z], ..places }
-    }
 }
 
 /// Min/max of h over cells and blocks of 4³, 16³ and 64³ cells, in 8 bits over the sweep, so that no block that holds a
@@ -91,9 +92,11 @@ pub struct Pyramid {
     far: Vec4,
     /// Beyond what rounding does to h at a point of a cell, and to three times that.
     rounding: f64,
+    /// Six times what f32 does to a ray's place in a cell, or more.
+    slack: f32,
     ranks: Ranks,
     levels: Vec<Level>,
-    places: [Places; LEVELS],
+    children: [Children; LEVELS],
     /// Nodes of the top level.
     roots: usize,
     /// What a step along y or z adds to a sample's position in memory.
@@ -167,13 +170,11 @@ impl Pyramid {
         let far = field.lattice().far().as_vec3().extend(1.0);
         let rounding = 32.0 * f64::EPSILON * f64::from(field.largest());
         let dims = field.lattice().dims();
-        let places = std::array::from_fn(|n| match n.checked_sub(1) {
-            None => Places::samples(dims),
-            Some(below) => Places::new(levels.get(below).map_or([0; 3], |level| level.dims)),
-        });
+        let slack = 24.0 * f32::EPSILON * far.max_element();
         let roots = levels[levels.len() - 1].tiles.len();
         let steps = [dims[0], dims[0] * dims[1]];
-        Self { cells, far, rounding, ranks, levels, places, roots, steps, capped, isa: Isa::current() }
+        let children = std::array::from_fn(|level| children(dims, &levels, level));
+        Self { cells, far, rounding, slack, ranks, levels, children, roots, steps, capped, isa: Isa::current() }
     }
 
     /// The same with another instruction set: the same hits.
@@ -222,6 +223,37 @@ impl Pyramid {
         self.isa.walk16::<true>(self, field, active, ray, &mut hits);
         hits.iter().enumerate().fold(0, |bits, (n, hit)| bits | u16::from(hit.is_some()) << n)
     }
+}
+
+/// Where a node or a cell begins whose first cell is `cell`.
+#[allow(clippy::cast_possible_truncation, reason = "lattices have 31-bit numbers, and there are fewer tiles")]
+fn place(dims: [usize; 3], levels: &[Level], cell: [usize; 3]) -> Place {
+    let at = std::array::from_fn(|level| {
+        let (dims, size) = match level.checked_sub(1).map(|below| levels.get(below)) {
+            None => (dims, 1),
+            Some(Some(below)) => (below.dims, 4usize.pow(level as u32)),
+            Some(None) => return 0,
+        };
+        let [x, y, z] = cell.map(|i| i / size);
+        ((z * dims[1] + y) * dims[0] + x) as u32
+    });
+    Place { at, corner: Vec4::new(cell[0] as f32, cell[1] as f32, cell[2] as f32, 0.0) }
+}
+
+fn children(dims: [usize; 3], levels: &[Level], level: usize) -> Children {
+    let width = 4usize.pow(level as u32);
+    // No node of a level that is not there has a second child.
+    let step = |n: usize| {
+        if level < levels.len() {
+            place(dims, levels, [n % 4, n / 4 % 4, n / 16].map(|i| width * i))
+        } else {
+            Place::default()
+        }
+    };
+    let [y, z] = [dims[0], dims[0] * dims[1]].map(|step| size_of::<f32>() * step);
+    let (bytes, lines) =
+        if level == 0 { (size_of::<f32>(), [0, y, z, y + z]) } else { (size_of::<Tile>(), [0, 64, 0, 64]) };
+    Children { steps: std::array::from_fn(step), bytes, lines }
 }
 
 /// A level of `dims` nodes.
@@ -303,7 +335,7 @@ fn coarser(fine: &Level) -> Level {
         for n in 0..64 {
             let child = [4 * node[0] + n % 4, 4 * node[1] + n / 4 % 4, 4 * node[2] + n / 16];
             if (0..3).all(|a| child[a] < fine.dims[a]) {
-                (tile.lo[n], tile.hi[n]) = fine.tiles[fine.at(child.map(|i| i as u32))].range();
+                (tile.lo[n], tile.hi[n]) = fine.tiles[fine.at(child)].range();
             }
         }
         tile

@@ -6,9 +6,12 @@ use glam::Vec4;
 /// A ray as the walk sees it: in cells from a start in or on Ω, with direction components of at most 1.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Line {
-    /// Start.
+    /// Start, and direction.
+    pub(super) start: Vec4,
+    pub(super) d: Vec4,
+    /// Where planes are crossed from: the start, but the middle of its cell along an axis whose planes the ray never crosses.
     pub(super) o: Vec4,
-    /// 1 / direction; huge, but finite, along an axis whose planes the ray never crosses.
+    /// 1 / direction; huge, but finite, along such an axis.
     pub(super) inv: Vec4,
     /// The end of a cell, 0 or 1, by which the ray leaves it.
     pub(super) far: Vec4,
@@ -78,6 +81,13 @@ pub(super) trait Kernel: Copy {
 
     /// [`crate::cell::Cell::inside`].
     fn inside(self, corners: &Self::Corners, c: f32) -> u8;
+
+    /// Whether h − c is surely of one sign at the corners of the box from `begin` to `end`, local coordinates whose error,
+    /// times six, is below `slack`. A quick look: false says nothing.
+    #[inline(always)]
+    fn clear(self, _corners: &Self::Corners, _c: f32, _begin: Vec4, _end: Vec4, _slack: f32) -> bool {
+        false
+    }
 
     /// h at the corners of the box that the piece spans: bit a of the position says whose coordinate along axis a counts,
     /// that of its begin or of its end. So the first is h at its begin and the last h at its end, and

@@ -68,9 +68,9 @@ impl Pyramid {
     /// Asks memory for what a child is read from: tile or samples. `memory`: where samples and levels begin.
     #[inline(always)]
     fn ask<K: Kernel>(&self, kernel: K, memory: &[*const u8; 5], child: &Child) {
-        let places = &self.places[child.level];
-        let at = memory[child.level].wrapping_add(child.at.wrapping_mul(places.bytes));
-        for step in places.lines {
+        let children = &self.children[child.level];
+        let at = memory[child.level].wrapping_add(child.at.wrapping_mul(children.bytes));
+        for step in children.lines {
             kernel.ask(at.wrapping_add(step));
         }
     }
@@ -128,7 +128,7 @@ impl Pyramid {
             for n in round.cells.lanes() {
                 let number = usize::from(n) % WIDTH;
                 let Some(lane) = &mut lanes[number] else { continue };
-                match lane.cell::<ANY, K>(kernel, next[number]) {
+                match lane.cell::<ANY, K>(kernel, next[number], self.slack) {
                     Step::On => next[number] = then.queue(kernel, self, &memory, lane, n),
                     Step::Hit(hit) => (hits[number], lane.capped) = (Some(hit), false),
                     Step::End => lane.capped = false,

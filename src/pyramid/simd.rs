@@ -137,6 +137,39 @@ macro_rules! shared {
         }
 
         #[inline(always)]
+        fn clear(self, corners: &__m256, c: f32, begin: Vec4, end: Vec4, slack: f32) -> bool {
+            #[inline]
+            #[target_feature(enable = $features)]
+            fn inner(corners: __m256, c: f32, begin: Vec4, end: Vec4, slack: f32) -> bool {
+                let h = _mm256_sub_ps(corners, _mm256_set1_ps(c));
+                // max |h − c|, all over.
+                let most = _mm256_andnot_ps(_mm256_set1_ps(-0.0), h);
+                let most = _mm256_max_ps(most, _mm256_permute2f128_ps::<1>(most, most));
+                let most = _mm256_max_ps(most, _mm256_permute_ps::<0x4e>(most));
+                let most = _mm256_max_ps(most, _mm256_permute_ps::<0xb1>(most));
+                let margin = _mm256_fmadd_ps(most, _mm256_set1_ps(slack), _mm256_set1_ps(c.abs() * 1e-6));
+                // (x, x′, x, x′), (y, y, y′, y′), and z, z′ in the halves.
+                let (begin, end) = (__m128::from(begin), __m128::from(end));
+                let xy = _mm_unpacklo_ps(begin, end);
+                let x = _mm256_set_m128(_mm_movelh_ps(xy, xy), _mm_movelh_ps(xy, xy));
+                let y = _mm_permute_ps::<0xfa>(xy);
+                let y = _mm256_set_m128(y, y);
+                let z = _mm256_permute_ps::<0xaa>(_mm256_set_m128(end, begin));
+                let lerp = |u: __m256, a: __m256, b: __m256| _mm256_fmadd_ps(u, _mm256_sub_ps(b, a), a);
+                let h = lerp(x, _mm256_moveldup_ps(h), _mm256_movehdup_ps(h));
+                let h = lerp(y, _mm256_permute_ps::<0x44>(h), _mm256_permute_ps::<0xee>(h));
+                let h = lerp(z, _mm256_permute2f128_ps::<0x00>(h, h), _mm256_permute2f128_ps::<0x11>(h, h));
+                // Between the greatest below and the least above are those that are near; NaN is.
+                let above = _mm256_movemask_ps(_mm256_cmp_ps::<_CMP_GT_OQ>(h, margin));
+                let below =
+                    _mm256_movemask_ps(_mm256_cmp_ps::<_CMP_LT_OQ>(h, _mm256_xor_ps(margin, _mm256_set1_ps(-0.0))));
+                (above == 0xff) | (below == 0xff)
+            }
+            // SAFETY: `self` exists, so the machine has the features.
+            unsafe { inner(*corners, c, begin, end, slack) }
+        }
+
+        #[inline(always)]
         fn outlined<T>(self, f: impl FnOnce() -> T) -> T {
             #[inline(never)]
             #[target_feature(enable = $features)]

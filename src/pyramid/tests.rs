@@ -93,6 +93,8 @@ fn every_instruction_set_finds_the_same_children() {
         let line = kernel::Line {
             // Some start on planes and edges.
             o: if rng.bits().is_multiple_of(3) { o.floor() } else { o },
+            start: o,
+            d,
             inv: 1.0 / d.with_w(1.0),
             far: Vec4::select(backward, Vec4::ZERO, Vec4::ONE),
             flip: (0..3).filter(|&a| backward.test(a)).fold(0, |flip, a| flip | 3 << (2 * a)),

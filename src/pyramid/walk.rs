@@ -17,7 +17,7 @@
 mod begin;
 
 use super::kernel::{Kernel, Line, Piece, Scalar};
-use super::{LEVELS, Pyramid, Ranks};
+use super::{LEVELS, Place, Pyramid, Ranks, place};
 use crate::cell::Cell;
 use crate::field::Field;
 use crate::flattened::{FlattenedHit, FlattenedRay, Side, Target};
@@ -34,17 +34,6 @@ const INTEGERS: f32 = 8_388_608.0;
 
 /// [`Line::flip`] of the axes whose bits are set in the index.
 const FLIPS: [u32; 8] = [0, 0x03, 0x0c, 0x0f, 0x30, 0x33, 0x3c, 0x3f];
-
-/// Where the 64 children of a node stand.
-static PLACES: [Vec4; 64] = {
-    let mut places = [Vec4::ZERO; 64];
-    let mut n = 0;
-    while n < 64 {
-        places[n] = Vec4::new((n & 3) as f32, (n >> 2 & 3) as f32, (n >> 4) as f32, 0.0);
-        n += 1;
-    }
-    places
-};
 
 /// A ray within Ω.
 pub(super) struct Ray<'a> {
@@ -72,9 +61,11 @@ pub(super) struct Lane<'a, R> {
     /// [`Kernel::ray`].
     constants: R,
     pub(super) stack: Stack,
-    /// The cell of the start.
-    pub(super) cell: [u32; 3],
-    /// It is done.
+    /// The start among the children of its nodes, six bits for each level.
+    own: u32,
+    /// The node of the top level that holds it.
+    root: usize,
+    /// The start's cell is done.
     departing: bool,
     /// Levels that were looked at around the start.
     pub(super) climbed: usize,
@@ -92,27 +83,30 @@ pub(super) enum Begun {
 }
 
 /// Children still to be visited.
-#[derive(Default)]
 pub(super) struct Stack {
     /// Levels that have some, bit by bit.
     pub(super) live: u32,
     /// The children, bit by bit, in the ray's order.
     pending: [u64; LEVELS],
-    /// Each level's first child: its place in memory, its number in units of children, and where it stands.
-    first: [usize; LEVELS],
-    number: [[u32; 3]; LEVELS],
-    corner: [Vec4; LEVELS],
+    /// Where each level's child begins that was last popped, and behind them the node of the top level.
+    places: [Place; LEVELS + 1],
 }
 
-/// A child of a level's node.
+/// A cell, or a node of the level below. It begins at its level's [`Stack::places`].
 #[derive(Clone, Copy, Default)]
 pub(super) struct Child {
     pub(super) level: usize,
-    n: u32,
     /// Place in memory: of its tile, or of the cell's first sample.
     pub(super) at: usize,
-    /// Its first corner in cells.
-    corner: Vec4,
+}
+
+/// Where a ray starts.
+pub(super) struct Start {
+    /// As [`Lane::own`] and [`Lane::root`].
+    own: u32,
+    root: usize,
+    /// As [`Stack::places`].
+    places: [Place; LEVELS + 1],
 }
 
 /// The width of a level's children, in cells.
@@ -121,7 +115,7 @@ fn size(level: usize) -> f32 {
     f32::from_bits((127 + 2 * level as u32) << 23)
 }
 
-/// A place of the lattice in the tables of places.
+/// A place of the lattice.
 #[inline(always)]
 fn point([x, y, z]: [u32; 3]) -> Vec4 {
     // Below 2²³ an integer is the low bits of itself plus 2²³.
@@ -129,17 +123,32 @@ fn point([x, y, z]: [u32; 3]) -> Vec4 {
 }
 
 impl Stack {
+    /// Leaves children of a level for later.
+    #[inline(always)]
+    fn push(&mut self, level: usize, these: u64) {
+        self.pending[level] = these;
+        self.live |= u32::from(these != 0) << level;
+    }
+
     /// The next child; no child if nothing is live.
     #[inline(always)]
     fn pop(&mut self, pyramid: &Pyramid, line: &Line) -> Child {
         let level = (self.live.trailing_zeros() as usize) % LEVELS;
-        let these = self.pending[level];
+        self.live &= self.live.wrapping_sub(1);
+        self.first(pyramid, line, level, self.pending[level])
+    }
+
+    /// The first child of `these`, of a level; the others are left for later.
+    #[inline(always)]
+    fn first(&mut self, pyramid: &Pyramid, line: &Line, level: usize, these: u64) -> Child {
         let rest = these & these.wrapping_sub(1);
         self.pending[level] = rest;
-        self.live &= !(u32::from(rest == 0) << level);
+        self.live |= u32::from(rest != 0) << level;
         let n = (these.trailing_zeros() ^ line.flip) % 64;
-        let at = self.first[level].wrapping_add(pyramid.places[level].child[n as usize]);
-        Child { level, n, at, corner: self.corner[level] + PLACES[n as usize] * size(level) }
+        let (node, step) = (&self.places[level + 1], &pyramid.children[level].steps[n as usize]);
+        let at = node.at[level].wrapping_add(step.at[level]) as usize;
+        self.places[level] = node.plus(step);
+        Child { level, at }
     }
 }
 
@@ -176,12 +185,19 @@ impl Pyramid {
                     return self.leave(&lane.ray);
                 }
             }
-            let child = lane.pop(self);
+            let mut child = lane.pop(self);
+            while child.level > 0 {
+                let level = (child.level - 1) % LEVELS;
+                let found = self.look(kernel, lane, level, child.at);
+                if found == 0 {
+                    break;
+                }
+                child = lane.stack.first(self, &lane.line, level, found);
+            }
             if child.level > 0 {
-                self.open(kernel, lane, child);
                 continue;
             }
-            match lane.cell::<ANY, K>(kernel, child) {
+            match lane.cell::<ANY, K>(kernel, child, self.slack) {
                 Step::On => {}
                 Step::Hit(hit) => return Some(hit),
                 Step::End => return None,
@@ -193,26 +209,33 @@ impl Pyramid {
     /// are done. What they give comes first on the path, and neither node waits for the other.
     #[inline(always)]
     pub(super) fn climb<K: Kernel>(&self, kernel: K, lane: &mut Lane<K::Ray>) {
-        let level = lane.climbed;
-        lane.climbed = level + 2;
-        for level in level..(level + 2).min(self.levels.len()) {
-            let shift = 2 * level as u32;
-            let number = lane.cell.map(|i| i >> (shift + 2));
-            let corner = point(lane.cell.map(|i| i >> (shift + 2) << (shift + 2)));
-            self.look(kernel, lane, level, self.levels[level].at(number), number, corner);
-            let [x, y, z] = lane.cell.map(|i| i >> shift & 3);
-            let own = u64::from(level > 0 || lane.departing) << (((x | y << 2 | z << 4) ^ lane.line.flip) % 64);
-            let pending = lane.stack.pending[level % LEVELS] & !own;
-            lane.stack.pending[level % LEVELS] = pending;
-            lane.stack.live &= !(u32::from(pending == 0) << level);
-            if level > 0 {
-                // The first that will be opened after what is found on the levels below.
-                let n = (pending.trailing_zeros() ^ lane.line.flip) % 64;
-                let at = lane.stack.first[level % LEVELS].wrapping_add(self.places[level % LEVELS].child[n as usize]);
-                let tile = self.levels[level - 1].tiles.as_ptr().wrapping_add(at).cast::<u8>();
-                kernel.ask(tile);
-                kernel.ask(tile.wrapping_add(64));
-            }
+        if lane.climbed == 0 {
+            self.look_around::<0, K>(kernel, lane);
+            self.look_around::<1, K>(kernel, lane);
+        } else {
+            self.look_around::<2, K>(kernel, lane);
+            self.look_around::<3, K>(kernel, lane);
+        }
+        lane.climbed += 2;
+    }
+
+    /// Opens the node that holds the start on a level, but for the child that holds it and is done.
+    #[inline(always)]
+    fn look_around<const LEVEL: usize, K: Kernel>(&self, kernel: K, lane: &mut Lane<K::Ray>) {
+        if LEVEL >= self.levels.len() {
+            return;
+        }
+        let own = u64::from(LEVEL > 0 || lane.departing) << ((lane.own >> (6 * LEVEL) ^ lane.line.flip) % 64);
+        let pending = !own & self.look(kernel, lane, LEVEL, tile(LEVEL, &lane.stack.places, lane.root));
+        lane.stack.push(LEVEL, pending);
+        if LEVEL > 0 {
+            // The first that will be opened after what is found on the levels below.
+            let n = (pending.trailing_zeros() ^ lane.line.flip) % 64;
+            let step = &self.children[LEVEL].steps[n as usize];
+            let at = lane.stack.places[LEVEL + 1].at[LEVEL].wrapping_add(step.at[LEVEL]) as usize;
+            let tile = self.levels[LEVEL - 1].tiles.as_ptr().wrapping_add(at).cast::<u8>();
+            kernel.ask(tile);
+            kernel.ask(tile.wrapping_add(64));
         }
     }
 
@@ -227,57 +250,68 @@ impl Pyramid {
             let n = [*turn % roots[0], *turn / roots[0] % roots[1], *turn / (roots[0] * roots[1])];
             *turn += 1;
             let line = &lane.line;
-            let number = [0, 1, 2].map(|a| if line.negative(a) { roots[a] - 1 - n[a] } else { n[a] } as u32);
-            let corner = point(number) * width;
+            let number = [0, 1, 2].map(|a| if line.negative(a) { roots[a] - 1 - n[a] } else { n[a] });
+            let at = self.levels[top].at(number);
+            let node = self.root(number);
+            let corner = node.corner;
             let near = line.times(corner + (Vec4::ONE - line.far) * width);
             let far = line.times(corner + line.far * width);
             let met = near.x.max(near.y).max(near.z) <= far.x.min(far.y).min(far.z);
-            if met && number != lane.cell.map(|i| i >> (2 * top + 2)) {
-                self.look(kernel, lane, top, self.levels[top].at(number), number, corner);
+            if met && at != lane.root {
+                lane.stack.places[top + 1] = node;
+                let found = self.look(kernel, lane, top, at);
+                lane.stack.push(top, found);
                 return true;
             }
         }
         false
     }
 
-    /// Asks memory for the nodes of two levels that hold `cell`.
+    /// Where node `number` of the top level begins.
+    fn root(&self, number: [usize; 3]) -> Place {
+        let width = 4usize.pow(self.levels.len() as u32);
+        let dims = self.cells.map(|n| n + 1);
+        place(dims, &self.levels, number.map(|i| width * i))
+    }
+
+    /// The nodes around a cell.
     #[inline(always)]
-    pub(super) fn prefetch<K: Kernel>(&self, kernel: K, cell: [u32; 3], level: usize) {
-        for level in level..(level + 2).min(self.levels.len()) {
-            let nodes = &self.levels[level];
-            kernel.prefetch(&nodes.tiles[nodes.at(cell.map(|i| i >> (2 * level + 2)))]);
+    fn nodes(&self, cell: [u32; 3]) -> Start {
+        let own = spread(cell);
+        let mut places = [Place::default(); LEVELS + 1];
+        let mut root = 0;
+        if self.roots != 1 {
+            let number = cell.map(|i| i as usize >> (2 * LEVELS));
+            (places[LEVELS], root) = (self.root(number), self.levels[LEVELS - 1].at(number));
+        }
+        for level in (1..LEVELS).rev() {
+            let n = (own >> (6 * level)) % 64;
+            places[level] = places[level + 1].plus(&self.children[level].steps[n as usize]);
+        }
+        Start { own, root, places }
+    }
+
+    /// Asks memory for the two lowest nodes around a start.
+    #[inline(always)]
+    fn prefetch<K: Kernel>(&self, kernel: K, start: &Start) {
+        for (level, nodes) in self.levels.iter().enumerate().take(2) {
+            kernel.prefetch(&nodes.tiles[tile(level, &start.places, start.root)]);
         }
     }
 
     /// Pushes the active children of a node that was popped.
     #[inline(always)]
     pub(super) fn open<K: Kernel>(&self, kernel: K, lane: &mut Lane<K::Ray>, node: Child) {
-        let [x, y, z] = lane.stack.number[node.level % LEVELS];
-        let number = [x + (node.n & 3), y + (node.n >> 2 & 3), z + (node.n >> 4)];
-        self.look(kernel, lane, (node.level - 1) % LEVELS, node.at, number, node.corner);
+        let level = (node.level - 1) % LEVELS;
+        let found = self.look(kernel, lane, level, node.at);
+        lane.stack.push(level, found);
     }
 
-    /// Pushes the active children of node `number` of `level`, whose tile stands `at` and which begins at `corner`.
+    /// The active children of a level's node, whose tile stands `at`.
     #[inline(always)]
-    fn look<K: Kernel>(
-        &self,
-        kernel: K,
-        lane: &mut Lane<K::Ray>,
-        level: usize,
-        at: usize,
-        number: [u32; 3],
-        corner: Vec4,
-    ) {
+    fn look<K: Kernel>(&self, kernel: K, lane: &Lane<K::Ray>, level: usize, at: usize) -> u64 {
         let tile = &self.levels[level].tiles[at];
-        let found = kernel.children(&lane.line, &lane.constants, tile, corner, size(level));
-        let stack = &mut lane.stack;
-        let first = number.map(|i| 4 * i);
-        let [y, z] = self.places[level].steps;
-        stack.first[level] = first[0] as usize + first[1] as usize * y + first[2] as usize * z;
-        stack.number[level] = first;
-        stack.corner[level] = corner;
-        stack.pending[level] = found;
-        stack.live |= u32::from(found != 0) << level;
+        kernel.children(&lane.line, &lane.constants, tile, lane.stack.places[level + 1].corner, size(level))
     }
 
     /// Where the samples of a cell begin.
@@ -344,8 +378,8 @@ impl Ray<'_> {
 
     /// Where h − c changes its sign after `t`, within `span`, the states at both ends being given.
     #[inline(never)]
-    fn crossing(&self, cell: &Child, t: f64, span: f64, [begins, ends]: [bool; 2]) -> Option<f64> {
-        let cubic = self.cell_at(cell.at).cubic(self.c, self.local(cell.corner, t), self.direction());
+    fn crossing(&self, at: usize, corner: Vec4, t: f64, span: f64, [begins, ends]: [bool; 2]) -> Option<f64> {
+        let cubic = self.cell_at(at).cubic(self.c, self.local(corner, t), self.direction());
         cubic.first_crossing(span, begins, ends)
     }
 
@@ -388,10 +422,11 @@ impl Ray<'_> {
 }
 
 impl<'a, R> Lane<'a, R> {
-    /// A ray that begins in `cell`.
     #[inline(always)]
-    fn new(constants: R, ray: Ray<'a>, line: Line, cell: [u32; 3], departing: bool, capped: bool) -> Self {
-        Self { ray, line, constants, stack: Stack::default(), cell, departing, climbed: 0, capped }
+    fn new(constants: R, ray: Ray<'a>, line: Line, start: Start, departing: bool, capped: bool) -> Self {
+        let Start { own, root, places } = start;
+        let stack = Stack { live: 0, pending: [0; LEVELS], places };
+        Self { ray, line, constants, stack, own, root, departing, climbed: 0, capped }
     }
 
     /// [`Stack::pop`].
@@ -402,11 +437,12 @@ impl<'a, R> Lane<'a, R> {
 
     /// A cell of the path, or one that the path only touches.
     #[inline(always)]
-    pub(super) fn cell<const ANY: bool, K: Kernel>(&self, kernel: K, cell: Child) -> Step {
+    pub(super) fn cell<const ANY: bool, K: Kernel>(&self, kernel: K, cell: Child, slack: f32) -> Step {
         let (ray, line) = (&self.ray, &self.line);
         let corners = kernel.corners(ray.samples, cell.at, ray.steps);
         let inside = kernel.inside(&corners, ray.c32);
-        let (near, far) = (cell.corner + (Vec4::ONE - line.far), cell.corner + line.far);
+        let corner = self.stack.places[0].corner;
+        let (near, far) = (corner + (Vec4::ONE - line.far), corner + line.far);
         // The last plane before the cell and the first behind it.
         let (entry, t_in) = last_of(line.times(near));
         let (exit, t_out) = first_of(line.times(far));
@@ -414,6 +450,11 @@ impl<'a, R> Lane<'a, R> {
         let crossed = (t_in < t_out) | ((t_in == t_out) & (entry < exit));
         let first = ray.within & (t_in <= 0.0);
         if (inside == 0) | (inside == u8::MAX) | !crossed | (first & self.departing) {
+            return Step::On;
+        }
+        // Most cells are passed by.
+        let local = |t: f32| (line.start - corner + line.d * t).max(Vec4::ZERO).min(Vec4::ONE);
+        if kernel.clear(&corners, ray.c32, local(t_in.max(0.0)), local(t_out), slack) {
             return Step::On;
         }
         let t = ray.time(entry, near.to_array()[entry]).max(0.0);
@@ -428,7 +469,7 @@ impl<'a, R> Lane<'a, R> {
             o: &ray.o,
             d: &ray.d,
             far: line.far,
-            cell: cell.corner,
+            cell: corner,
             t: [t, if last { t + span } else { t_exit }],
             on: [if first { 0 } else { 1 << entry }, if last { 0 } else { 1 << exit }],
         };
@@ -445,7 +486,7 @@ impl<'a, R> Lane<'a, R> {
         if ANY && begins != ends {
             return Step::Hit(ray.hit(t, begins));
         }
-        match ray.crossing(&cell, t, span, [begins, ends]) {
+        match ray.crossing(cell.at, corner, t, span, [begins, ends]) {
             Some(dt) => Step::Hit(ray.hit(t + dt, begins)),
             None if last => Step::End,
             None => Step::On,
@@ -478,6 +519,22 @@ impl Cell {
     }
 }
 
+/// Where the tile of a level's node stands, of those around a start.
+#[inline(always)]
+fn tile(level: usize, places: &[Place; LEVELS + 1], root: usize) -> usize {
+    if level + 1 < LEVELS { places[level + 1].at[level + 1] as usize } else { root }
+}
+
+/// A cell among the children of the nodes around it: x, y and z of each level side by side, in six bits.
+#[inline(always)]
+fn spread(cell: [u32; 3]) -> u32 {
+    let [x, y, z] = cell.map(|i| {
+        let fours = (i & 0xff | i << 8) & 0x00_f00f;
+        (fours | fours << 4) & 0x0c_30c3
+    });
+    x | y << 2 | z << 4
+}
+
 /// The smallest f32 not below `c`.
 #[inline(always)]
 #[allow(clippy::cast_possible_truncation, reason = "rounded up")]
@@ -490,8 +547,10 @@ fn not_below(c: f64) -> f32 {
 #[inline(always)]
 fn last_of(t: Vec4) -> (usize, f32) {
     let [x, y, z, _] = t.to_array();
-    let (a, t) = (usize::from(y >= x), if y >= x { y } else { x });
-    (if z >= t { 2 } else { a }, if z >= t { z } else { t })
+    let (a, t) = (usize::from(y >= x), if x > y { x } else { y });
+    let last = usize::from(z >= t);
+    // Without branches, which nothing could foretell.
+    (a & !last | last << 1, if t > z { t } else { z })
 }
 
 /// The axis of the smallest number, of equal ones the first, and that number.
@@ -499,7 +558,8 @@ fn last_of(t: Vec4) -> (usize, f32) {
 fn first_of(t: Vec4) -> (usize, f32) {
     let [x, y, z, _] = t.to_array();
     let (a, t) = (usize::from(y < x), if y < x { y } else { x });
-    (if z < t { 2 } else { a }, if z < t { z } else { t })
+    let last = usize::from(z < t);
+    (a & !last | last << 1, if z < t { z } else { t })
 }
 
 #[inline]

@@ -17,13 +17,14 @@ pub(in crate::pyramid) struct Ray {
     /// Plane numbers within a node before and behind its children along x and y, in the ray's order, twice.
     before: [__m256; 2],
     behind: [__m256; 2],
-    /// Those before and behind layers 0, 2 (first half) and 1, 3 along z.
+    /// Those before and behind the first two layers along z in memory's order, each in a half, then the last two.
     layers: __m256,
-    /// Positions within 16 children of the same z, in the ray's order, and of the words of two layers.
+    /// Positions within 16 children of the same z, in the ray's order.
     order: __m256i,
-    halves: __m256i,
     /// Where among a node's 64 the first half of the ray's children stands.
     first: usize,
+    /// By how many bits layers of a half stand out of the ray's order: they are in memory's.
+    turn: u32,
     most_lo: __m256i,
     least_hi: __m256i,
 }
@@ -31,8 +32,7 @@ pub(in crate::pyramid) struct Ray {
 /// By the direction: along the axis, against it.
 const BEFORE: [[f32; 8]; 2] = [[0., 1., 2., 3., 0., 1., 2., 3.], [4., 3., 2., 1., 4., 3., 2., 1.]];
 const BEHIND: [[f32; 8]; 2] = [[1., 2., 3., 4., 1., 2., 3., 4.], [3., 2., 1., 0., 3., 2., 1., 0.]];
-const LAYERS: [[f32; 8]; 2] = [[0., 2., 1., 3., 1., 3., 2., 4.], [4., 2., 3., 1., 3., 1., 2., 0.]];
-const HALVES: [[i32; 8]; 2] = [[0, 1, 2, 3, 4, 5, 6, 7], [4, 5, 6, 7, 0, 1, 2, 3]];
+const LAYERS: [[f32; 8]; 2] = [[0., 2., 1., 3., 1., 3., 2., 4.], [3., 1., 2., 0., 4., 2., 3., 1.]];
 const COUNT: [i8; 32] = {
     let mut count = [0; 32];
     let mut n = 0;
@@ -116,8 +116,8 @@ fn ray(line: &Line) -> Ray {
         behind: [number(&BEHIND, 0), number(&BEHIND, 1)],
         layers: number(&LAYERS, 2),
         order: _mm256_xor_si256(load(&COUNT), _mm256_set1_epi8((line.flip & 15) as i8)),
-        halves: load(&HALVES[back[2]]),
         first: 32 * back[2],
+        turn: 16 * u32::from(line.negative(2)),
         most_lo: _mm256_set1_epi8(line.most_lo.cast_signed()),
         least_hi: _mm256_set1_epi8(line.least_hi.cast_signed()),
     }
@@ -165,12 +165,11 @@ fn children(line: &Line, ray: &Ray, tile: &Tile, base: Vec4, size: f32) -> u64 {
         };
         let begins = _mm256_cmpeq_epi8(_mm256_min_epu8(lo, ray.most_lo), lo);
         let ends = _mm256_cmpeq_epi8(_mm256_max_epu8(hi, ray.least_hi), hi);
-        let in_order = _mm256_permutevar8x32_epi32(_mm256_and_si256(begins, ends), ray.halves);
-        _mm256_shuffle_epi8(in_order, ray.order)
+        _mm256_shuffle_epi8(_mm256_and_si256(begins, ends), ray.order)
     };
     let found = |path: __m256i, first: usize| {
         let both = _mm256_movemask_epi8(_mm256_and_si256(path, holds(first)));
-        u64::from(both.cast_unsigned())
+        u64::from(both.cast_unsigned().rotate_left(ray.turn))
     };
     found(near, ray.first) | found(far, ray.first ^ 32) << 32
 }

@@ -49,11 +49,14 @@ impl Pyramid {
         let corner = floor - Vec4::select(backward & origin.cmpeq(floor), Vec4::ONE, Vec4::ZERO);
         let [x, y, z, _] = (corner + INTEGERS).to_array().map(|x| x.to_bits() & 0x7f_ffff);
         let cell = [x, y, z];
+        let start = self.nodes(cell);
         // What is cold most often, on the way while the first cell is computed.
-        self.prefetch(kernel, cell, 0);
+        self.prefetch(kernel, &start);
         let crosses = size.cmpgt(Vec4::splat(PARALLEL * scale));
         let backward = backward & crosses;
         let mut line = Line {
+            start: origin,
+            d: direction / scale,
             o: Vec4::select(crosses, origin, corner + 0.5),
             inv: Vec4::select(crosses, scale / direction, Vec4::splat(1e30)),
             far: Vec4::select(backward, Vec4::ZERO, Vec4::ONE),
@@ -96,7 +99,7 @@ impl Pyramid {
         }
         line.hold(&self.ranks, c32);
         let ray = Ray { samples: field.samples(), steps: self.steps, o, d, inv, c, c32, t: 0.0, reach, within: true };
-        *lane = Some(Lane::new(kernel.ray(&line), ray, line, cell, departing, self.capped));
+        *lane = Some(Lane::new(kernel.ray(&line), ray, line, start, departing, self.capped));
         Begun::On
     }
 
@@ -119,7 +122,7 @@ impl Pyramid {
     pub(in crate::pyramid) fn start(&self, origin: Vec3) -> Child {
         let floor = origin.extend(0.0).max(Vec4::ZERO).min(self.far).floor();
         let [x, y, z, _] = (floor + INTEGERS).to_array().map(|x| x.to_bits() & 0x7f_ffff);
-        Child { at: self.sample([x, y, z]), ..Child::default() }
+        Child { level: 0, at: self.sample([x, y, z]) }
     }
 
     /// [`Pyramid::begin`] of any ray.
@@ -185,6 +188,8 @@ impl Pyramid {
         // The cell of the start, and the line from there.
         let mut cell = [0u32; 3];
         let mut line = Line {
+            start: Vec4::ZERO,
+            d: Vec4::ZERO,
             o: Vec4::ZERO,
             inv: Vec4::splat(1e30),
             far: Vec4::ONE,
@@ -196,6 +201,7 @@ impl Pyramid {
         };
         for a in 0..3 {
             let p = o[a] + t * d[a];
+            (line.start[a], line.d[a]) = (p as f32, (d[a] / scale) as f32);
             // On a shared plane the ray is in the cell it goes to.
             let below = d[a] < 0.0 && p == p.floor();
             cell[a] = (p.floor() as i32 - i32::from(below)).clamp(0, n[a] as i32 - 1).cast_unsigned();
@@ -207,7 +213,8 @@ impl Pyramid {
                 line.o[a] = cell[a] as f32 + 0.5;
             }
         }
-        self.prefetch(kernel, cell, 0);
+        let start = self.nodes(cell);
+        self.prefetch(kernel, &start);
 
         let c = f64::from(ray.isovalue);
         let within = entry.is_none();
@@ -240,7 +247,7 @@ impl Pyramid {
             }
         }
 
-        *lane = Some(Lane::new(kernel.ray(&line), ray, line, cell, departing.is_some(), self.capped));
+        *lane = Some(Lane::new(kernel.ray(&line), ray, line, start, departing.is_some(), self.capped));
         Begun::On
     }
 }
