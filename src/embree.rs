@@ -9,7 +9,8 @@
 //! `rtcSetSceneBuildQuality`, `rtcNewGeometry`, `rtcReleaseGeometry`, `rtcCommitGeometry`, `rtcAttachGeometry`,
 //! `rtcSetGeometryMask`, `rtcSetNewGeometryBuffer`, `rtcSetGeometryBuildQuality`, `rtcSetGeometryUserData`,
 //! `rtcSetGeometryUserPrimitiveCount`, `rtcSetGeometryBoundsFunction`, `rtcSetGeometryIntersectFunction`,
-//! `rtcSetGeometryOccludedFunction`, `rtcIntersect1`, `rtcOccluded1`, `rtcIntersect16`, `rtcOccluded16`.
+//! `rtcSetGeometryOccludedFunction`, `rtcIntersect1`, `rtcOccluded1`, `rtcIntersect8`, `rtcOccluded8`,
+//! `rtcIntersect16`, `rtcOccluded16`.
 //!
 //! Never wrapped: `RTCRayQueryContext` and the argument structs that hold one (the size of the context depends on the
 //! library's version), and `rtcGetGeometry*` inside callbacks (slow since 4.0).

@@ -1,9 +1,12 @@
 //! The fence around Embree: layout, callbacks, errors. Every expected distance is known without Embree.
 
 use isolume::embree::{
-    Device, INVALID_ID, Ray, Ray16, RayHit, RayHit16, RayView, Scene, SceneBuilder, UserGeometry, UserHit, Valid16,
+    Device, INVALID_ID, Ray, Ray16, RayHit, RayHit16, RayView, Scene, SceneBuilder, UserGeometry, UserHit, UserHits16,
+    Valid16,
 };
 use isolume::error::Error;
+use isolume::isa::Isa;
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
 
 const FAR: f32 = f32::INFINITY;
@@ -228,6 +231,63 @@ fn occluded_and_packets_agree_with_intersect() {
         }
     }
     assert!((300..1300).contains(&hits), "{hits} of 1600 rays hit: the fan tests nothing");
+}
+
+/// Hits nothing, and counts how rays arrive: single ones, and those of packets.
+#[derive(Default)]
+struct Counter {
+    single: AtomicU32,
+    together: AtomicU32,
+}
+
+impl Counter {
+    fn packet(&self, active: u16) -> u16 {
+        self.together.fetch_add(active.count_ones(), Ordering::Relaxed);
+        0
+    }
+}
+
+impl UserGeometry for Counter {
+    fn len(&self) -> u32 {
+        1
+    }
+    fn bounds(&self, _: u32) -> ([f32; 3], [f32; 3]) {
+        ([-1.0; 3], [1.0; 3])
+    }
+    fn intersect(&self, _: u32, _: &RayView) -> Option<UserHit> {
+        self.single.fetch_add(1, Ordering::Relaxed);
+        None
+    }
+    fn occluded(&self, prim: u32, ray: &RayView) -> bool {
+        self.intersect(prim, ray).is_some()
+    }
+    fn intersect16(&self, _: u32, active: u16, _: &Ray16, _: &mut UserHits16) -> u16 {
+        self.packet(active)
+    }
+    fn occluded16(&self, _: u32, active: u16, _: &Ray16) -> u16 {
+        self.packet(active)
+    }
+}
+
+/// Embree takes sixteen rays apart, one by one, where its own vectors are eight wide.
+#[test]
+fn packets_arrive_as_packets() {
+    if Isa::found().len() < 2 {
+        println!("only plain code here: Embree has single rays at most");
+        return;
+    }
+    let (device, counter) = (device(), Counter::default());
+    let mut builder = SceneBuilder::new(&device).unwrap();
+    builder.user(&counter, u32::MAX).unwrap();
+    let scene = builder.commit().unwrap();
+    let rays = Ray16::new(&[Ray::new([0.0, 0.0, 5.0], [0.0, 0.0, -1.0], 0.0, FAR); 16]);
+    for active in [0xffff, 0x00ff, 0x8000, 0x0110] {
+        scene.intersect16(&Valid16::from_bits(active), &mut RayHit16::new(rays));
+        let mut shadows = rays;
+        scene.occluded16(&Valid16::from_bits(active), &mut shadows);
+    }
+    let count = |x: &AtomicU32| x.load(Ordering::Relaxed);
+    assert_eq!((count(&counter.single), count(&counter.together)), (0, 2 * (16 + 8 + 1 + 2)));
 }
 
 /// A geometry whose hits lie outside the ray, or nowhere.

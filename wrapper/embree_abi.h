@@ -1,7 +1,7 @@
 /* The rays and hits that are handed to Embree, and the functions for which embree4-sys 0.0.12 is unsafe as declared.
  *
  * embree4-sys carries Embree's 4.2 headers. Since 4.3 a hit ends with instPrimID, so that the library writes 4 bytes
- * (16 times 4 for a packet) behind the 80-byte RTCRayHit (1280-byte RTCRayHit16) of those headers. The structs below
+ * (8 or 16 times 4 for a packet) behind the 80-byte RTCRayHit (640-byte RTCRayHit8, 1280-byte RTCRayHit16) of those headers. The structs below
  * have the 4.2 layout plus room for what 4.3 and later write: they are right for every Embree from 4.0 to 4.4.
  * RTCRayQueryContext grew as well: none is ever built, every query passes NULL arguments.
  *
@@ -61,6 +61,35 @@ struct RayHit {
   struct Hit hit;
 } __attribute__((aligned(16)));
 
+/// Eight rays: `RTCRay8` of Embree 4, 384 bytes. Fields as in `Ray16`.
+struct Ray8 {
+  float org[3][8];
+  float tnear[8];
+  float dir[3][8];
+  uint32_t time[8];
+  float tfar[8];
+  uint32_t mask[8];
+  uint32_t id[8];
+  uint32_t flags[8];
+} __attribute__((aligned(32)));
+
+/// Eight hits: `RTCHit8` of Embree 4.2 (256 bytes) plus 32 spare bytes. Fields as in `Hit16`.
+struct Hit8 {
+  float normal[3][8];
+  float u[8];
+  float v[8];
+  uint32_t prim[8];
+  uint32_t geometry[8];
+  uint32_t instance[8];
+  uint32_t spare[8];
+};
+
+/// Eight rays and their nearest hits: `RTCRayHit8` of Embree 4.2 plus 32 spare bytes, 672 bytes in all.
+struct RayHit8 {
+  struct Ray8 ray;
+  struct Hit8 hit;
+} __attribute__((aligned(32)));
+
 /// Sixteen rays, one field after the other: `RTCRay16` of Embree 4, 768 bytes. Fields as in `Ray`.
 struct Ray16 {
   /// Origins: x of all rays, then y, then z.
@@ -117,5 +146,7 @@ uint32_t rtcGetDeviceError(struct RTCDeviceTy *device);
 void rtcSetDeviceErrorFunction(struct RTCDeviceTy *device, ErrorFunction function, void *user);
 void rtcIntersect1(struct RTCSceneTy *scene, struct RayHit *rayhit, void *args);
 void rtcOccluded1(struct RTCSceneTy *scene, struct Ray *ray, void *args);
+void rtcIntersect8(const int *valid, struct RTCSceneTy *scene, struct RayHit8 *rayhit, void *args);
+void rtcOccluded8(const int *valid, struct RTCSceneTy *scene, struct Ray8 *ray, void *args);
 void rtcIntersect16(const int *valid, struct RTCSceneTy *scene, struct RayHit16 *rayhit, void *args);
 void rtcOccluded16(const int *valid, struct RTCSceneTy *scene, struct Ray16 *ray, void *args);

@@ -1,6 +1,6 @@
 //! Scenes: triangles and user geometry under one bounding volume hierarchy.
 
-use super::abi::{Hit, INVALID_ID, Ray, Ray16, RayHit, RayHit16, RayView, Valid16, raw};
+use super::abi::{Hit, INVALID_ID, Ray, Ray8, Ray16, RayHit, RayHit8, RayHit16, RayView, Valid16, raw};
 use super::device::Device;
 use crate::error::{Error, Result};
 use embree4_sys::{RTCBoundsFunctionArguments, RTCIntersectFunctionNArguments, RTCOccludedFunctionNArguments};
@@ -74,7 +74,8 @@ pub trait UserGeometry: Sync {
     /// `intersect` for the rays whose bit is set in `active`; returns the bits of the rays that hit, and their hits in
     /// `hits` (whatever stands in the other lanes is ignored).
     ///
-    /// Embree may split a packet, or fall back to `intersect` (always so on a CPU without AVX-512).
+    /// Embree may split a packet: it is asked for eight rays at a time on a CPU with AVX2, and hands over single ones, to
+    /// `intersect`, on one without.
     #[inline]
     fn intersect16(&self, prim: u32, active: u16, rays: &Ray16, hits: &mut UserHits16) -> u16 {
         let mut found = 0;
@@ -148,6 +149,8 @@ pub struct SceneBuilder<'a> {
 pub struct Scene<'a> {
     handle: embree4_sys::RTCScene,
     device: Device,
+    /// Whether packets go to Embree in halves: it takes sixteen rays apart, one by one, where its own vectors are eight wide.
+    halves: bool,
     /// What the callbacks of shared user geometries read: never touched, only kept.
     _shared: Vec<Arc<dyn UserGeometry + Send + 'a>>,
     /// The same for borrowed ones.
@@ -201,7 +204,8 @@ impl<'a> SceneBuilder<'a> {
             device.check()?;
             return Err(Error::Embree("no scene could be made".into()));
         }
-        let scene = Scene { handle, device: device.clone(), _shared: Vec::new(), _borrowed: PhantomData };
+        let halves = device.packet_width() == 8;
+        let scene = Scene { handle, device: device.clone(), halves, _shared: Vec::new(), _borrowed: PhantomData };
         device.check()?;
         Ok(Self { scene, quality: Quality::default(), robust: true })
     }
@@ -342,22 +346,27 @@ impl<'a> SceneBuilder<'a> {
                     // SAFETY: as above.
                     unsafe { accept(base, 1, 0, &hit, args.primID, args.geomID) };
                 }
-            } else if n == 16 && base.cast::<Ray16>().is_aligned() {
+            } else if n == 16 && base.cast::<Ray16>().is_aligned() || n == 8 && base.cast::<Ray8>().is_aligned() {
                 // SAFETY: `valid` has N entries.
-                let active = unsafe { active16(args.valid) };
+                let active = unsafe { active(args.valid, n) };
                 let mut hits = UserHits16::ZERO;
-                // SAFETY: with N = 16 the rays are a Ray16 (alignment tested); otherwise as for N = 1.
-                let found =
-                    active & unsafe { data.intersect16(args.primID, active, &*base.cast::<Ray16>(), &mut hits) };
-                for lane in (0..16).filter(|lane| found >> lane & 1 == 1) {
+                // SAFETY: with N = 16 the rays are a Ray16, with N = 8 a Ray8 (alignment tested); otherwise as for N = 1.
+                let found = active
+                    & unsafe {
+                        match n {
+                            16 => data.intersect16(args.primID, active, &*base.cast::<Ray16>(), &mut hits),
+                            _ => data.intersect16(args.primID, active, &(*base.cast::<Ray8>()).widened(), &mut hits),
+                        }
+                    };
+                for lane in (0..n).filter(|lane| found >> lane & 1 == 1) {
                     let hit = UserHit {
                         t: hits.t[lane],
                         u: hits.u[lane],
                         v: hits.v[lane],
                         normal: [hits.normal[0][lane], hits.normal[1][lane], hits.normal[2][lane]],
                     };
-                    // SAFETY: `base` is a packet of 16 rays and hits, `lane` < 16.
-                    unsafe { accept(base, 16, lane, &hit, args.primID, args.geomID) };
+                    // SAFETY: `base` is a packet of N rays and hits, `lane` < N.
+                    unsafe { accept(base, n, lane, &hit, args.primID, args.geomID) };
                 }
             } else {
                 for lane in 0..n {
@@ -388,13 +397,17 @@ impl<'a> SceneBuilder<'a> {
                         (&raw mut (*ray).tfar).write(f32::NEG_INFINITY);
                     }
                 }
-            } else if n == 16 && base.cast::<Ray16>().is_aligned() {
-                // SAFETY: `valid` has N entries; with N = 16 the rays are a Ray16 (alignment tested).
+            } else if n == 16 && base.cast::<Ray16>().is_aligned() || n == 8 && base.cast::<Ray8>().is_aligned() {
+                // SAFETY: `valid` has N entries; with N = 16 the rays are a Ray16, with N = 8 a Ray8 (alignment tested).
                 unsafe {
-                    let active = active16(args.valid);
-                    let found = active & data.occluded16(args.primID, active, &*base.cast::<Ray16>());
-                    for lane in (0..16).filter(|lane| found >> lane & 1 == 1) {
-                        base.add(TFAR * 16 + lane).write(f32::NEG_INFINITY.to_bits());
+                    let active = active(args.valid, n);
+                    let found = active
+                        & match n {
+                            16 => data.occluded16(args.primID, active, &*base.cast::<Ray16>()),
+                            _ => data.occluded16(args.primID, active, &(*base.cast::<Ray8>()).widened()),
+                        };
+                    for lane in (0..n).filter(|lane| found >> lane & 1 == 1) {
+                        base.add(TFAR * n + lane).write(f32::NEG_INFINITY.to_bits());
                     }
                 }
             } else {
@@ -490,6 +503,16 @@ impl Scene<'_> {
     /// [`Scene::intersect1`] for the rays of `rayhit` that take part.
     #[inline]
     pub fn intersect16(&self, valid: &Valid16, rayhit: &mut RayHit16) {
+        if self.halves {
+            for n in 0..2 {
+                let Some(valid) = valid.half(n) else { continue };
+                let mut eight = RayHit8::half_of(rayhit, n);
+                // SAFETY: as in `intersect1`, with 672 bytes; `valid` is eight lanes, 32-byte aligned as is `eight`.
+                unsafe { raw::rtcIntersect8(valid, self.handle, &mut eight, std::ptr::null_mut()) }
+                eight.put_back(rayhit, n);
+            }
+            return;
+        }
         // SAFETY: as in `intersect1`, with 1344 bytes; both structs are 64-byte aligned by their types.
         unsafe { raw::rtcIntersect16(valid.as_ptr(), self.handle, rayhit, std::ptr::null_mut()) }
     }
@@ -497,6 +520,16 @@ impl Scene<'_> {
     /// [`Scene::occluded1`] for the rays that take part: `tfar` of the occluded ones becomes −∞.
     #[inline]
     pub fn occluded16(&self, valid: &Valid16, rays: &mut Ray16) {
+        if self.halves {
+            for n in 0..2 {
+                let Some(valid) = valid.half(n) else { continue };
+                let mut eight = Ray8::half_of(rays, n);
+                // SAFETY: as in `intersect16`, with 384 bytes.
+                unsafe { raw::rtcOccluded8(valid, self.handle, &mut eight, std::ptr::null_mut()) }
+                eight.put_back(rays, n);
+            }
+            return;
+        }
         // SAFETY: as in `intersect16`, with 768 bytes.
         unsafe { raw::rtcOccluded16(valid.as_ptr(), self.handle, rays, std::ptr::null_mut()) }
     }
@@ -558,10 +591,10 @@ unsafe fn lane_of(base: *const u32, n: usize, lane: usize) -> Ray {
 /// Bit i is set if `valid[i]` is not 0.
 ///
 /// # Safety
-/// `valid` points to 16 values.
+/// `valid` points to `n` values, 16 at most.
 #[inline]
-unsafe fn active16(valid: *const i32) -> u16 {
+unsafe fn active(valid: *const i32, n: usize) -> u16 {
     // SAFETY: the caller's promise; i32 alignment is Embree's.
-    let valid = unsafe { &*valid.cast::<[i32; 16]>() };
+    let valid = unsafe { std::slice::from_raw_parts(valid, n) };
     valid.iter().enumerate().fold(0, |bits, (i, &v)| bits | u16::from(v != 0) << i)
 }

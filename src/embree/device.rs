@@ -82,6 +82,16 @@ impl Device {
         version_text(self.property(embree4_sys::RTCDeviceProperty::VERSION))
     }
 
+    /// How many rays a packet has that Embree's own kernels trace side by side: 16, 8, 4, or 1.
+    pub(super) fn packet_width(&self) -> usize {
+        let widths = [
+            (16, embree4_sys::RTCDeviceProperty::NATIVE_RAY16_SUPPORTED),
+            (8, embree4_sys::RTCDeviceProperty::NATIVE_RAY8_SUPPORTED),
+            (4, embree4_sys::RTCDeviceProperty::NATIVE_RAY4_SUPPORTED),
+        ];
+        widths.into_iter().find(|(_, native)| self.property(*native) != 0).map_or(1, |(width, _)| width)
+    }
+
     fn property(&self, property: embree4_sys::RTCDeviceProperty) -> isize {
         // SAFETY: the handle is live as long as `self`.
         let value = unsafe { embree4_sys::rtcGetDeviceProperty(self.0.handle, property) };
