@@ -60,6 +60,18 @@ impl Isa {
         }
         Scalar.children(line, &(), tile, base, size)
     }
+
+    /// [`Kernel::clear`].
+    #[cfg(test)]
+    pub(super) fn clear(self, corners: &[f32; 8], c: f32, [begin, end]: [Vec4; 2], slack: f32) -> bool {
+        #[cfg(target_arch = "x86_64")]
+        if let Some(kernel) = avx512::Avx512::of(self) {
+            return kernel.clear(&kernel.corners(corners, 0, [2, 4]), c, begin, end, slack);
+        } else if let Some(kernel) = avx2::Avx2::of(self) {
+            return kernel.clear(&kernel.corners(corners, 0, [2, 4]), c, begin, end, slack);
+        }
+        Scalar.clear(corners, c, begin, end, slack)
+    }
 }
 
 /// Defines the walks of a kernel, compiled for its instruction set.

@@ -115,6 +115,46 @@ fn every_instruction_set_finds_the_same_children() {
     assert!(sizes[2..].iter().sum::<u64>() > 5_000, "{sizes:?}");
 }
 
+/// Cells that are passed by hold nothing, wherever within its error the path lies; isovalues are close to what the path meets.
+#[test]
+fn cells_are_passed_by_only_if_the_path_stays_on_one_side() {
+    let mut rng = Rng::stream(10, Stage::Test, 0);
+    let slack = 3e-4;
+    let (mut passed, mut close) = (0, 0);
+    for _ in 0..100_000 {
+        let mut unit = || rng.unit();
+        let (offset, range) = (unit() - 0.5, 10f64.powf(-4.0 * unit()));
+        let corners: [f32; 8] = std::array::from_fn(|_| (offset + range * unit()) as f32);
+        let ends = [0, 1].map(|_| Vec4::new(unit() as f32, unit() as f32, unit() as f32, 0.0));
+        // Where it is indeed.
+        let path = ends.map(|p| [0, 1, 2].map(|a| f64::from(p[a]) + f64::from(slack) / 6.0 * (2.0 * unit() - 1.0)));
+        let h = |n: usize| {
+            let mut s = corners.map(f64::from).to_vec();
+            for a in 0..3 {
+                let u = path[n >> a & 1][a];
+                s = s.chunks_exact(2).map(|s| (1.0 - u) * s[0] + u * s[1]).collect();
+            }
+            s[0]
+        };
+        let along = [0, 1, 2, 3, 4, 5, 6, 7].map(h);
+        let least = along.into_iter().fold(f64::INFINITY, f64::min);
+        let most = along.into_iter().fold(f64::NEG_INFINITY, f64::max);
+        let beside = range * f64::from(slack) * 10f64.powf(3.0 * unit() - 2.0) * if unit() < 0.5 { -1.0 } else { 1.0 };
+        let c = if unit() < 0.5 { least - beside } else { most + beside } as f32;
+        for isa in Isa::found() {
+            if isa.clear(&corners, c, ends, slack) {
+                let one_side = least > f64::from(c) || most < f64::from(c);
+                assert!(one_side, "{isa:?}: {corners:?}, {ends:?}: {least} … {most} around {c}");
+                passed += 1;
+                close +=
+                    u32::from((least - f64::from(c)).abs().min((most - f64::from(c)).abs()) < f64::from(slack) * range);
+            }
+        }
+    }
+    let found = Isa::found().len() - 1;
+    assert!(passed >= 10_000 * found && close as usize >= 200 * found, "{passed}, {close}");
+}
+
 #[test]
 fn packets_give_the_bits_of_single_rays() {
     for (dims, levels) in [([70, 66, 67], 1e4), ([300, 30, 21], 40.0), ([5, 4, 9], 7.0)] {
