@@ -59,7 +59,7 @@ impl Level {
 #[derive(Clone, Copy, Debug, Default)]
 struct Place {
     /// In memory: its first sample, and its first tile of each level but the last.
-    at: [u32; LEVELS],
+    at: [usize; LEVELS],
     /// In the lattice: its first corner.
     corner: Vec4,
 }
@@ -67,7 +67,7 @@ struct Place {
 impl Place {
     #[inline(always)]
     fn plus(&self, step: &Self) -> Self {
-        // Numbers of 31 bits (Lattice): nothing wraps.
+        // Nothing wraps that is there.
         let at = std::array::from_fn(|level| self.at[level].wrapping_add(step.at[level]));
         Self { at, corner: self.corner + step.corner }
     }
@@ -226,7 +226,6 @@ impl Pyramid {
 }
 
 /// Where a node or a cell begins whose first cell is `cell`.
-#[allow(clippy::cast_possible_truncation, reason = "lattices have 31-bit numbers, and there are fewer tiles")]
 fn place(dims: [usize; 3], levels: &[Level], cell: [usize; 3]) -> Place {
     let at = std::array::from_fn(|level| {
         let (dims, size) = match level.checked_sub(1).map(|below| levels.get(below)) {
@@ -235,11 +234,12 @@ fn place(dims: [usize; 3], levels: &[Level], cell: [usize; 3]) -> Place {
             Some(None) => return 0,
         };
         let [x, y, z] = cell.map(|i| i / size);
-        ((z * dims[1] + y) * dims[0] + x) as u32
+        (z * dims[1] + y) * dims[0] + x
     });
     Place { at, corner: Vec4::new(cell[0] as f32, cell[1] as f32, cell[2] as f32, 0.0) }
 }
 
+/// Those of the nodes of a level.
 fn children(dims: [usize; 3], levels: &[Level], level: usize) -> Children {
     let width = 4usize.pow(level as u32);
     // No node of a level that is not there has a second child.

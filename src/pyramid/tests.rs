@@ -115,6 +115,38 @@ fn every_instruction_set_finds_the_same_children() {
     assert!(sizes[2..].iter().sum::<u64>() > 5_000, "{sizes:?}");
 }
 
+/// Steps from node to node lead where the cell's numbers lead, on lattices of more than 2³² samples too.
+#[test]
+fn steps_lead_to_places() {
+    for cells in [[2999, 2999, 2999], [255, 70, 13], [17, 3, 1]] {
+        let dims = cells.map(|n| n + 1);
+        let mut levels = Vec::new();
+        let mut nodes = cells.map(|n: usize| n.div_ceil(4));
+        while levels.len() < LEVELS {
+            levels.push(Level { dims: nodes, tiles: Vec::new() });
+            nodes = nodes.map(|n| n.div_ceil(4));
+        }
+        let all: Vec<Children> = (0..LEVELS).map(|level| children(dims, &levels, level)).collect();
+        let mut rng = Rng::stream(12, Stage::Test, cells[0] as u64);
+        for _ in 0..1000 {
+            let cell = cells.map(|n| (rng.unit() * n as f64) as usize);
+            // From the root that holds it, and from level to level its part.
+            let mut here = place(dims, &levels, cell.map(|i| i >> 8 << 8));
+            for level in (0..LEVELS).rev() {
+                let [x, y, z] = cell.map(|i| i >> (2 * level) & 3);
+                here = here.plus(&all[level].steps[x + 4 * y + 16 * z]);
+                let [i, j, k] = cell.map(|i| i >> (2 * level));
+                let expected = match level {
+                    0 => (k * dims[1] + j) * dims[0] + i,
+                    _ => levels[level - 1].at([i, j, k]),
+                };
+                assert_eq!(here.at[level], expected, "{cell:?}, level {level}");
+            }
+            assert_eq!(here.corner, Vec4::new(cell[0] as f32, cell[1] as f32, cell[2] as f32, 0.0));
+        }
+    }
+}
+
 /// Cells that are passed by hold nothing, wherever within its error the path lies; isovalues are close to what the path meets.
 #[test]
 fn cells_are_passed_by_only_if_the_path_stays_on_one_side() {

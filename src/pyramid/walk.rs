@@ -146,7 +146,7 @@ impl Stack {
         self.live |= u32::from(rest != 0) << level;
         let n = (these.trailing_zeros() ^ line.flip) % 64;
         let (node, step) = (&self.places[level + 1], &pyramid.children[level].steps[n as usize]);
-        let at = node.at[level].wrapping_add(step.at[level]) as usize;
+        let at = node.at[level].wrapping_add(step.at[level]);
         self.places[level] = node.plus(step);
         Child { level, at }
     }
@@ -232,7 +232,7 @@ impl Pyramid {
             // The first that will be opened after what is found on the levels below.
             let n = (pending.trailing_zeros() ^ lane.line.flip) % 64;
             let step = &self.children[LEVEL].steps[n as usize];
-            let at = lane.stack.places[LEVEL + 1].at[LEVEL].wrapping_add(step.at[LEVEL]) as usize;
+            let at = lane.stack.places[LEVEL + 1].at[LEVEL].wrapping_add(step.at[LEVEL]);
             let tile = self.levels[LEVEL - 1].tiles.as_ptr().wrapping_add(at).cast::<u8>();
             kernel.ask(tile);
             kernel.ask(tile.wrapping_add(64));
@@ -522,7 +522,7 @@ impl Cell {
 /// Where the tile of a level's node stands, of those around a start.
 #[inline(always)]
 fn tile(level: usize, places: &[Place; LEVELS + 1], root: usize) -> usize {
-    if level + 1 < LEVELS { places[level + 1].at[level + 1] as usize } else { root }
+    if level + 1 < LEVELS { places[level + 1].at[level + 1] } else { root }
 }
 
 /// A cell among the children of the nodes around it: x, y and z of each level side by side, in six bits.
