@@ -337,6 +337,7 @@ impl<'a> SceneBuilder<'a> {
             // `register` stored, live and shared by its contract.
             let (args, data) = unsafe { (&*args, &*(*args).geometryUserPtr.cast::<G>()) };
             let (n, base) = (args.N as usize, args.rayhit.cast::<u32>());
+            let mut room = None;
             if n == 1 {
                 let ray = base.cast::<Ray>();
                 // SAFETY: with N = 1 `rayhit` is the 16-byte aligned ray and hit of a single-ray query, nobody else
@@ -346,18 +347,12 @@ impl<'a> SceneBuilder<'a> {
                     // SAFETY: as above.
                     unsafe { accept(base, 1, 0, &hit, args.primID, args.geomID) };
                 }
-            } else if n == 16 && base.cast::<Ray16>().is_aligned() || n == 8 && base.cast::<Ray8>().is_aligned() {
+            // SAFETY: `base` is a packet of N rays that nobody writes to until the last use of `rays`.
+            } else if let Some(rays) = unsafe { sixteen(base, n, &mut room) } {
                 // SAFETY: `valid` has N entries.
                 let active = unsafe { active(args.valid, n) };
                 let mut hits = UserHits16::ZERO;
-                // SAFETY: with N = 16 the rays are a Ray16, with N = 8 a Ray8 (alignment tested); otherwise as for N = 1.
-                let found = active
-                    & unsafe {
-                        match n {
-                            16 => data.intersect16(args.primID, active, &*base.cast::<Ray16>(), &mut hits),
-                            _ => data.intersect16(args.primID, active, &(*base.cast::<Ray8>()).widened(), &mut hits),
-                        }
-                    };
+                let found = active & data.intersect16(args.primID, active, rays, &mut hits);
                 for lane in (0..n).filter(|lane| found >> lane & 1 == 1) {
                     let hit = UserHit {
                         t: hits.t[lane],
@@ -389,6 +384,7 @@ impl<'a> SceneBuilder<'a> {
             // SAFETY: as in `intersect`.
             let (args, data) = unsafe { (&*args, &*(*args).geometryUserPtr.cast::<G>()) };
             let (n, base) = (args.N as usize, args.ray.cast::<u32>());
+            let mut room = None;
             if n == 1 {
                 let ray = base.cast::<Ray>();
                 // SAFETY: as in `intersect`, without a hit behind the ray.
@@ -397,18 +393,14 @@ impl<'a> SceneBuilder<'a> {
                         (&raw mut (*ray).tfar).write(f32::NEG_INFINITY);
                     }
                 }
-            } else if n == 16 && base.cast::<Ray16>().is_aligned() || n == 8 && base.cast::<Ray8>().is_aligned() {
-                // SAFETY: `valid` has N entries; with N = 16 the rays are a Ray16, with N = 8 a Ray8 (alignment tested).
-                unsafe {
-                    let active = active(args.valid, n);
-                    let found = active
-                        & match n {
-                            16 => data.occluded16(args.primID, active, &*base.cast::<Ray16>()),
-                            _ => data.occluded16(args.primID, active, &(*base.cast::<Ray8>()).widened()),
-                        };
-                    for lane in (0..n).filter(|lane| found >> lane & 1 == 1) {
-                        base.add(TFAR * n + lane).write(f32::NEG_INFINITY.to_bits());
-                    }
+            // SAFETY: as in `intersect`.
+            } else if let Some(rays) = unsafe { sixteen(base, n, &mut room) } {
+                // SAFETY: `valid` has N entries.
+                let active = unsafe { active(args.valid, n) };
+                let found = active & data.occluded16(args.primID, active, rays);
+                for lane in (0..n).filter(|lane| found >> lane & 1 == 1) {
+                    // SAFETY: `base` is a packet of N rays, `lane` < N.
+                    unsafe { base.add(TFAR * n + lane).write(f32::NEG_INFINITY.to_bits()) };
                 }
             } else {
                 for lane in 0..n {
@@ -585,6 +577,22 @@ unsafe fn lane_of(base: *const u32, n: usize, lane: usize) -> Ray {
     unsafe {
         let words: [u32; 12] = std::array::from_fn(|field| base.add(field * n + lane).read());
         std::mem::transmute::<[u32; 12], Ray>(words)
+    }
+}
+
+/// The rays of a packet of sixteen, or of eight, which are widened into `room`; `None` for other packets.
+///
+/// # Safety
+/// `base` points to a packet of `n` rays that is not written to while the result is used.
+#[inline]
+unsafe fn sixteen(base: *const u32, n: usize, room: &mut Option<Ray16>) -> Option<&Ray16> {
+    // SAFETY: sixteen rays are a Ray16, eight a Ray8, if they are aligned; any bits are valid in them.
+    unsafe {
+        match n {
+            16 if base.cast::<Ray16>().is_aligned() => Some(&*base.cast::<Ray16>()),
+            8 if base.cast::<Ray8>().is_aligned() => Some(room.insert((*base.cast::<Ray8>()).widened())),
+            _ => None,
+        }
     }
 }
 

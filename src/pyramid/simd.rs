@@ -159,6 +159,7 @@ macro_rules! shared {
                 let most = _mm256_max_ps(most, _mm256_permute2f128_ps::<1>(most, most));
                 let most = _mm256_max_ps(most, _mm256_permute_ps::<0x4e>(most));
                 let most = _mm256_max_ps(most, _mm256_permute_ps::<0xb1>(most));
+                // `c` itself is rounded by less than a millionth.
                 let margin = _mm256_fmadd_ps(most, _mm256_set1_ps(slack), _mm256_set1_ps(c.abs() * 1e-6));
                 // (x, x′, x, x′), (y, y, y′, y′), and z, z′ in the halves.
                 let (begin, end) = (__m128::from(begin), __m128::from(end));
