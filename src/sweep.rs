@@ -34,6 +34,7 @@ mod runs;
 mod segments;
 #[allow(unsafe_code, reason = "vector instructions: measured to pay, chosen at run time")]
 mod simd;
+mod slits;
 mod state;
 mod totals;
 
@@ -43,7 +44,6 @@ use crate::flat::FlatTexture;
 use crate::flattened::Side;
 use crate::isa::Isa;
 use crate::scene::{Boundary, Scene};
-use ends::Standing;
 use flats::Flats;
 use gather::Pass;
 use grid::Geometry;
@@ -52,6 +52,7 @@ use planes::{NodeLight, Planes, Spare};
 use points::Points;
 use rayon::prelude::*;
 use reflect::Mirror;
+use slits::Slits;
 use state::{Passes, State};
 use std::sync::Mutex;
 
@@ -110,6 +111,8 @@ pub struct SweepResult {
     /// Nodes with light: those with ∇h ≠ 0 that hold a surface of the sweep, and those beside one whose own lies less than
     /// a quarter of the sweep outside it, unless h ends in a plateau there.
     pub lit: Vec<bool>,
+    /// Nodes less than a quarter of a voxel behind a luminaire that hangs as closely before a wall, in rising order: no light gets there.
+    pub covered: Vec<usize>,
     /// Reflected radiance of walls, luminaires and caps, by flat number; `None` where nothing is reflected.
     pub flats: Vec<Option<FlatTexture>>,
     /// Indirect bounces of the replicate that took the most.
@@ -216,7 +219,7 @@ pub fn sweep_resumable(
 ) -> Result<SweepResult> {
     supported(scene)?;
     let geometry = Geometry::new(&scene.field);
-    let mirror = Mirror::new(scene, &geometry);
+    let slits = Slits::new(scene);
     let stored = scene.surface.stored_sides();
     let sides = swept_sides(scene);
     let replicates = settings.replicates.max(1);
@@ -234,8 +237,8 @@ pub fn sweep_resumable(
         scene,
         settings,
         geometry: &geometry,
-        standing: mirror.standing(),
-        mirror,
+        slits: &slits,
+        mirror: Mirror::new(scene, &geometry, &slits),
         sides: &sides,
         isa: Isa::current(),
         saved,
@@ -270,8 +273,15 @@ pub fn sweep_resumable(
         })
     });
     let flats = flats.collect();
-    let sides = total.finish(&lit, done);
-    Ok(SweepResult { sides, lit, flats, bounces, residual, stopped, counts })
+    let mut sides = total.finish(&lit, done);
+    for side in &mut sides {
+        for &o in &slits.covered {
+            side.irradiance[o] = [0.0; 3];
+            side.std_error.get_mut(o).into_iter().for_each(|e| *e = 0.0);
+        }
+    }
+    let covered = slits.covered;
+    Ok(SweepResult { sides, lit, covered, flats, bounces, residual, stopped, counts })
 }
 
 /// The sides that are swept: the stored ones, and the other one if light passes to it.
@@ -312,8 +322,8 @@ struct Run<'a> {
     scene: &'a Scene,
     settings: &'a SweepSettings,
     geometry: &'a Geometry<'a>,
+    slits: &'a Slits,
     mirror: Mirror<'a>,
-    standing: Vec<Standing>,
     sides: &'a [Side],
     isa: Isa,
     saved: Stage<'a>,
@@ -410,7 +420,7 @@ impl Run<'_> {
         let pass = Pass {
             scene: self.scene,
             geometry: self.geometry,
-            standing: &self.standing,
+            standing: self.slits.standing(),
             primary: self.sides[0],
             isa: self.isa,
             spare: self.spare,

@@ -132,6 +132,10 @@ impl<'a> Walls<'a> {
         for (wall, forward) in self.ends.fronts(pf, qf) {
             let Some(flat) = wall.flat else { continue };
             let next = self.ends.stop(pf, qf, wall.tau, forward, Some(flat));
+            // What is covered shows to nobody: a texel is the mean of the rest.
+            if next.is_some_and(|n| n.covers == Some(flat)) {
+                continue;
+            }
             let reach = next.map_or(if forward { f64::INFINITY } else { f64::NEG_INFINITY }, |s| s.tau);
             out.push((flat, wall.uv), self.weight, nc, |values| {
                 fill_column(self.flats, next, values);
@@ -265,7 +269,7 @@ impl<'a> Walls<'a> {
         let x = face % 3;
         let uv = [(x + 1) % 3, (x + 2) % 3].map(|b| (local[b] / far[b]).clamp(0.0, 1.0) as f32);
         #[allow(clippy::cast_possible_truncation, reason = "six caps")]
-        Stop { tau, flat: Some(self.caps + face as u32), uv }
+        Stop { tau, flat: Some(self.caps + face as u32), uv, covers: None }
     }
 
     /// What the caps at a line's entry and exit see outside Ω.

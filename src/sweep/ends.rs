@@ -34,7 +34,15 @@ struct Met {
 
 /// Where a polygon stands.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Standing {
+pub(super) struct Standing {
+    pub place: Place,
+    /// The wall closely behind it, of which it covers a part.
+    pub covers: Option<u32>,
+}
+
+/// Where a polygon stands in the volume.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Place {
     /// Outside Ω or on its faces.
     Outside,
     /// Inside Ω: a luminaire that cuts lines.
@@ -99,7 +107,7 @@ impl Ends {
 
     /// Whether lines may be cut inside Ω.
     pub(super) fn cut(&self) -> bool {
-        self.met.iter().any(|m| m.standing != Standing::Outside)
+        self.met.iter().any(|m| m.standing.place != Place::Outside)
     }
 
     /// What line (p, q) meets first beyond `from`, towards +τ (`forward`) or −τ; polygon `except` does not
@@ -183,12 +191,12 @@ impl Ends {
     /// nearer, and shows what is in front.
     pub(super) fn cuts(&self, p: f64, q: f64, from: f64, to: f64, out: &mut Vec<(f64, [Stop; 2])>) {
         out.clear();
-        for m in self.met.iter().filter(|m| m.standing != Standing::Outside) {
+        for m in self.met.iter().filter(|m| m.standing.place != Place::Outside) {
             let tau = at(&m.tau, p, q);
             if tau > from + 1e-6 && tau < to - 1e-6 && m.edges.iter().all(|e| at(e, p, q) >= -m.slack) {
-                let at = match m.standing {
-                    Standing::Slit if m.front_plus => tau + 0.5,
-                    Standing::Slit => tau - 0.5,
+                let at = match m.standing.place {
+                    Place::Slit if m.front_plus => tau + 0.5,
+                    Place::Slit => tau - 0.5,
                     _ => tau,
                 };
                 out.push((at, [m.stop(p, q, tau, true), m.stop(p, q, tau, false)]));
@@ -202,9 +210,10 @@ impl Met {
     #[inline]
     #[allow(clippy::cast_possible_truncation, reason = "texture coordinates")]
     fn stop(&self, p: f64, q: f64, tau: f64, forward: bool) -> Stop {
-        let front = self.front_plus == forward && self.reflects;
+        let front = self.front_plus == forward;
         let uv = [0, 1].map(|a| at(&self.uv[a], p, q).clamp(0.0, 1.0) as f32);
-        Stop { tau, flat: front.then_some(self.number), uv }
+        let covers = if front { None } else { self.standing.covers };
+        Stop { tau, flat: (front && self.reflects).then_some(self.number), uv, covers }
     }
 }
 

@@ -389,6 +389,8 @@ pub(super) struct Stop {
     pub flat: Option<u32>,
     /// Texture coordinates there.
     pub uv: [f32; 2],
+    /// The wall closely behind it, if it is the back of what covers one.
+    pub covers: Option<u32>,
 }
 
 /// The radiance of a stop over isovalues; black where it shows none.

@@ -1,11 +1,10 @@
 //! What nodes reflect, as lines read it.
 
-use super::ends::{self, Standing};
 use super::flats::Flats;
 use super::grid::Geometry;
 use super::half::{self, Half4};
 use super::planes::NodeLight;
-use crate::polygon::LocalPolygon;
+use super::slits::Slits;
 use crate::scene::Scene;
 use glam::DVec3;
 use rayon::prelude::*;
@@ -15,32 +14,16 @@ use rayon::prelude::*;
 /// axis in turn across, E + ∇²E/24 is read: this much is taken off before. \[Condat05\]
 const SHARPENING: f32 = 1.0 / 24.0;
 
-/// A node less than this share of a voxel behind a luminaire is what lines before it read, not those behind.
-const SLIT: f64 = 0.25;
-
 /// Turns irradiance into radiance.
 pub(super) struct Mirror<'a> {
     scene: &'a Scene,
     geometry: &'a Geometry<'a>,
-    /// Nodes closely behind a luminaire, in rising order, and the node in front of it each shows instead.
-    hidden: Vec<(usize, usize)>,
-    /// Luminaires that hide some.
-    hiding: Vec<u32>,
+    slits: &'a Slits,
 }
 
 impl<'a> Mirror<'a> {
-    pub(super) fn new(scene: &'a Scene, geometry: &'a Geometry<'a>) -> Self {
-        let mut hidden = Vec::new();
-        let mut hiding = Vec::new();
-        for &number in scene.luminaires() {
-            let nodes = hidden_by(scene, number);
-            if !nodes.is_empty() {
-                hiding.push(number);
-            }
-            hidden.extend(nodes);
-        }
-        hidden.sort_unstable();
-        Self { scene, geometry, hidden, hiding }
+    pub(super) fn new(scene: &'a Scene, geometry: &'a Geometry<'a>, slits: &'a Slits) -> Self {
+        Self { scene, geometry, slits }
     }
 
     /// Which nodes of a row along x have light of their own to reflect: 1, the others 0.
@@ -49,19 +32,9 @@ impl<'a> Mirror<'a> {
         let nodes = row * nx..(row + 1) * nx;
         to.clear();
         to.extend(self.geometry.normals[nodes.clone()].iter().map(|n| if *n != 0 { 1.0 } else { 0.0 }));
-        let first = self.hidden.partition_point(|h| h.0 < nodes.start);
-        self.hidden[first..].iter().take_while(|h| h.0 < nodes.end).for_each(|h| to[h.0 - nodes.start] = 0.0);
-    }
-
-    /// Where polygons stand.
-    pub(super) fn standing(&self) -> Vec<Standing> {
-        let inside = ends::inside(self.scene);
-        let stands = |(number, inside)| match inside {
-            false => Standing::Outside,
-            true if self.hiding.contains(&number) => Standing::Slit,
-            true => Standing::Inside,
-        };
-        (0..).zip(inside).map(stands).collect()
+        let hidden = &self.slits.hidden;
+        let first = hidden.partition_point(|h| h.0 < nodes.start);
+        hidden[first..].iter().take_while(|h| h.0 < nodes.end).for_each(|h| to[h.0 - nodes.start] = 0.0);
     }
 
     /// B = Le + ρ/π Σ scale · irradiance of the sides, sharpened, and filled where no surface is; packs the flats too.
@@ -142,7 +115,7 @@ impl<'a> Mirror<'a> {
                     }
                 }
             });
-            for &(node, front) in &self.hidden {
+            for &(node, front) in &self.slits.hidden {
                 b[node] = b[front];
             }
             self.geometry.fill(&mut b);
@@ -183,45 +156,10 @@ fn sharpen(light: &mut Cross, shown: &Cross, laplacian: &mut Vec<f32>) {
     here.iter_mut().zip(laplacian).for_each(|(e, l)| *e = (*e - SHARPENING * *l).max(0.0));
 }
 
-/// Nodes less than [`SLIT`] voxels behind luminaire `number`, or in its plane, and the nodes in front of it.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "nodes of the lattice")]
-fn hidden_by(scene: &Scene, number: u32) -> Vec<(usize, usize)> {
-    let lattice = scene.lattice();
-    let mut out = Vec::new();
-    let light = &scene.polygons()[number as usize];
-    let along = lattice.axes().transpose() * light.normal();
-    let size = along.abs();
-    let axis = if size.z >= size.x && size.z >= size.y { 2 } else { usize::from(size.y >= size.x) };
-    let step = DVec3::AXES[axis] * along[axis].signum();
-    let (lo, hi) = LocalPolygon::new(light, lattice).bounds();
-    let lo = (lo - SLIT).ceil().max(DVec3::ZERO);
-    let hi = (hi + SLIT).floor().min(lattice.far());
-    let range = |a: usize| (0..).map(move |n| lo[a] + f64::from(n)).take_while(move |x| *x <= hi[a]);
-    for z in range(2) {
-        for (y, x) in range(1).flat_map(|y| range(0).map(move |x| (y, x))) {
-            let node = DVec3::new(x, y, z);
-            let front = node + step;
-            // Voxels from the plane, along the axis.
-            let world = lattice.to_world(node);
-            let depth = (light.vertices()[0] - world).dot(light.normal()) / size[axis];
-            let foot = lattice.to_world(node + depth * step);
-            let within = front.cmpge(DVec3::ZERO).all() && front.cmple(lattice.far()).all();
-            if (0.0..SLIT).contains(&depth) && light.contains(foot) && within {
-                let at = |p: DVec3| lattice.offset(p.x as usize, p.y as usize, p.z as usize);
-                out.push((at(node), at(front)));
-            }
-        }
-    }
-    out
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::{Field, Sweep};
     use crate::rng::{Rng, Stage};
-    use crate::scene::{Boundary, Surface, cornell_box};
-    use crate::volume::{Lattice, Samples, Volume};
 
     /// Of a field whose second differences are known: read as lines do, at any place, it is itself on average. Without sharpening the
     /// mean would be off by 0.083.
@@ -277,29 +215,6 @@ mod tests {
             sharpen(&mut sharp, &rows(&is, row), &mut Vec::new());
             for (sharp, _) in sharp[0].iter().zip(&shown[10 * row..]).filter(|x| *x.1) {
                 assert_eq!(*sharp, 0.7);
-            }
-        }
-    }
-
-    /// The luminaire of the default box covers nodes 12 to 28 of 41, a thousandth of the box below the ceiling.
-    #[test]
-    fn nodes_closely_behind_a_luminaire_show_those_in_front() {
-        for (up, depth) in [(true, 40), (false, 0)] {
-            let step = DVec3::new(0.1, 0.1, if up { 0.1 } else { -0.1 });
-            let lattice = Lattice::aligned([41; 3], DVec3::ZERO, DVec3::splat(0.1)).unwrap();
-            let lattice =
-                Lattice::new([41; 3], DVec3::ZERO, lattice.axes() * glam::DMat3::from_diagonal(step * 10.0)).unwrap();
-            let walls = cornell_box(&lattice, 0.0).unwrap();
-            let samples = Samples::F64((0..lattice.len()).map(|o| o as f64).collect());
-            let volume = Volume::new("x", lattice.clone(), samples).unwrap();
-            let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
-            let scene = Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap();
-            let hidden = hidden_by(&scene, scene.luminaires()[0]);
-            assert!((15 * 15..=17 * 17).contains(&hidden.len()), "{}", hidden.len());
-            for (node, front) in hidden {
-                let ([i, j, k], [x, y, z]) = (lattice.ijk(node), lattice.ijk(front));
-                assert!((12..=28).contains(&i) && (12..=28).contains(&j) && k == depth);
-                assert!((x, y) == (i, j) && z == depth.abs_diff(1), "{x} {y} {z}");
             }
         }
     }

@@ -1,0 +1,136 @@
+//! Slits: what is so closely behind a luminaire that no slice of nodes tells one from the other.
+
+use super::ends::{self, Place, Standing};
+use crate::polygon::{LocalPolygon, Polygon};
+use crate::scene::Scene;
+use crate::volume::Lattice;
+use glam::DVec3;
+
+/// A slit is less than this share of a voxel wide.
+const SLIT: f64 = 0.25;
+
+/// The slits behind all luminaires.
+pub(super) struct Slits {
+    /// Nodes within one, in rising order, and the node in front of the luminaire that each shows to lines instead of itself.
+    pub hidden: Vec<(usize, usize)>,
+    /// Those of them between a luminaire and the wall that it covers, in rising order: no light gets there.
+    pub covered: Vec<usize>,
+    standing: Vec<Standing>,
+}
+
+impl Slits {
+    pub(super) fn new(scene: &Scene) -> Self {
+        let (mut hidden, mut covered) = (Vec::new(), Vec::new());
+        let outside = Standing { place: Place::Outside, covers: None };
+        let mut standing = vec![outside; scene.polygons().len()];
+        for (standing, inside) in standing.iter_mut().zip(ends::inside(scene)) {
+            standing.place = if inside { Place::Inside } else { Place::Outside };
+        }
+        for &number in scene.luminaires() {
+            let standing = &mut standing[number as usize];
+            let nodes = hidden_by(scene, number);
+            standing.covers = covered_by(scene, number);
+            if standing.covers.is_some() {
+                covered.extend(nodes.iter().map(|(node, _)| *node));
+            }
+            if standing.place == Place::Inside && !nodes.is_empty() {
+                standing.place = Place::Slit;
+            }
+            hidden.extend(nodes);
+        }
+        hidden.sort_unstable();
+        covered.sort_unstable();
+        covered.dedup();
+        Self { hidden, covered, standing }
+    }
+
+    /// Where polygons stand.
+    pub(super) fn standing(&self) -> &[Standing] {
+        &self.standing
+    }
+}
+
+/// The wall that hangs less than [`SLIT`] voxels behind all of luminaire `number` and faces where it faces. What the luminaire hides of
+/// it lights nothing, and would darken what its texels show beside the luminaire.
+#[allow(clippy::cast_possible_truncation, reason = "fewer than 2¹⁶ polygons")]
+fn covered_by(scene: &Scene, number: u32) -> Option<u32> {
+    let light = &scene.polygons()[number as usize];
+    if !light.opaque_back {
+        return None;
+    }
+    let (_, voxel) = voxel_along(scene.lattice(), light);
+    let behind = |wall: &Polygon| {
+        let depth = |x: &DVec3| (*x - wall.vertices()[0]).dot(wall.normal());
+        light.normal().dot(wall.normal()) > 0.0
+            && light.vertices().iter().all(|x| depth(x) > 0.0 && depth(x) < SLIT * voxel && wall.contains(*x))
+    };
+    scene.polygons().iter().position(behind).map(|wall| wall as u32)
+}
+
+/// The lattice's axis that is nearest to the normal of a polygon, and how far apart its slices are along that.
+fn voxel_along(lattice: &Lattice, polygon: &Polygon) -> (usize, f64) {
+    let size = (lattice.axes().transpose() * polygon.normal()).abs();
+    let axis = if size.z >= size.x && size.z >= size.y { 2 } else { usize::from(size.y >= size.x) };
+    (axis, size[axis])
+}
+
+/// Nodes less than [`SLIT`] voxels behind luminaire `number`, or in its plane, and the nodes in front of it.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "nodes of the lattice")]
+fn hidden_by(scene: &Scene, number: u32) -> Vec<(usize, usize)> {
+    let lattice = scene.lattice();
+    let mut out = Vec::new();
+    let light = &scene.polygons()[number as usize];
+    let (axis, voxel) = voxel_along(lattice, light);
+    let step = DVec3::AXES[axis] * lattice.axes().col(axis).dot(light.normal()).signum();
+    let (lo, hi) = LocalPolygon::new(light, lattice).bounds();
+    let lo = (lo - SLIT).ceil().max(DVec3::ZERO);
+    let hi = (hi + SLIT).floor().min(lattice.far());
+    let range = |a: usize| (0..).map(move |n| lo[a] + f64::from(n)).take_while(move |x| *x <= hi[a]);
+    for z in range(2) {
+        for (y, x) in range(1).flat_map(|y| range(0).map(move |x| (y, x))) {
+            let node = DVec3::new(x, y, z);
+            let front = node + step;
+            // Voxels from the plane, along the axis.
+            let world = lattice.to_world(node);
+            let depth = (light.vertices()[0] - world).dot(light.normal()) / voxel;
+            let foot = lattice.to_world(node + depth * step);
+            let within = front.cmpge(DVec3::ZERO).all() && front.cmple(lattice.far()).all();
+            if (0.0..SLIT).contains(&depth) && light.contains(foot) && within {
+                let at = |p: DVec3| lattice.offset(p.x as usize, p.y as usize, p.z as usize);
+                out.push((at(node), at(front)));
+            }
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::{Field, Sweep};
+    use crate::scene::{Boundary, Surface, cornell_box};
+    use crate::volume::{Samples, Volume};
+
+    /// The luminaire of the default box covers nodes 12 to 28 of 41, a thousandth of the box below the ceiling.
+    #[test]
+    fn nodes_closely_behind_a_luminaire_show_those_in_front() {
+        for (up, depth) in [(true, 40), (false, 0)] {
+            let step = DVec3::new(0.1, 0.1, if up { 0.1 } else { -0.1 });
+            let lattice = Lattice::aligned([41; 3], DVec3::ZERO, DVec3::splat(0.1)).unwrap();
+            let lattice =
+                Lattice::new([41; 3], DVec3::ZERO, lattice.axes() * glam::DMat3::from_diagonal(step * 10.0)).unwrap();
+            let walls = cornell_box(&lattice, 0.0).unwrap();
+            let samples = Samples::F64((0..lattice.len()).map(|o| o as f64).collect());
+            let volume = Volume::new("x", lattice.clone(), samples).unwrap();
+            let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+            let scene = Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap();
+            let hidden = hidden_by(&scene, scene.luminaires()[0]);
+            assert!((15 * 15..=17 * 17).contains(&hidden.len()), "{}", hidden.len());
+            for (node, front) in hidden {
+                let ([i, j, k], [x, y, z]) = (lattice.ijk(node), lattice.ijk(front));
+                assert!((12..=28).contains(&i) && (12..=28).contains(&j) && k == depth);
+                assert!((x, y) == (i, j) && z == depth.abs_diff(1), "{x} {y} {z}");
+            }
+        }
+    }
+}
