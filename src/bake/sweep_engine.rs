@@ -2,6 +2,7 @@
 //! next to luminaires.
 
 use super::bands::Band;
+use super::contacts::{Contacts, Wedge};
 use super::grid_points::{Beside, Counts, STAND_INS};
 use super::photon_engine::{Job, STAGES};
 use super::{BakeSettings, Lit, stages};
@@ -28,6 +29,9 @@ const STEPS: f64 = 1000.0;
 /// The shares of the photon engine's gather and shadow rays that a sample beside steep edges takes: each point there is fitted
 /// to samples of its own and its neighbours'.
 const SHARES: [u32; 2] = [4, 8];
+
+/// Those that a wall takes at a contact: only a part of what arrives there is seen again.
+const CONTACT_SHARES: [u32; 2] = [2, 4];
 
 /// Points nearer to a luminaire than this many voxels are sampled by exact rays: on its front light falls off within a voxel,
 /// and what lies behind it is lit by lines that a sweep mixes a voxel further.
@@ -73,13 +77,14 @@ pub(super) fn light(
     let fitted = |o: usize| masks[o] == Mask::Filled && !own[o];
     let beside = Beside::new(&scene.field, lattice, fitted, settings.seed);
     let near = beside_luminaires(scene, masks, &covered);
+    let contacts = Contacts::new(scene, |o| masks[o] == Mask::Valid && own[o] && covered.binary_search(&o).is_err());
     // What the sweep knows is what rays from these points gather.
-    let gathered = |side| swept.iter().find(|s| s.side == side && beside.len() + near.len() > 0);
+    let gathered = |side| swept.iter().find(|s| s.side == side && beside.len() + near.len() + contacts.len() > 0);
     let nodes = [Side::Lower, Side::Higher].map(|side| Some(widened(lattice, masks, &gathered(side)?.irradiance)));
     let cache = RadianceCache::from_parts(nodes, flats);
     let mut sides = Vec::new();
-    for s in swept {
-        let stage = progress.stage("samples", (beside.len() + near.len()) as u64);
+    for mut s in swept {
+        let stage = progress.stage("samples", (beside.len() + near.len() + contacts.len()) as u64);
         let seed = settings.seed;
         let gather = |share: u32| Indirect::Gather(&cache, (settings.gather_rays / share).max(2));
         let shadow = |share: u32| (settings.shadow_rays / share).max(2);
@@ -95,8 +100,16 @@ pub(super) fn light(
         // Keys of a point beside; none of these is one.
         let place = |n: usize| ((STAND_INS * near[n]) as u64, local_position(&scene.field, lattice, near[n]).as_vec3());
         let sampled = sample_places(&sampler, near.len(), &place, Stage::UNSAVED, 0, &|n| stage.tick(n));
-        stage.end()?;
         lit.count(Counts::from(&sampled));
+        let wedge = Wedge {
+            tracer: &tracer,
+            cache: &cache,
+            gather_rays: (settings.gather_rays / CONTACT_SHARES[0]).max(2),
+            shadow_rays: shadow(CONTACT_SHARES[1]),
+            seed,
+        };
+        lit.count(contacts.solve(s.side, &wedge, (&mut s.irradiance, &mut s.std_error), &|n| stage.tick(n)));
+        stage.end()?;
         let mask = |o: usize| if own[o] { masks[o] } else { Mask::Empty };
         let mut grid = swept_grid(mask, outgoing(scene, s.irradiance), s.std_error);
         for (&o, sample) in near.iter().zip(&sampled.samples) {

@@ -1,0 +1,155 @@
+//! Grid points where level sets meet a wall on Ω's faces. Light falls like a power of the distance there, far below a texel of the wall,
+//! and a point on the face itself would see a texel's mean at its very own place.
+//!
+//! At the contact the hemisphere of either surface is cut in two: directions into the wedge between them, and directions that
+//! meet the other one at distance 0. With N the surface's normal, M the wall's, a share F = (1 − N·M)/2 of either irradiance comes from
+//! the other surface, so that E = D + F ρ_w E_w and E_w = D_w + F ρ E, D being what the wedge brings: two equations for E and E_w.
+//! \[Lambert1760\]
+
+use super::grid_points::{Counts, STAND_INS};
+use crate::direct::{Receiver, direct_irradiance, luminance};
+use crate::flattened::{Departure, Side, Target};
+use crate::gather::gathered_irradiance;
+use crate::mask::local_position;
+use crate::radiance_cache::RadianceCache;
+use crate::rng::Stage;
+use crate::scene::{Boundary, Scene};
+use crate::tracer::Tracer;
+use glam::DVec3;
+use rayon::prelude::*;
+use std::f64::consts::PI;
+
+/// A point this near to a wall, in voxels, lies on it.
+const ON: f64 = 1e-3;
+/// Walls that a point can lie on.
+const MOST: usize = 3;
+/// The share of light between two surfaces that they keep, at most.
+const MOST_KEPT: f64 = 0.99;
+
+/// Lattice points on walls that reflect.
+pub(super) struct Contacts<'a> {
+    scene: &'a Scene,
+    /// Points in rising order, and the walls each lies on.
+    points: Vec<(usize, [Option<u32>; MOST])>,
+}
+
+/// How light at contacts is gathered.
+pub(super) struct Wedge<'a, T> {
+    pub tracer: &'a T,
+    pub cache: &'a RadianceCache,
+    pub gather_rays: u32,
+    pub shadow_rays: u32,
+    pub seed: u64,
+}
+
+impl<'a> Contacts<'a> {
+    /// The points of the scene's lattice that `holds` picks and that lie on walls. None if Ω's faces are capped.
+    #[allow(clippy::cast_possible_truncation, reason = "fewer than 2¹⁶ polygons")]
+    pub(super) fn new(scene: &'a Scene, holds: impl Fn(usize) -> bool + Sync) -> Self {
+        let lattice = scene.lattice();
+        let near = ON * lattice.spacing().min_element();
+        let dims = lattice.dims();
+        let centre = lattice.to_world(0.5 * lattice.far());
+        let walls: Vec<u32> = (0..scene.polygons().len() as u32)
+            .filter(|&w| {
+                let wall = &scene.polygons()[w as usize];
+                wall.albedo != DVec3::ZERO && scene.boundary == Boundary::Open
+            })
+            .collect();
+        let on_face = |o: usize| lattice.ijk(o).into_iter().zip(dims).any(|(i, n)| i == 0 || i == n - 1);
+        let touching = |o: usize| {
+            let x = lattice.to_world(local_position(&scene.field, lattice, o));
+            let touches = |w: &u32| {
+                let wall = &scene.polygons()[*w as usize];
+                wall.distance(x) < near && (centre - x).dot(wall.normal()) > 0.0
+            };
+            let mut touched = walls.iter().copied().filter(touches);
+            let found: [Option<u32>; MOST] = std::array::from_fn(|_| touched.next());
+            found[0].map(|_| (o, found))
+        };
+        let points = (0..lattice.len()).into_par_iter().with_min_len(1 << 12);
+        let points = points.filter(|&o| !walls.is_empty() && on_face(o) && holds(o)).filter_map(touching).collect();
+        Self { scene, points }
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.points.len()
+    }
+
+    /// Solves for the light of `side` at all points. `white` holds what a white surface would reflect at every node of the lattice, with
+    /// walls as their textures show them, which is also what the cache of `wedge` holds; `std_error`, unless it is empty, the standard error of
+    /// the luminance that leaves.
+    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+    pub(super) fn solve<T: Tracer>(
+        &self,
+        side: Side,
+        wedge: &Wedge<T>,
+        (white, std_error): (&mut [[f32; 3]], &mut [f32]),
+        tick: &(dyn Fn(u64) -> bool + Sync),
+    ) -> Counts {
+        let points = self.points.par_iter().with_max_len(64);
+        let solved: Vec<Option<(DVec3, f64, Counts)>> = points
+            .map(|&(o, walls)| {
+                if !tick(1) {
+                    return None;
+                }
+                let (mut counts, mut variance) = (Counts::default(), 0.0);
+                let mut light = DVec3::from_array(white[o].map(f64::from));
+                for (n, wall) in walls.into_iter().flatten().enumerate() {
+                    let (met, added) = self.meet((o, side), (n, wall), wedge, light, &mut counts)?;
+                    (light, variance) = (met, variance + added);
+                }
+                Some((light, variance, counts))
+            })
+            .collect();
+        let mut total = Counts::default();
+        for (&(o, _), solved) in self.points.iter().zip(solved) {
+            let Some((light, variance, counts)) = solved else { continue };
+            white[o] = light.as_vec3().to_array();
+            std_error.get_mut(o).into_iter().for_each(|e| *e = f64::from(*e).hypot(variance.sqrt()) as f32);
+            total += counts;
+        }
+        total
+    }
+
+    /// What a white surface would reflect at point `o` on `wall`, the `n`th of its walls, if it would reflect `white` with that wall as its
+    /// texture shows it, and the variance that this adds to the luminance that leaves. `None` where ∇h vanishes.
+    #[allow(clippy::cast_possible_truncation, reason = "positions and isovalues are f32")]
+    fn meet<T: Tracer>(
+        &self,
+        (o, side): (usize, Side),
+        (n, wall): (usize, u32),
+        wedge: &Wedge<T>,
+        white: DVec3,
+        counts: &mut Counts,
+    ) -> Option<(DVec3, f64)> {
+        let scene = self.scene;
+        let Wedge { tracer, cache, gather_rays, shadow_rays, seed } = *wedge;
+        let x = local_position(&scene.field, scene.lattice(), o);
+        let isovalue = scene.field.value(x) as f32;
+        let polygon = &scene.polygons()[wall as usize];
+        // The share of either hemisphere that the other surface fills. \[Lambert1760\]
+        let share = 0.5 * (1.0 - scene.normal(x, side)?.dot(polygon.normal()));
+        let receiver = Receiver {
+            position: x.as_vec3(),
+            normal: polygon.normal(),
+            isovalue,
+            // The level set: what of the wall's hemisphere it fills is met at distance 0.
+            departure: Departure::Surface(side),
+        };
+        let index = ((STAND_INS * o + 1 + n) * 2 + side.index()) as u64;
+        let direct = direct_irradiance(scene, tracer, &receiver, shadow_rays, (seed, Stage::Direct, index));
+        let gathered = gathered_irradiance(scene, tracer, cache, &receiver, gather_rays, (seed, index)).estimate;
+        counts.rays += direct.rays + gathered.rays;
+        counts.misses += gathered.misses;
+        let shown = cache.lookup(scene, Target::Polygon(wall), x, isovalue, &mut counts.misses);
+        let level_set = scene.surface.albedo.at(f64::from(isovalue));
+        // D_w/π, without what the level set has lit the wall by so far.
+        let opening = ((direct.mean + gathered.mean) / PI - share * level_set * white).max(DVec3::ZERO);
+        // Of white surfaces that touch face to face nothing would ever be lost.
+        let lost = 1.0 - (share * share * polygon.albedo * level_set).min(DVec3::splat(MOST_KEPT));
+        let met = (white + share * (polygon.albedo * opening - shown)) / lost;
+        let gain = luminance(level_set * share * polygon.albedo / lost) / PI;
+        Some((met.max(DVec3::ZERO), gain * gain * (direct.variance + gathered.variance)))
+    }
+}
