@@ -126,6 +126,10 @@ impl<T: Tracer> Sampler<'_, T> {
             isovalue: isovalue as f32,
             departure: Departure::Surface(side),
         };
+        if scene.covers(scene.lattice().to_world(p)) {
+            let radiance = scene.surface.emission.as_vec3();
+            return Some(RadianceSample { position, radiance, ..RadianceSample::default() });
+        }
         let index = key * 2 + side.index() as u64;
         let direct = direct_irradiance(scene, tracer, &receiver, self.shadow_rays, (self.seed, Stage::Direct, index));
         counts[0] += direct.rays;

@@ -2,9 +2,11 @@
 //! volume.
 
 mod companion;
+mod cover;
 mod obj;
 
 pub use companion::{Companion, Member, Policy};
+pub(crate) use cover::{SLIT, voxel_along};
 pub use obj::{Placement, read_context, read_obj};
 
 use crate::error::{Error, Result};

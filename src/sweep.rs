@@ -111,8 +111,6 @@ pub struct SweepResult {
     /// Nodes with light: those with ∇h ≠ 0 that hold a surface of the sweep, and those beside one whose own lies less than
     /// a quarter of the sweep outside it, unless h ends in a plateau there.
     pub lit: Vec<bool>,
-    /// Nodes less than a quarter of a voxel behind a luminaire that hangs as closely before a wall, in rising order: no light gets there.
-    pub covered: Vec<usize>,
     /// Reflected radiance of walls, luminaires and caps, by flat number; `None` where nothing is reflected.
     pub flats: Vec<Option<FlatTexture>>,
     /// Indirect bounces of the replicate that took the most.
@@ -280,8 +278,7 @@ pub fn sweep_resumable(
             side.std_error.get_mut(o).into_iter().for_each(|e| *e = 0.0);
         }
     }
-    let covered = slits.covered;
-    Ok(SweepResult { sides, lit, covered, flats, bounces, residual, stopped, counts })
+    Ok(SweepResult { sides, lit, flats, bounces, residual, stopped, counts })
 }
 
 /// The sides that are swept: the stored ones, and the other one if light passes to it.

@@ -65,7 +65,8 @@ impl<'a> Contacts<'a> {
             };
             let mut touched = walls.iter().copied().filter(touches);
             let found: [Option<u32>; MOST] = std::array::from_fn(|_| touched.next());
-            found[0].map(|_| (o, found))
+            // Behind a luminaire that covers the wall it is dark.
+            found[0].filter(|_| !scene.covers(x)).map(|_| (o, found))
         };
         let points = (0..lattice.len()).into_par_iter().with_min_len(1 << 12);
         let points = points.filter(|&o| !walls.is_empty() && on_face(o) && holds(o)).filter_map(touching).collect();

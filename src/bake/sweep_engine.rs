@@ -67,7 +67,7 @@ pub(super) fn light(
     lit.spend(clock, |s| &mut s.sweep);
     lit.sweep_queries = swept.counts.gather_rays + swept.counts.shadow_rays;
 
-    let SweepResult { sides: mut swept, lit: own, covered, flats, .. } = swept;
+    let SweepResult { sides: mut swept, lit: own, flats, .. } = swept;
     swept.iter_mut().for_each(|s| whiten(&own, &mut s.irradiance));
     let clock = Clock::start();
     let tracer = GraphTracer::new(device, scene)?;
@@ -76,8 +76,8 @@ pub(super) fn light(
     // Just outside the sweep, light on the point's own level set is a better end of interpolation than any fit.
     let fitted = |o: usize| masks[o] == Mask::Filled && !own[o];
     let beside = Beside::new(&scene.field, lattice, fitted, settings.seed);
-    let near = beside_luminaires(scene, masks, &covered);
-    let contacts = Contacts::new(scene, |o| masks[o] == Mask::Valid && own[o] && covered.binary_search(&o).is_err());
+    let near = beside_luminaires(scene, masks);
+    let contacts = Contacts::new(scene, |o| masks[o] == Mask::Valid && own[o]);
     // What the sweep knows is what rays from these points gather.
     let gathered = |side| swept.iter().find(|s| s.side == side && beside.len() + near.len() + contacts.len() > 0);
     let nodes = [Side::Lower, Side::Higher].map(|side| Some(widened(lattice, masks, &gathered(side)?.irradiance)));
@@ -137,16 +137,14 @@ fn outgoing(scene: &Scene, mut white: Vec<[f32; 3]>) -> Vec<[f32; 3]> {
     white
 }
 
-/// Valid points less than [`NEAR`] voxels from a luminaire, but for those that it covers.
-fn beside_luminaires(scene: &Scene, masks: &[Mask], covered: &[usize]) -> Vec<usize> {
+/// Valid points less than [`NEAR`] voxels from a luminaire.
+fn beside_luminaires(scene: &Scene, masks: &[Mask]) -> Vec<usize> {
     let lattice = scene.lattice();
     let reach = NEAR * lattice.spacing().max_element();
     let lights: Vec<&Polygon> = scene.luminaires().iter().map(|&l| &scene.polygons()[l as usize]).collect();
     let near = |&o: &usize| {
         let x = lattice.to_world(local_position(&scene.field, lattice, o));
-        masks[o] == Mask::Valid
-            && lights.iter().any(|light| light.distance(x) < reach)
-            && covered.binary_search(&o).is_err()
+        masks[o] == Mask::Valid && lights.iter().any(|light| light.distance(x) < reach)
     };
     (0..masks.len()).into_par_iter().with_min_len(1 << 12).filter(near).collect()
 }

@@ -8,6 +8,7 @@ use crate::field::Field;
 use crate::flat::{self, Flat, FlatTexture, Texel};
 use crate::flattened::{Side, split_face};
 use crate::photon::FlatPhoton;
+use crate::polygon::Polygon;
 use crate::rng::Stage;
 use crate::scene::Scene;
 use crate::tracer::Tracer;
@@ -30,7 +31,8 @@ pub(super) fn fill_flat<T: Tracer>(
     let dims = flat.resolution(settings.flat_resolution, settings.isovalue_resolution);
     let centres = FlatTexture::black(dims);
     let lattice = scene.lattice();
-    let parts = flat.texels(dims);
+    let mut parts = flat.texels(dims);
+    hide(scene, number, &flat, dims, &mut parts);
     let solid = Solid::new(scene, number, &flat);
     let open = solid.as_ref().and_then(|s| Open::new(s, dims));
     // Where no solid stands, none holds photons.
@@ -85,6 +87,23 @@ pub(super) fn fill_flat<T: Tracer>(
     };
     // A texture to be averaged is not clamped at 0: that would brighten what few photons reach.
     (texture(GATHERED, f64::NEG_INFINITY), texture(SHOWN, 0.0))
+}
+
+/// Takes off each texel what luminaires closely before the flat hide of it.
+fn hide(scene: &Scene, number: usize, flat: &Flat, [nu, nv, _]: [usize; 3], parts: &mut [Texel]) {
+    let wall = u32::try_from(number).ok().filter(|_| number < scene.polygons().len());
+    let covering: Vec<&Polygon> = wall.into_iter().flat_map(|wall| scene.covering(wall)).collect();
+    if covering.is_empty() {
+        return;
+    }
+    for (texel, part) in parts.iter_mut().enumerate() {
+        let hidden = (0..PLACES * PLACES).filter(|n| {
+            let [a, b] = [n % PLACES, n / PLACES].map(|n| (n as f64 + 0.5) / PLACES as f64);
+            let x = flat.at([((texel % nu) as f64 + a) / nu as f64, ((texel / nu) as f64 + b) / nv as f64]);
+            covering.iter().any(|light| light.contains(x))
+        });
+        part.covered *= 1.0 - hidden.count() as f64 / (PLACES * PLACES) as f64;
+    }
 }
 
 /// Where on a flat solids stand: light reaches a wall on Ω's faces where the level sets' outer sides are, and a cap where

@@ -1,13 +1,9 @@
 //! Slits: what is so closely behind a luminaire that no slice of nodes tells one from the other.
 
 use super::ends::{self, Place, Standing};
-use crate::polygon::{LocalPolygon, Polygon};
-use crate::scene::Scene;
-use crate::volume::Lattice;
+use crate::polygon::LocalPolygon;
+use crate::scene::{SLIT, Scene, voxel_along};
 use glam::DVec3;
-
-/// A slit is less than this share of a voxel wide.
-const SLIT: f64 = 0.25;
 
 /// The slits behind all luminaires.
 pub(super) struct Slits {
@@ -29,7 +25,7 @@ impl Slits {
         for &number in scene.luminaires() {
             let standing = &mut standing[number as usize];
             let nodes = hidden_by(scene, number);
-            standing.covers = covered_by(scene, number);
+            standing.covers = scene.covered_wall(number);
             if standing.covers.is_some() {
                 covered.extend(nodes.iter().map(|(node, _)| *node));
             }
@@ -48,30 +44,6 @@ impl Slits {
     pub(super) fn standing(&self) -> &[Standing] {
         &self.standing
     }
-}
-
-/// The wall that hangs less than [`SLIT`] voxels behind all of luminaire `number` and faces where it faces. What the luminaire hides of
-/// it lights nothing, and would darken what its texels show beside the luminaire.
-#[allow(clippy::cast_possible_truncation, reason = "fewer than 2¹⁶ polygons")]
-fn covered_by(scene: &Scene, number: u32) -> Option<u32> {
-    let light = &scene.polygons()[number as usize];
-    if !light.opaque_back {
-        return None;
-    }
-    let (_, voxel) = voxel_along(scene.lattice(), light);
-    let behind = |wall: &Polygon| {
-        let depth = |x: &DVec3| (*x - wall.vertices()[0]).dot(wall.normal());
-        light.normal().dot(wall.normal()) > 0.0
-            && light.vertices().iter().all(|x| depth(x) > 0.0 && depth(x) < SLIT * voxel && wall.contains(*x))
-    };
-    scene.polygons().iter().position(behind).map(|wall| wall as u32)
-}
-
-/// The lattice's axis that is nearest to the normal of a polygon, and how far apart its slices are along that.
-fn voxel_along(lattice: &Lattice, polygon: &Polygon) -> (usize, f64) {
-    let size = (lattice.axes().transpose() * polygon.normal()).abs();
-    let axis = if size.z >= size.x && size.z >= size.y { 2 } else { usize::from(size.y >= size.x) };
-    (axis, size[axis])
 }
 
 /// Nodes less than [`SLIT`] voxels behind luminaire `number`, or in its plane, and the nodes in front of it.
@@ -109,7 +81,7 @@ mod tests {
     use super::*;
     use crate::field::{Field, Sweep};
     use crate::scene::{Boundary, Surface, cornell_box};
-    use crate::volume::{Samples, Volume};
+    use crate::volume::{Lattice, Samples, Volume};
 
     /// The luminaire of the default box covers nodes 12 to 28 of 41, a thousandth of the box below the ceiling.
     #[test]

@@ -1,4 +1,4 @@
-//! Light by sweeps next to walls, whose textures are coarser than the grid: bakes against path tracing at the grid's points.
+//! Light next to walls, whose textures are coarser than the grid: bakes by both engines against path tracing at the grid's points.
 
 use glam::DVec3;
 use isolume::bake::{BakeOptions, BakeSettings, Engine, bake};
@@ -33,9 +33,10 @@ struct Errors {
 }
 
 /// Errors of a bake of `scene` at every `stride`th point that `chosen` picks.
-fn errors(scene: &Scene, stride: usize, paths: u32, chosen: impl Fn(DVec3) -> bool) -> Errors {
+fn errors(scene: &Scene, engine: Engine, stride: usize, paths: u32, chosen: impl Fn(DVec3) -> bool) -> Errors {
     let options = BakeOptions {
-        engine: Some(Engine::Sweep),
+        engine: Some(engine),
+        photons: (engine == Engine::Photon).then_some(1 << 20),
         directions: Some(256),
         light_points: Some(64),
         gather_rays: Some(64),
@@ -73,12 +74,14 @@ fn a_luminaire_does_not_darken_the_ceiling_around_it() {
     let scene = waves();
     let light = &scene.polygons()[0];
     let voxel = scene.lattice().spacing().x;
-    let errors = errors(&scene, 2, 1024, |p| {
-        let distance = light.distance(scene.lattice().to_world(p)) / voxel;
-        (1.5..4.0).contains(&distance)
-    });
-    println!("{errors:?}");
-    assert!(errors.points > 200 && errors.mean.abs() < 0.01);
+    for engine in [Engine::Sweep, Engine::Photon] {
+        let errors = errors(&scene, engine, 2, 1024, |p| {
+            let distance = light.distance(scene.lattice().to_world(p)) / voxel;
+            (1.5..4.0).contains(&distance)
+        });
+        println!("{engine:?}: {errors:?}");
+        assert!(errors.points > 200 && errors.mean.abs() < 0.01);
+    }
 }
 
 /// Where level sets meet walls at all angles, light on the face itself is that of the edge between the two, not of a texel's mean.
@@ -89,7 +92,7 @@ fn light_on_a_wall_is_that_of_the_edge() {
     let light = &scene.polygons()[0];
     let voxel = scene.lattice().spacing().x;
     // The front of the default box is open.
-    let errors = errors(&scene, 7, 1024, |p| {
+    let errors = errors(&scene, Engine::Sweep, 7, 1024, |p| {
         let on = p.x == 0.0 || p.x == far.x || p.y == far.y || p.z == 0.0 || p.z == far.z;
         on && light.distance(scene.lattice().to_world(p)) > 3.0 * voxel
     });
@@ -107,12 +110,15 @@ fn it_is_dark_behind_a_luminaire() {
         let x = scene.lattice().to_world(p);
         p.z == far.z && light.contains(x)
     };
-    let options = BakeOptions { engine: Some(Engine::Sweep), directions: Some(32), ..BakeOptions::default() };
-    let settings = BakeSettings::new(&options, &scene).unwrap();
-    let baked = bake(&scene, &settings, &Device::new(0).unwrap(), Progress::Quiet).unwrap();
-    let points = (0..scene.lattice().len())
+    let points: Vec<usize> = (0..scene.lattice().len())
         .filter(|&o| behind(DVec3::from_array(scene.lattice().ijk(o).map(|x| x as f64))))
-        .filter(|&o| (0.0..=1.0).contains(&scene.field.samples()[o]));
-    let lit: Vec<f32> = points.map(|o| baked.sides[0].1.radiance[o][1]).collect();
-    assert!(lit.len() > 50 && lit.iter().all(|x| *x == 0.0), "{lit:?}");
+        .filter(|&o| (0.0..=1.0).contains(&scene.field.samples()[o]))
+        .collect();
+    for (engine, directions, photons) in [(Engine::Sweep, Some(32), None), (Engine::Photon, None, Some(1 << 16))] {
+        let options = BakeOptions { engine: Some(engine), directions, photons, ..BakeOptions::default() };
+        let settings = BakeSettings::new(&options, &scene).unwrap();
+        let baked = bake(&scene, &settings, &Device::new(0).unwrap(), Progress::Quiet).unwrap();
+        let lit: Vec<f32> = points.iter().map(|&o| baked.sides[0].1.radiance[o][1]).collect();
+        assert!(lit.len() > 50 && lit.iter().all(|x| *x < 0.01), "{engine:?}: {lit:?}");
+    }
 }
