@@ -103,8 +103,8 @@ pub struct Sampler<'a, T> {
 }
 
 impl<T: Tracer> Sampler<'_, T> {
-    /// The sample at `position`, its random numbers keyed by `key`; `None` where ∇h vanishes. Adds rays and misses to
-    /// `counts`.
+    /// The sample at `position`, its random numbers keyed by `key`; `None` where ∇h vanishes, no light between a luminaire and the wall that
+    /// it covers ([`Scene::covers`]). Adds rays and misses to `counts`.
     #[allow(clippy::cast_possible_truncation, reason = "isovalues and storage are f32")]
     pub fn sample(
         &self,

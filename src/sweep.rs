@@ -46,6 +46,7 @@ use crate::isa::Isa;
 use crate::scene::{Boundary, Scene};
 use flats::Flats;
 use gather::Pass;
+use glam::DVec3;
 use grid::Geometry;
 use monitor::Monitor;
 use planes::{NodeLight, Planes, Spare};
@@ -272,8 +273,10 @@ pub fn sweep_resumable(
     });
     let flats = flats.collect();
     let mut sides = total.finish(&lit, done);
-    for side in &mut sides {
-        for &o in &slits.covered {
+    let world = |o: usize| scene.lattice().to_world(DVec3::from_array(scene.lattice().ijk(o).map(|i| i as f64)));
+    let dark = slits.hidden.iter().map(|hidden| hidden.0).filter(|&o| scene.covers(world(o)));
+    for o in dark {
+        for side in &mut sides {
             side.irradiance[o] = [0.0; 3];
             side.std_error.get_mut(o).into_iter().for_each(|e| *e = 0.0);
         }

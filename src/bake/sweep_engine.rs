@@ -86,7 +86,8 @@ pub(super) fn light(
     for mut s in swept {
         let stage = progress.stage("samples", (beside.len() + near.len() + contacts.len()) as u64);
         let seed = settings.seed;
-        let gather = |share: u32| Indirect::Gather(&cache, (settings.gather_rays / share).max(2));
+        let rays = |share: u32| (settings.gather_rays / share).max(2);
+        let gather = |share: u32| Indirect::Gather(&cache, rays(share));
         let shadow = |share: u32| (settings.shadow_rays / share).max(2);
         let (indirect, shadow_rays) = (gather(SHARES[0]), shadow(SHARES[1]));
         let sampler = Sampler { scene, tracer: &tracer, indirect: &indirect, side: s.side, shadow_rays, seed };
@@ -104,7 +105,7 @@ pub(super) fn light(
         let wedge = Wedge {
             tracer: &tracer,
             cache: &cache,
-            gather_rays: (settings.gather_rays / CONTACT_SHARES[0]).max(2),
+            gather_rays: rays(CONTACT_SHARES[0]),
             shadow_rays: shadow(CONTACT_SHARES[1]),
             seed,
         };

@@ -9,35 +9,26 @@ use glam::DVec3;
 pub(super) struct Slits {
     /// Nodes within one, in rising order, and the node in front of the luminaire that each shows to lines instead of itself.
     pub hidden: Vec<(usize, usize)>,
-    /// Those of them between a luminaire and the wall that it covers, in rising order: no light gets there.
-    pub covered: Vec<usize>,
     standing: Vec<Standing>,
 }
 
 impl Slits {
     pub(super) fn new(scene: &Scene) -> Self {
-        let (mut hidden, mut covered) = (Vec::new(), Vec::new());
-        let outside = Standing { place: Place::Outside, covers: None };
-        let mut standing = vec![outside; scene.polygons().len()];
-        for (standing, inside) in standing.iter_mut().zip(ends::inside(scene)) {
-            standing.place = if inside { Place::Inside } else { Place::Outside };
-        }
+        let place = |inside| if inside { Place::Inside } else { Place::Outside };
+        let stands = |inside| Standing { place: place(inside), covers: None };
+        let mut standing: Vec<Standing> = ends::inside(scene).into_iter().map(stands).collect();
+        let mut hidden = Vec::new();
         for &number in scene.luminaires() {
             let standing = &mut standing[number as usize];
             let nodes = hidden_by(scene, number);
             standing.covers = scene.covered_wall(number);
-            if standing.covers.is_some() {
-                covered.extend(nodes.iter().map(|(node, _)| *node));
-            }
             if standing.place == Place::Inside && !nodes.is_empty() {
                 standing.place = Place::Slit;
             }
             hidden.extend(nodes);
         }
         hidden.sort_unstable();
-        covered.sort_unstable();
-        covered.dedup();
-        Self { hidden, covered, standing }
+        Self { hidden, standing }
     }
 
     /// Where polygons stand.
