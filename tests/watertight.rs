@@ -3,7 +3,7 @@
 
 use glam::{DVec3, Vec3};
 use isolume::embree::{Device, GraphTracer};
-use isolume::flattened::{FlattenedHit, FlattenedRay, Target};
+use isolume::flattened::{FlattenedRay, Target};
 use isolume::rng::{Rng, Stage};
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
 use isolume::selftest::watertight::{direction, noise, start};
@@ -36,11 +36,8 @@ fn batches_find_what_single_rays_find() {
         let mut kinds = [0; 3];
         for ((ray, hit), blocked) in rays.iter().zip(hits).zip(blocked) {
             assert_eq!(hit.is_some(), blocked, "{ray:?}");
-            // Embree may ask for the volume with the reach that a polygon left over: t can differ in its last bit.
-            let single = tracer.intersect(ray);
-            assert_eq!(hit.map(|h| h.target), single.map(|h| h.target), "{ray:?}");
-            let t = |h: Option<FlattenedHit>| h.map_or(0.0, |h| h.t);
-            assert!((t(hit) - t(single)).abs() <= 1e-6 * t(single), "{ray:?}: {hit:?}, {single:?}");
+            // Embree may ask for the volume with the reach that a polygon left over, or the other way round.
+            assert_eq!(hit, tracer.intersect(ray), "{ray:?}");
             kinds[match hit.map(|h| h.target) {
                 Some(Target::Polygon(_)) => 0,
                 Some(_) => 1,

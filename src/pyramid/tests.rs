@@ -78,6 +78,35 @@ fn with_and_without_simd_hits_are_the_same_bits() {
     }
 }
 
+/// Embree asks with the reach that whatever it met first left over.
+#[test]
+fn where_the_reach_ends_does_not_move_a_hit() {
+    let (dims, levels) = ([70, 66, 67], 1e4);
+    let field = field(dims, levels);
+    let mut rng = Rng::stream(4, Stage::Test, 0);
+    for capped in [false, true] {
+        let pyramid = Pyramid::new(&field, capped);
+        let mut hits = 0;
+        for _ in 0..50_000 {
+            let ray = FlattenedRay { reach: f32::INFINITY, ..ray(&field, &mut rng, levels) };
+            let Some(hit) = pyramid.intersect(&field, &ray, f64::INFINITY) else { continue };
+            let cell = 1.0 / ray.direction.length();
+            for reach in [hit.t.next_up(), hit.t + 0.01 * cell, hit.t + 0.3 * cell] {
+                let reach = f64::from(reach).max(1e-30);
+                assert_eq!(pyramid.intersect(&field, &ray, reach), Some(hit), "{reach}, {ray:?}");
+                assert!(pyramid.occluded(&field, &ray, reach), "{reach}, {ray:?}");
+            }
+            let before = f64::from(hit.t) - f64::from(0.01 * cell + 1e-6 * hit.t);
+            if before > 0.0 {
+                assert_eq!(pyramid.intersect(&field, &ray, before), None, "{before}, {hit:?}, {ray:?}");
+                assert!(!pyramid.occluded(&field, &ray, before), "{before}, {hit:?}, {ray:?}");
+            }
+            hits += 1;
+        }
+        assert!(hits > 5_000, "{hits}");
+    }
+}
+
 /// A child too many would cost time only, so that no hit tells.
 #[test]
 fn every_instruction_set_finds_the_same_children() {

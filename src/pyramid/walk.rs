@@ -399,25 +399,21 @@ impl Ray<'_> {
         if start != (side == Side::Higher) {
             return Step::Hit(FlattenedHit { t: 0.0, target: Target::Surface(side) });
         }
-        let span = if last { self.reach } else { t_exit };
-        let end = if last {
-            cubic.value(span) >= 0.0
-        } else {
-            corners.face_inside_ray(exit, !line.negative(exit), self, corner, t_exit)
-        };
-        let crossing = if ANY && start != end { Some(0.0) } else { cubic.first_crossing(span, start, end) };
+        let end = corners.face_inside_ray(exit, !line.negative(exit), self, corner, t_exit);
+        let sure = ANY & !last & (start != end);
+        let crossing = if sure { Some(0.0) } else { cubic.first_crossing(t_exit, start, end) };
         match crossing {
-            Some(t) => Step::Hit(self.hit(t, start)),
-            None if last => Step::End,
-            None => Step::On,
+            Some(t) if t <= self.reach => Step::Hit(Self::hit(t, start)),
+            _ if last => Step::End,
+            _ => Step::On,
         }
     }
 
     #[inline(always)]
     #[allow(clippy::cast_possible_truncation, reason = "t leaves as f32")]
-    fn hit(&self, t: f64, from_inside: bool) -> FlattenedHit {
+    fn hit(t: f64, from_inside: bool) -> FlattenedHit {
         let side = if from_inside { Side::Higher } else { Side::Lower };
-        FlattenedHit { t: t.min(self.reach) as f32, target: Target::Surface(side) }
+        FlattenedHit { t: t as f32, target: Target::Surface(side) }
     }
 }
 
@@ -464,32 +460,32 @@ impl<'a, R> Lane<'a, R> {
         }
         let t_exit = ray.time(exit, far.to_array()[exit]).max(t);
         let last = t_exit >= ray.reach;
-        let span = if last { (ray.reach - t).max(0.0) } else { t_exit - t };
         let piece = Piece {
             o: &ray.o,
             d: &ray.d,
             far: line.far,
             cell: corner,
-            t: [t, if last { t + span } else { t_exit }],
-            on: [if first { 0 } else { 1 << entry }, if last { 0 } else { 1 << exit }],
+            t: [t, t_exit],
+            on: [if first { 0 } else { 1 << entry }, 1 << exit],
         };
         let v = kernel.span(&corners, &piece);
         let above = kernel.at_least(&v, ray.c);
         // Signs come from weights, not from the cubic's coefficients, which a huge corner far away may have rounded off.
         let (begins, ends) = (above & 1 == 1, above >> 7 == 1);
         let begins = if first { begins } else { state(inside, entry, line.negative(entry), begins) };
-        let ends = if last { ends } else { state(inside, exit, !line.negative(exit), ends) };
+        let ends = state(inside, exit, !line.negative(exit), ends);
         // Between equal states nothing happens if all Bernstein coefficients agree.
         if (begins == ends) & (above == if begins { u8::MAX } else { 0 }) {
             return if last { Step::End } else { Step::On };
         }
-        if ANY && begins != ends {
-            return Step::Hit(ray.hit(t, begins));
+        if ANY && !last && begins != ends {
+            return Step::Hit(Ray::hit(t, begins));
         }
-        match ray.crossing(cell.at, corner, t, span, [begins, ends]) {
-            Some(dt) => Step::Hit(ray.hit(t + dt, begins)),
-            None if last => Step::End,
-            None => Step::On,
+        // In all of the cell, so that t does not depend on where the reach ends: on what was met before.
+        match ray.crossing(cell.at, corner, t, t_exit - t, [begins, ends]) {
+            Some(dt) if t + dt <= ray.reach => Step::Hit(Ray::hit(t + dt, begins)),
+            _ if last => Step::End,
+            _ => Step::On,
         }
     }
 }
