@@ -21,9 +21,11 @@ mod device;
 mod extrusions;
 mod hexahedra;
 mod triangles;
+mod user;
 
 pub use abi::{Hit, Hit16, INVALID_ID, Ray, Ray16, RayHit, RayHit16, RayView, Valid16};
-pub use bvh::{Quality, Scene, SceneBuilder, UserGeometry, UserHit, UserHits16};
+pub use bvh::{Quality, Scene, SceneBuilder};
 pub use device::Device;
 pub use hexahedra::{GraphTracer, pyramids};
 pub use triangles::SurfaceTracer;
+pub use user::{UserGeometry, UserHit, UserHits16};
