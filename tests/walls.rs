@@ -165,11 +165,14 @@ fn it_is_dark_behind_a_luminaire() {
         .filter(|&o| behind(DVec3::from_array(scene.lattice().ijk(o).map(|x| x as f64))))
         .filter(|&o| (0.0..=1.0).contains(&scene.field.samples()[o]))
         .collect();
-    for (engine, directions, photons) in [(Engine::Sweep, Some(32), None), (Engine::Photon, None, Some(1 << 16))] {
+    // What exact rays gather is smoothed over neighbours in front of the luminaire.
+    for (engine, directions, photons, most) in
+        [(Engine::Sweep, Some(32), None, 0.0), (Engine::Photon, None, Some(1 << 16), 0.01)]
+    {
         let options = BakeOptions { engine: Some(engine), directions, photons, ..BakeOptions::default() };
         let settings = BakeSettings::new(&options, &scene).unwrap();
         let baked = bake(&scene, &settings, &Device::new(0).unwrap(), Progress::Quiet).unwrap();
         let lit: Vec<f32> = points.iter().map(|&o| baked.sides[0].1.radiance[o][1]).collect();
-        assert!(lit.len() > 50 && lit.iter().all(|x| *x < 0.01), "{engine:?}: {lit:?}");
+        assert!(lit.len() > 50 && lit.iter().all(|x| *x <= most), "{engine:?}: {lit:?}");
     }
 }
