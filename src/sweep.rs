@@ -22,7 +22,6 @@ mod flats;
 mod gather;
 mod grid;
 mod half;
-mod monitor;
 mod near;
 mod normals;
 mod open_share;
@@ -32,6 +31,7 @@ mod points;
 mod reflect;
 mod runs;
 mod segments;
+mod settling;
 #[allow(unsafe_code, reason = "vector instructions: measured to pay, chosen at run time")]
 mod simd;
 mod slits;
@@ -48,11 +48,11 @@ use flats::Flats;
 use gather::Pass;
 use glam::DVec3;
 use grid::Geometry;
-use monitor::Monitor;
 use planes::{NodeLight, Planes, Spare};
 use points::Points;
 use rayon::prelude::*;
-use reflect::Mirror;
+use reflect::{Mirror, Reflected};
+use settling::Settling;
 use slits::Slits;
 use state::{Passes, State};
 use std::sync::Mutex;
@@ -66,7 +66,7 @@ pub struct SweepSettings {
     pub light_points: usize,
     /// Indirect bounces; what is left beyond is cut off. Large values mean: until `target` is met.
     pub max_bounces: usize,
-    /// The share of mean indirect light that may be left out when the bounces stop.
+    /// The share of indirect light that may be missing when the bounces stop; rounding ends below 1e-4.
     pub target: f64,
     /// Repetitions with random numbers of their own, averaged; 4 or more give a standard error. Their directions and luminaire
     /// points are parts of one low-discrepancy set.
@@ -116,8 +116,8 @@ pub struct SweepResult {
     pub flats: Vec<Option<FlatTexture>>,
     /// Indirect bounces of the replicate that took the most.
     pub bounces: usize,
-    /// Bound on the share of mean indirect light that later bounces would add; NaN where bounces were cut before
-    /// it was known.
+    /// The share of indirect light that later bounces would change, as far as their decay is known; NaN where bounces were cut
+    /// before it was.
     pub residual: f64,
     /// Whether `tick` stopped the work.
     pub stopped: bool,
@@ -151,7 +151,7 @@ const LEAST: usize = 16;
 /// twice the directions errs less than the mean of two.
 const LATE: usize = 2;
 /// Coarse passes until light has settled, as a rule; only estimates of time rely on it.
-const SETTLING: usize = 6;
+const SETTLING: usize = 8;
 /// The share of progress that is direct light.
 pub(crate) const DIRECT_SHARE: f64 = 0.2;
 
@@ -379,16 +379,17 @@ impl Run<'_> {
     /// What nodes and flats reflect before the first pass of a replicate.
     fn begin(&self, state: &State, flats: &mut Flats) -> Passes {
         let late = if self.warm(state) { LATE - 1 } else { 0 };
-        let direct = (NodeLight::Half(&state.total.direct), [1.0; 3]);
-        let (b, unit) = if late > 0 {
+        let direct = (NodeLight::Half(&state.total.direct), 1.0);
+        let (light, sums) = if late > 0 {
             let share = 1.0 / state.done as f32;
             flats.take(&state.flats, share);
-            self.mirror.reflect(flats, &[direct, (NodeLight::Half(&state.total.light), [share; 3])], Vec::new())
+            let light = (NodeLight::Half(&state.total.light), share);
+            self.mirror.reflect(flats, &[direct, light], Reflected::default(), None)
         } else {
             flats.reflect_direct();
-            self.mirror.reflect(flats, &[direct], Vec::new())
+            self.mirror.reflect(flats, &[direct], Reflected::default(), None)
         };
-        Passes { b, unit, monitor: Monitor::default(), late, bounce: 0 }
+        Passes { light, before: Reflected::default(), settling: Settling::new(sums.light), late, bounce: 0 }
     }
 
     /// Whether a replicate starts from the light of those before instead of from luminaires alone: then its last pass is all
@@ -398,7 +399,7 @@ impl Run<'_> {
         state.done > 0 && self.settings.settles() && state.total.sides().len() == self.sides.len()
     }
 
-    /// Bounces: coarse passes until the tail is predictable and small, then finer ones. Goes on behind the passes of `from`, whose
+    /// Bounces: coarse passes until what is missing is known and small, then finer ones. Goes on behind the passes of `from`, whose
     /// light the flats hold. Returns the indirect irradiance per side, and false if `progress` stopped it.
     fn replicate(
         &self,
@@ -413,7 +414,7 @@ impl Run<'_> {
             self.saved.save(0, || state.bytes(None, flats));
         }
         if let Some(passes) = &from {
-            flats.pack(passes.unit);
+            flats.pack(passes.light.unit);
         }
         let mut now = from.unwrap_or_else(|| self.begin(state, flats));
         let mut indirect = Vec::new();
@@ -431,7 +432,7 @@ impl Run<'_> {
             if self.saved.due() {
                 self.saved.save(0, || state.bytes(Some(&now), flats));
             }
-            let settled = now.late > 0 || now.monitor.missing(LATE as i32).is_some_and(|m| m < s.target);
+            let settled = now.late > 0 || now.settling.missing(LATE as i32).is_some_and(|m| m < s.target);
             let bounce = now.bounce + 1;
             let late = settled || bounce + LATE > s.max_bounces;
             let directions = match () {
@@ -458,8 +459,8 @@ impl Run<'_> {
                 progress(passes / (bounce as f64 + more))
             };
             let mut stopped = false;
-            for (&side, b) in self.sides.iter().zip(&now.b) {
-                let (e, complete) = pass.gather(side, &lines, b, now.unit, flats, &mut incoming, &mut ask);
+            for (&side, b) in self.sides.iter().zip(&now.light.b) {
+                let (e, complete) = pass.gather(side, &lines, b, now.light.unit, flats, &mut incoming, &mut ask);
                 stopped |= !complete;
                 indirect.push(e);
             }
@@ -475,38 +476,33 @@ impl Run<'_> {
             state.counts.families += total as u64;
             state.counts.gather_rays += state.counts.valid * total as u64;
             now.late += usize::from(late && !fixed);
-            let scale = if fixed { [1.0; 3] } else { now.monitor.push(self.mean(&indirect)) };
-            flats.reflect(scale, true);
+            let settles = !fixed && !late;
+            #[allow(clippy::cast_possible_truncation, reason = "a number in [1, 2]")]
+            let omega = now.settling.omega.map(|x| x as f32);
+            if settles {
+                flats.settle(omega);
+            } else {
+                now.settling.since += 1;
+                flats.reflect(true);
+            }
             if now.late == LATE || bounce == s.max_bounces {
                 break;
             }
-            let old = std::mem::take(&mut now.b);
-            (now.b, now.unit) = self.mirror.reflect(
-                flats,
-                &[(NodeLight::Half(&state.total.direct), [1.0; 3]), (NodeLight::Full(&indirect), scale)],
-                old,
-            );
+            let light = [(NodeLight::Half(&state.total.direct), 1.0), (NodeLight::Full(&indirect), 1.0)];
+            if settles {
+                let memory = std::mem::take(&mut now.before);
+                let (reflected, sums) = self.mirror.reflect(flats, &light, memory, Some((&now.light, omega)));
+                now.before = std::mem::replace(&mut now.light, reflected);
+                now.settling.push(sums);
+            } else {
+                now.before = Reflected::default();
+                let memory = std::mem::take(&mut now.light);
+                now.light = self.mirror.reflect(flats, &light, memory, None).0;
+            }
             self.spare.keep(indirect.drain(..).flatten());
         }
         state.see(&now);
         (indirect, true)
-    }
-
-    /// Indirect irradiance summed over valid nodes and sides, per channel.
-    fn mean(&self, planes: &[Planes]) -> [f64; 3] {
-        // Sums by fixed chunks: the same bits on any number of threads.
-        let sum = |plane: &Vec<f32>| -> f64 {
-            let chunks: Vec<f64> = plane
-                .par_chunks(1 << 14)
-                .enumerate()
-                .map(|(chunk, x)| {
-                    let nodes = x.iter().zip(chunk << 14..);
-                    nodes.filter(|(_, at)| self.geometry.valid(*at)).map(|(x, _)| f64::from(*x)).sum()
-                })
-                .collect();
-            chunks.iter().sum()
-        };
-        std::array::from_fn(|c| planes.iter().map(|p| sum(&p[c])).sum())
     }
 }
 

@@ -200,6 +200,42 @@ fn the_residual_of_cut_bounces_is_not_known() {
     }
 }
 
+/// Light that counts as settled against light that went on: the last passes' directions are the same, so all that differs is what is missing.
+#[test]
+fn settled_light_misses_what_it_says() {
+    let f = bumps(41);
+    let walls = cornell_box(f.lattice(), 0.0).unwrap();
+    let bright = Surface { albedo: DVec3::new(0.9, 0.6, 0.3).into(), ..Surface::default() };
+    for surface in [Surface::default(), bright] {
+        let scene = Scene::new(f.clone(), surface, Boundary::Open, walls.clone()).unwrap();
+        let light = |max_bounces, target| {
+            let settings = SweepSettings {
+                directions: 32,
+                light_points: 4,
+                replicates: 1,
+                max_bounces,
+                target,
+                seed: 1,
+                flat_resolution: (16, 16),
+            };
+            run(&scene, settings)
+        };
+        let (direct, whole) = (light(0, 1.0), light(64, 2e-4));
+        for target in [3e-2, 4e-3] {
+            let got = light(64, target);
+            let all = |of: fn(f32, f32, f32) -> f32| -> f64 {
+                let both =
+                    got.sides[0].irradiance.iter().zip(&whole.sides[0].irradiance).zip(&direct.sides[0].irradiance);
+                both.flat_map(|((a, b), d)| (0..3).map(move |c| f64::from(of(a[c], b[c], d[c])))).sum()
+            };
+            let missing = all(|a, b, _| (a - b).abs()) / all(|_, b, d| b - d);
+            println!("target {target}: {missing:.5} is missing after {} passes, said {:.5}", got.bounces, got.residual);
+            assert!(missing < got.residual && got.residual < target && missing > 0.05 * got.residual);
+            assert!(got.bounces < whole.bounces && got.bounces <= 9);
+        }
+    }
+}
+
 /// The light that replicates share while it spreads is that of all their luminaire points, not of the first one's few: with two each,
 /// the mean indirect light errs less than the mean direct light does (0.5 times as much; 1.4 times where the first one spread its own).
 #[test]

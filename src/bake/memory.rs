@@ -57,6 +57,10 @@ const CACHED: u64 = 12;
 const SWEPT: u64 = 13;
 const SWEPT_SIDE: u64 = 26;
 const SUMMED_SIDE: u64 = 9;
+/// Per point and swept side while light settles, before there are such sums: what lines read a pass before, here and in a checkpoint;
+/// and of the sums' bytes those of the spread.
+const SETTLING_SIDE: u64 = 16;
+const SPREAD_SIDE: u64 = 3;
 
 /// Bytes per point and side that its checkpoint holds while a replicate is under way, besides the sums; and per stored side,
 /// when all are done.
@@ -214,7 +218,8 @@ impl Parts {
         let levels = Levels::new(members.iter().zip(&all_masks).map(|(m, masks)| (&*m.field, &masks[..])));
         let texels = flat::texels(scene, settings.wall_resolution, settings.wall_isovalues) as u64;
         let sides = sweep::swept_sides(scene).len() as u64;
-        let swept = points * (SWEPT + sides * (SWEPT_SIDE + KEPT_SIDE) + 2 * stored * SUMMED_SIDE);
+        let summed = (2 * stored * SUMMED_SIDE).max(sides * SETTLING_SIDE + 2 * stored * SPREAD_SIDE);
+        let swept = points * (SWEPT + sides * (SWEPT_SIDE + KEPT_SIDE) + summed);
         let ([landings, lower, higher], gather) = match settings.engine {
             Engine::Photon => (landings(scene, settings, device)?, settings.gather_rays > 0),
             Engine::Sweep => ([0.0; 3], false),

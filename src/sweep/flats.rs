@@ -25,6 +25,8 @@ pub(super) struct Texture {
     pub indirect: Vec<f32>,
     /// Reflected radiance B.
     pub radiance: Vec<f32>,
+    /// While light settles: B of the pass before the last.
+    pub before: Vec<f32>,
     /// Where the texture starts in [`Flats::packed`].
     start: usize,
     /// ∫cos dω as the pass has seen it, per texel and isovalue: π where no part of it is inside the solid.
@@ -150,6 +152,7 @@ impl Flats {
                     direct: vec![0.0; n],
                     indirect: vec![0.0; n],
                     radiance: vec![0.0; n],
+                    before: Vec::new(),
                     start: next - texels * isovalues,
                     weight: vec![0.0; texels * isovalues],
                 })
@@ -222,7 +225,24 @@ impl Flats {
     pub(super) fn reflect_direct(&mut self) {
         let nothing = self.open();
         self.close(&nothing);
-        self.reflect([1.0; 3], false);
+        self.reflect(false);
+    }
+
+    /// As [`Flats::reflect`] while light settles: goes ω times as far from what was before the pass's light, which is kept for the next
+    /// one. \[GV61\]
+    pub(super) fn settle(&mut self, omega: [f32; 3]) {
+        let light: Vec<Option<Vec<f32>>> =
+            self.textures.iter().map(|t| t.as_ref().map(|t| t.radiance.clone())).collect();
+        self.reflect(true);
+        for (t, light) in self.textures.iter_mut().zip(light) {
+            let (Some(t), Some(light)) = (t, light) else { continue };
+            let before = std::mem::replace(&mut t.before, light);
+            let nc = t.isovalues();
+            let channels = t.radiance.chunks_mut(nc).zip(before.chunks(nc)).enumerate();
+            for (c, (y, before)) in channels.filter(|c| omega[c.0 % 3] != 1.0) {
+                y.iter_mut().zip(before).for_each(|(y, x)| *y = (x + omega[c % 3] * (*y - x)).max(0.0));
+            }
+        }
     }
 
     /// Empty sums for a pass.
@@ -273,8 +293,8 @@ impl Flats {
         }
     }
 
-    /// B = ρ/π (direct + scale · indirect); texels that lie inside the solid take the mean of neighbours that do not.
-    pub(super) fn reflect(&mut self, scale: [f32; 3], seen: bool) {
+    /// B = ρ/π (direct + indirect); texels that lie inside the solid take the mean of neighbours that do not.
+    pub(super) fn reflect(&mut self, seen: bool) {
         for t in self.textures.iter_mut().flatten() {
             let nc = t.isovalues();
             let (direct, indirect, albedo) = (&t.direct, &t.indirect, &t.albedo);
@@ -285,7 +305,7 @@ impl Flats {
                     let channel = c * nc..(c + 1) * nc;
                     let light = direct[channel.clone()].iter().zip(&indirect[channel.clone()]);
                     for ((out, (d, e)), albedo) in out[channel].iter_mut().zip(light).zip(albedo) {
-                        *out = albedo[c] / PI * (d + scale[c] * e);
+                        *out = albedo[c] / PI * (d + e);
                     }
                 }
             });

@@ -4,6 +4,7 @@ use super::flats::Flats;
 use super::grid::Geometry;
 use super::half::{self, Half4};
 use super::planes::NodeLight;
+use super::settling::Sums;
 use super::slits::Slits;
 use crate::scene::Scene;
 use glam::DVec3;
@@ -13,6 +14,20 @@ use rayon::prelude::*;
 /// a cell linear interpolation exceeds E by E″/12 along both axes of the slice, and the nearest slice falls short by E″/24; with every
 /// axis in turn across, E + ∇²E/24 is read: this much is taken off before. \[Condat05\]
 const SHARPENING: f32 = 1.0 / 24.0;
+
+/// What nodes reflect.
+#[derive(Debug)]
+pub(super) struct Reflected {
+    /// Per side, times `unit`.
+    pub b: Vec<Vec<Half4>>,
+    pub unit: f32,
+}
+
+impl Default for Reflected {
+    fn default() -> Self {
+        Self { b: Vec::new(), unit: 1.0 }
+    }
+}
 
 /// Turns irradiance into radiance.
 pub(super) struct Mirror<'a> {
@@ -38,15 +53,17 @@ impl<'a> Mirror<'a> {
     }
 
     /// B = Le + ρ/π Σ scale · irradiance of the sides, sharpened, and filled where no surface is; packs the flats too.
-    /// `light`: one or two sets of irradiance, each with its scale; `old`: memory of the same form. Returns what all was
-    /// multiplied by.
+    /// `light`: one or two sets of irradiance, each with its scale; `memory`: of the same form, or empty. While light settles
+    /// there is also what the pass read, and ω ≥ 1: the result goes ω times as far from `memory`, which was there before that.
+    /// Returns sums of B itself, too.
     #[allow(clippy::cast_possible_truncation, reason = "albedo and emission")]
     pub(super) fn reflect(
         &self,
         flats: &mut Flats,
-        light: &[(NodeLight, [f32; 3])],
-        old: Vec<Vec<Half4>>,
-    ) -> (Vec<Vec<Half4>>, f32) {
+        light: &[(NodeLight, f32)],
+        memory: Reflected,
+        relaxed: Option<(&Reflected, [f32; 3])>,
+    ) -> (Reflected, Sums) {
         let surface = &self.scene.surface;
         let over_pi =
             |albedo: DVec3| -> [f32; 3] { std::array::from_fn(|c| (albedo[c] / std::f64::consts::PI) as f32) };
@@ -57,22 +74,25 @@ impl<'a> Mirror<'a> {
             h.map(|&h| over_pi(surface.albedo.at(f64::from(h)))).collect()
         });
         let emission = surface.emission.as_vec3().to_array();
+        let omega = relaxed.map_or([1.0; 3], |r| r.1);
         let mut most = flats.greatest();
         let sides = light[0].0.sides();
         for s in 0..sides {
             for c in 0..3 {
-                let e: f32 = light.iter().map(|(light, scale)| scale[c] * light.greatest(s, c)).sum();
-                most = most.max(emission[c] + greatest[c] * e * (1.0 + 6.0 * SHARPENING));
+                let e: f32 = light.iter().map(|(light, scale)| scale * light.greatest(s, c)).sum();
+                most = most.max(omega[c] * (emission[c] + greatest[c] * e * (1.0 + 6.0 * SHARPENING)));
             }
         }
         let unit = half::scale(most);
         flats.pack(unit);
         let [nx, ny, nz] = self.geometry.dims;
         let n = nx * ny * nz;
-        let mut old = old.into_iter();
+        let from = unit / memory.unit;
+        let mut memory = memory.b.into_iter();
+        let mut sums = Sums::default();
         let b = (0..sides).map(|s| {
-            let mut b = old.next().unwrap_or_else(|| vec![[0; 4]; n]);
-            b.par_chunks_mut(nx).enumerate().with_max_len(64).for_each_init(Rows::default, |rows, (row, b)| {
+            let mut b = memory.next().unwrap_or_else(|| vec![[0; 4]; n]);
+            let rows = b.par_chunks_mut(nx).enumerate().with_max_len(64).map_init(Rows::default, |rows, (row, b)| {
                 let (j, k) = (row % ny, row / ny);
                 let beside = [
                     Some(row),
@@ -81,11 +101,12 @@ impl<'a> Mirror<'a> {
                     (k > 0).then(|| row - ny),
                     (k + 1 < nz).then_some(row + ny),
                 ];
+                let mut sums = Sums::default();
                 let Rows { shown, light: rows, laplacian } = rows;
                 self.shown(row, &mut shown[0]);
                 if !shown[0].contains(&1.0) {
                     b.fill([0; 4]);
-                    return;
+                    return sums;
                 }
                 for (shown, row) in shown.iter_mut().zip(beside).skip(1) {
                     match row {
@@ -98,30 +119,45 @@ impl<'a> Mirror<'a> {
                         to.clear();
                         if let Some(row) = row {
                             to.resize(nx, 0.0);
-                            light.iter().for_each(|(light, scale)| light.add((s, c), scale[c], row * nx, to));
+                            light.iter().for_each(|(light, scale)| light.add((s, c), *scale, row * nx, to));
                         }
                     }
                     sharpen(rows, shown, laplacian);
                     let (le, rho) = (unit * emission[c], unit * greatest[c]);
-                    let nodes = b.iter_mut().zip(&rows[0]).zip(&shown[0]);
+                    let y = rows[0].iter_mut().zip(&shown[0]);
                     if let Some(by_node) = &by_node {
-                        for (((b, e), shown), rho) in nodes.zip(&by_node[row * nx..]) {
-                            b[c] = half::encode(shown * (le + unit * rho[c] * e));
-                        }
+                        y.zip(&by_node[row * nx..]).for_each(|((y, is), rho)| *y = is * (le + unit * rho[c] * *y));
+                    } else {
+                        y.for_each(|(y, is)| *y = is * (le + rho * *y));
+                    }
+                    let y = &rows[0];
+                    if let Some((old, _)) = relaxed {
+                        let x = old.b[s][row * nx..].iter().map(|x| unit / old.unit * half::decode(x[c]));
+                        sums.change[c] = changed(y, &shown[0], x);
+                    }
+                    sums.light[c] = y.iter().map(|y| f64::from(*y)).sum();
+                    if omega[c] == 1.0 {
+                        b.iter_mut().zip(y).for_each(|(b, y)| b[c] = half::encode(*y));
                         continue;
                     }
-                    for ((b, e), shown) in nodes {
-                        b[c] = half::encode(shown * (le + rho * e));
+                    for (b, y) in b.iter_mut().zip(y) {
+                        let before = from * half::decode(b[c]);
+                        b[c] = half::encode((before + omega[c] * (y - before)).max(0.0));
                     }
                 }
+                sums
             });
+            // Added up row after row: the same bits on any number of threads.
+            let rows: Vec<Sums> = rows.collect();
+            rows.iter().for_each(|row| sums.add(row, 1.0 / f64::from(unit)));
             for &(node, front) in &self.slits.hidden {
                 b[node] = b[front];
             }
             self.geometry.fill(&mut b);
             b
         });
-        (b.collect(), unit)
+        let b = b.collect();
+        (Reflected { b, unit }, sums)
     }
 }
 
@@ -134,6 +170,12 @@ struct Rows {
     shown: Cross,
     light: Cross,
     laplacian: Vec<f32>,
+}
+
+/// Σ|y − x| over nodes that are shown; y as it will be kept.
+#[inline(always)]
+fn changed(y: &[f32], shown: &[f32], x: impl Iterator<Item = f32>) -> f64 {
+    y.iter().zip(shown).zip(x).map(|((y, is), x)| f64::from(is * (half::decode(half::encode(*y)) - x).abs())).sum()
 }
 
 /// Sharpens the first row of irradiance, against its neighbours that are shown.

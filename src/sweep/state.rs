@@ -3,8 +3,9 @@
 use super::SweepCounts;
 use super::flats::Flats;
 use super::half::Half4;
-use super::monitor::Monitor;
 use super::planes::{HalfPlanes, Planes};
+use super::reflect::Reflected;
+use super::settling::Settling;
 use super::totals::{Totals, stride};
 use crate::flattened::Side;
 use crate::scene::Scene;
@@ -26,10 +27,11 @@ pub(super) struct State {
 
 /// A replicate between two passes. The flats hold the rest of it, their radiance.
 pub(super) struct Passes {
-    /// Times `unit`, the B that the next pass reads.
-    pub b: Vec<Vec<Half4>>,
-    pub unit: f32,
-    pub monitor: Monitor,
+    /// What the next pass reads.
+    pub light: Reflected,
+    /// While light settles: what the last pass read.
+    pub before: Reflected,
+    pub settling: Settling,
     /// Passes since the light has settled.
     pub late: usize,
     /// Passes behind us.
@@ -67,7 +69,7 @@ impl State {
     /// Takes note of how far a replicate came.
     pub(super) fn see(&mut self, passes: &Passes) {
         self.bounces = self.bounces.max(passes.bounce);
-        let missing = match passes.monitor.missing(0) {
+        let missing = match passes.settling.missing(0) {
             // From the light of replicates before.
             None if passes.late > 0 => 0.0,
             missing => missing.unwrap_or(f64::NAN),
@@ -82,7 +84,7 @@ impl State {
     pub(super) fn bytes(&self, passes: Option<&Passes>, flats: &Flats) -> Vec<u8> {
         let Totals { lighting, direct, light, spread, parts, .. } = &self.total;
         let numbers = 12 * lighting.len() + 6 * (direct.len() + light.len()) + 3 * spread.len();
-        let under_way = passes.map_or(0, |p| 8 * p.b.len());
+        let under_way = passes.map_or(0, |p| 8 * (p.light.b.len() + p.before.b.len()));
         // The flats are small beside it.
         let mut out = Writer { bytes: Vec::with_capacity(self.total.nodes() * (numbers + under_way) + (1 << 16)) };
         out.count(self.done);
@@ -112,13 +114,21 @@ impl State {
         if let Some(p) = passes {
             out.count(p.bounce);
             out.count(p.late);
-            out.numbers(&[p.unit]);
-            out.count(p.monitor.since.unsigned_abs() as usize);
-            out.count(p.monitor.means.len());
-            let means = p.monitor.means.iter().flatten();
-            means.chain(&p.monitor.ratio).chain(&p.monitor.tail).for_each(|&x| out.real(x));
-            p.b.iter().for_each(|b| out.halves(b.as_flattened().iter().copied()));
-            flats.textures.iter().flatten().for_each(|t| out.numbers(&t.radiance));
+            for reflected in [&p.light, &p.before] {
+                out.numbers(&[reflected.unit]);
+                out.count(reflected.b.len());
+                reflected.b.iter().for_each(|b| out.halves(b.as_flattened().iter().copied()));
+            }
+            let s = &p.settling;
+            out.count(s.since.unsigned_abs() as usize);
+            out.count(s.changes.len());
+            let threes = [&s.first, &s.share, &s.radius, &s.omega].into_iter().chain(&s.changes);
+            threes.flatten().for_each(|&x| out.real(x));
+            for t in flats.textures.iter().flatten() {
+                out.numbers(&t.radiance);
+                out.count(t.before.len());
+                out.numbers(&t.before);
+            }
         }
         out.bytes
     }
@@ -134,8 +144,8 @@ impl State {
         (self.done, self.flats) = (state.done, state.flats);
         (self.bounces, self.residual, self.counts) = (state.bounces, state.residual, state.counts);
         let (passes, light) = passes?;
-        for (texture, radiance) in flats.textures.iter_mut().flatten().zip(light) {
-            texture.radiance = radiance;
+        for (texture, [radiance, before]) in flats.textures.iter_mut().flatten().zip(light) {
+            [texture.radiance, texture.before] = [radiance, before];
         }
         Some(passes)
     }
@@ -190,18 +200,24 @@ impl State {
         let mut passes = None;
         if from.count()? == 1 {
             let (bounce, late) = (from.count()?, from.count()?);
-            let [unit] = from.numbers(1)?.try_into().ok()?;
-            let mut monitor = Monitor { since: i32::try_from(from.count()?).ok()?, ..Monitor::default() };
-            for _ in 0..from.count()? {
-                monitor.means.push(from.three()?);
-            }
-            (monitor.ratio, monitor.tail) = (from.three()?, from.three()?);
-            let b = (0..sides).map(|_| from.four_halves(nodes)).collect::<Option<_>>()?;
+            let mut reflected = || {
+                let [unit] = from.numbers(1)?.try_into().ok()?;
+                let b = (0..from.count()?.min(sides)).map(|_| from.four_halves(nodes)).collect::<Option<_>>()?;
+                Some(Reflected { b, unit })
+            };
+            let (light, before) = (reflected()?, reflected()?);
+            let since = i32::try_from(from.count()?).ok()?;
+            let changes = from.count()?.min(3);
+            let [first, share, radius, omega] = [from.three()?, from.three()?, from.three()?, from.three()?];
+            let changes = (0..changes).map(|_| from.three()).collect::<Option<_>>()?;
+            let settling = Settling { first, changes, share, radius, omega, since };
             let mut textures = Vec::new();
             for t in flats.textures.iter().flatten() {
-                textures.push(from.numbers(t.radiance.len())?);
+                let radiance = from.numbers(t.radiance.len())?;
+                let before = from.count()?.min(radiance.len());
+                textures.push([radiance, from.numbers(before)?]);
             }
-            passes = Some((Passes { b, unit, monitor, late, bounce }, textures));
+            passes = Some((Passes { light, before, settling, late, bounce }, textures));
         }
         from.bytes.is_empty().then_some(Parsed { state, direct, passes })
     }
@@ -212,8 +228,8 @@ struct Parsed {
     state: State,
     /// Direct light of the flats that reflect.
     direct: Vec<Vec<f32>>,
-    /// Passes under way, and the radiance of these flats.
-    passes: Option<(Passes, Vec<Vec<f32>>)>,
+    /// Passes under way, and these flats' radiance after the last pass and before it.
+    passes: Option<(Passes, Vec<[Vec<f32>; 2]>)>,
 }
 
 /// Numbers as little-endian bytes.
