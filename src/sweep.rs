@@ -83,7 +83,7 @@ impl Default for SweepSettings {
             directions: 64,
             light_points: 16,
             max_bounces: 64,
-            target: 4e-3,
+            target: 8e-3,
             replicates: 4,
             flat_resolution: (32, 32),
             seed: 1,
@@ -432,7 +432,7 @@ impl Run<'_> {
             if self.saved.due() {
                 self.saved.save(0, || state.bytes(Some(&now), flats));
             }
-            let settled = now.late > 0 || now.settling.missing(LATE as i32).is_some_and(|m| m < s.target);
+            let settled = now.late > 0 || now.settling.missing(LATE).is_some_and(|m| m < s.target);
             let bounce = now.bounce + 1;
             let late = settled || bounce + LATE > s.max_bounces;
             let directions = match () {
@@ -477,8 +477,7 @@ impl Run<'_> {
             state.counts.gather_rays += state.counts.valid * total as u64;
             now.late += usize::from(late && !fixed);
             let settles = !fixed && !late;
-            #[allow(clippy::cast_possible_truncation, reason = "a number in [1, 2]")]
-            let omega = now.settling.omega.map(|x| x as f32);
+            let omega = now.settling.omega();
             if settles {
                 flats.settle(omega);
             } else {

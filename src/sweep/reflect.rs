@@ -133,7 +133,7 @@ impl<'a> Mirror<'a> {
                     let y = &rows[0];
                     if let Some((old, _)) = relaxed {
                         let x = old.b[s][row * nx..].iter().map(|x| unit / old.unit * half::decode(x[c]));
-                        sums.change[c] = changed(y, &shown[0], x);
+                        (sums.change[c], sums.drift[c]) = changed(y, &shown[0], x);
                     }
                     sums.light[c] = y.iter().map(|y| f64::from(*y)).sum();
                     if omega[c] == 1.0 {
@@ -172,10 +172,11 @@ struct Rows {
     laplacian: Vec<f32>,
 }
 
-/// Σ|y − x| over nodes that are shown; y as it will be kept.
+/// Σ|y − x| and Σ(y − x) over nodes that are shown; y as it will be kept.
 #[inline(always)]
-fn changed(y: &[f32], shown: &[f32], x: impl Iterator<Item = f32>) -> f64 {
-    y.iter().zip(shown).zip(x).map(|((y, is), x)| f64::from(is * (half::decode(half::encode(*y)) - x).abs())).sum()
+fn changed(y: &[f32], shown: &[f32], x: impl Iterator<Item = f32>) -> (f64, f64) {
+    let changes = y.iter().zip(shown).zip(x).map(|((y, is), x)| f64::from(is * (half::decode(half::encode(*y)) - x)));
+    changes.fold((0.0, 0.0), |(sum, drift), x| (sum + x.abs(), drift + x))
 }
 
 /// Sharpens the first row of irradiance, against its neighbours that are shown.

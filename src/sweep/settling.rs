@@ -5,26 +5,32 @@
 //! Chebyshev's ω for ±r: errors shrink by √(ω∞ − 1) a pass, 0.39 where passes alone would leave r = 0.68. \[GV61\]
 
 /// What is known of a replicate's light while few directions spread it, per channel.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub(super) struct Settling {
+    /// Passes, and those since the newest change.
+    pub(super) passes: usize,
+    pub(super) since: usize,
     /// Σ of nodes' light before the first pass.
-    pub(super) first: [f64; 3],
-    /// Σ|y − x| of the last passes, at most [`KNOWN`], the newest last.
-    pub(super) changes: Vec<[f64; 3]>,
-    /// The newest one as a share of indirect light.
-    pub(super) share: [f64; 3],
+    first: [f64; 3],
+    /// Σ|y − x| of the last three passes, the newest last; and the least since r is known.
+    changes: [[f64; 3]; 3],
+    least: [f64; 3],
+    /// Σ|y − x| and |Σ(y − x)| of the last pass as shares of indirect light.
+    share: [f64; 3],
+    drift: [f64; 3],
     /// r, the greatest modulus of an eigenvalue; 0 until it is known.
-    pub(super) radius: [f64; 3],
-    /// ω of the pass to come; 1 makes y the next x.
-    pub(super) omega: [f64; 3],
-    /// Passes since the newest change.
-    pub(super) since: i32,
+    radius: [f64; 3],
+    /// ω of the last three passes and of the one to come; 1 makes y the next x.
+    omega: [[f64; 3]; 4],
 }
 
 /// Passes until r is known. It is taken over two of them, since what goes to and fro makes every other change small.
-pub(super) const KNOWN: usize = 3;
-/// The greatest r that is believed.
+const KNOWN: usize = 3;
+/// The greatest r that is believed, of the slowest light and of all other.
 const MOST: f64 = 0.98;
+const OTHERS: f64 = 0.93;
+/// Changes this much greater than the least tell that ω drives light apart.
+const APART: f64 = 10.0;
 
 /// Sums over nodes that show light of their own and over sides, per channel.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -33,6 +39,8 @@ pub(super) struct Sums {
     pub light: [f64; 3],
     /// Σ|y − x|.
     pub change: [f64; 3],
+    /// Σ(y − x).
+    pub drift: [f64; 3],
 }
 
 impl Sums {
@@ -41,6 +49,7 @@ impl Sums {
         for c in 0..3 {
             self.light[c] += scale * other.light[c];
             self.change[c] += scale * other.change[c];
+            self.drift[c] += scale * other.drift[c];
         }
     }
 }
@@ -48,40 +57,74 @@ impl Sums {
 impl Settling {
     /// Begins at light whose sum is `first`.
     pub(super) fn new(first: [f64; 3]) -> Self {
-        Self { first, omega: [1.0; 3], ..Self::default() }
+        let none = [0.0; 3];
+        Self {
+            passes: 0,
+            since: 0,
+            first,
+            changes: [none; 3],
+            least: [f64::INFINITY; 3],
+            share: none,
+            drift: none,
+            radius: none,
+            omega: [[1.0; 3]; 4],
+        }
+    }
+
+    /// All that a checkpoint holds of it besides counts.
+    pub(super) fn reals(&mut self) -> [&mut [f64; 3]; 12] {
+        let Self { first, changes: [a, b, c], least, share, drift, radius, omega: [d, e, f, g], .. } = self;
+        [first, a, b, c, least, share, drift, radius, d, e, f, g]
+    }
+
+    /// ω of the pass to come.
+    #[allow(clippy::cast_possible_truncation, reason = "a number in [1, 2]")]
+    pub(super) fn omega(&self) -> [f32; 3] {
+        self.omega[3].map(|x| x as f32)
     }
 
     /// Takes what a pass changed.
     pub(super) fn push(&mut self, sums: Sums) {
-        self.since = 0;
-        if self.changes.len() == KNOWN {
-            self.changes.remove(0);
-        }
-        self.changes.push(sums.change);
+        (self.passes, self.since) = (self.passes + 1, 0);
+        self.changes.rotate_left(1);
+        self.changes[2] = sums.change;
+        self.omega.rotate_left(1);
+        self.omega[3] = self.omega[2];
         for c in 0..3 {
-            self.share[c] = sums.change[c] / (sums.light[c] - self.first[c]).max(f64::MIN_POSITIVE);
-            let [old, _, new] = self.changes[..] else { continue };
-            let (old, new) = (old[c], new[c]);
-            self.omega[c] = match self.omega[c] {
-                omega if self.radius[c] > 0.0 => {
-                    // Where light does not settle T is not what ω is for, or rounding is all that is left: passes alone settle.
-                    let apt = omega > 1.0 && new < old;
-                    if apt { 1.0 / (1.0 - self.radius[c].powi(2) * omega / 4.0) } else { 1.0 }
-                }
-                omega if old > 0.0 && new > 0.0 => {
-                    self.radius[c] = (new / old).sqrt().min(MOST);
-                    omega / (1.0 - self.radius[c].powi(2) / 2.0)
-                }
-                omega => omega,
+            let indirect = (sums.light[c] - self.first[c]).max(f64::MIN_POSITIVE);
+            self.share[c] = sums.change[c] / indirect;
+            self.drift[c] = sums.drift[c].abs() / indirect;
+            let [old, _, new] = self.changes.map(|change| change[c]);
+            if self.passes < KNOWN || !(old > 0.0 && new > 0.0) {
+                continue;
+            }
+            // Of a change an eigenvalue λ leaves q in a pass, where ω λ q = q² + ω − 1; ω that of the x which the changes are measured from.
+            let (q, omega) = ((new / old).sqrt(), 0.5 * (self.omega[0][c] + self.omega[1][c]));
+            let begins = self.radius[c] == 0.0;
+            if q * q > omega - 1.0 {
+                self.radius[c] = self.radius[c].max(((q + (omega - 1.0) / q) / omega).min(MOST));
+            }
+            self.least[c] = self.least[c].min(new);
+            let r2 = self.radius[c].powi(2);
+            let omega = &mut self.omega[3][c];
+            *omega = match *omega {
+                _ if begins => 1.0 / (1.0 - r2 / 2.0),
+                omega if omega > 1.0 && new < APART * self.least[c] => 1.0 / (1.0 - r2 * omega / 4.0),
+                // T is not what ω is for: passes alone settle.
+                _ => 1.0,
             };
         }
     }
 
     /// The share of indirect light that is still missing, `more` passes from now: at most |y − x| r / (1 − r) after a pass, as far as
-    /// r is known. `None` before that.
-    pub(super) fn missing(&self, more: i32) -> Option<f64> {
-        let left = |c: usize| self.share[c] * self.radius[c].powi(1 + self.since + more) / (1.0 - self.radius[c]);
-        (self.changes.len() == KNOWN).then(|| (0..3).map(left).fold(0.0, f64::max))
+    /// r is known. `None` before that. Where r is near 1 that is light of one sign everywhere, so that its sum tells; other light
+    /// settles sooner, and rounding, which has no sign, does not count.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, reason = "few passes")]
+    pub(super) fn missing(&self, more: usize) -> Option<f64> {
+        let after = (1 + self.since + more) as i32;
+        let left = |share: f64, r: f64| share * r.powi(after) / (1.0 - r);
+        let of = |c: usize| left(self.drift[c], self.radius[c]).max(left(self.share[c], self.radius[c].min(OTHERS)));
+        (self.passes >= KNOWN).then(|| (0..3).map(of).fold(0.0, f64::max))
     }
 }
 
@@ -99,6 +142,7 @@ mod tests {
     fn settle(spread: impl Fn(&[f64]) -> Vec<f64>, relaxed: bool, target: f64) -> (usize, f64, f64) {
         let direct: Vec<f64> = (0..N).map(|i| if i == 5 { 1.0 } else { 0.0 }).collect();
         let pass = |x: &[f64]| -> Vec<f64> { spread(x).iter().zip(&direct).map(|(t, d)| t + d).collect() };
+        let sum = |x: &[f64]| -> f64 { x.iter().sum() };
         let distance = |a: &[f64], b: &[f64]| -> f64 { a.iter().zip(b).map(|(a, b)| (a - b).abs()).sum() };
         let mut whole = direct.clone();
         (0..1000).for_each(|_| whole = pass(&whole));
@@ -106,9 +150,12 @@ mod tests {
         let mut settling = Settling::new([1.0; 3]);
         for passes in 1..200 {
             let y = pass(&x);
-            let omega = if relaxed { settling.omega[0] } else { 1.0 };
+            let omega = if relaxed { f64::from(settling.omega()[0]) } else { 1.0 };
             let next = before.iter().zip(&y).map(|(b, y)| b + omega * (y - b)).collect();
-            settling.push(Sums { light: [y.iter().sum(); 3], change: [distance(&y, &x); 3] });
+            if !relaxed {
+                settling.omega[3] = [1.0; 3];
+            }
+            settling.push(Sums { light: [sum(&y); 3], change: [distance(&y, &x); 3], drift: [sum(&y) - sum(&x); 3] });
             if let Some(said) = settling.missing(0).filter(|m| *m < target) {
                 return (passes, distance(&y, &whole) / distance(&whole, &direct), said);
             }
@@ -147,8 +194,8 @@ mod tests {
         let mut settling = Settling::new([2.0, 0.0, 1.0]);
         for _ in 0..KNOWN {
             assert_eq!(settling.missing(0), None);
-            settling.push(Sums { light: [2.0, 0.0, 1.0], change: [0.0; 3] });
+            settling.push(Sums { light: [2.0, 0.0, 1.0], ..Sums::default() });
         }
-        assert_eq!((settling.missing(0), settling.omega), (Some(0.0), [1.0; 3]));
+        assert_eq!((settling.missing(0), settling.omega()), (Some(0.0), [1.0; 3]));
     }
 }

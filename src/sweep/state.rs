@@ -119,11 +119,9 @@ impl State {
                 out.count(reflected.b.len());
                 reflected.b.iter().for_each(|b| out.halves(b.as_flattened().iter().copied()));
             }
-            let s = &p.settling;
-            out.count(s.since.unsigned_abs() as usize);
-            out.count(s.changes.len());
-            let threes = [&s.first, &s.share, &s.radius, &s.omega].into_iter().chain(&s.changes);
-            threes.flatten().for_each(|&x| out.real(x));
+            out.count(p.settling.passes);
+            out.count(p.settling.since);
+            p.settling.clone().reals().into_iter().flatten().for_each(|x| out.real(*x));
             for t in flats.textures.iter().flatten() {
                 out.numbers(&t.radiance);
                 out.count(t.before.len());
@@ -206,11 +204,11 @@ impl State {
                 Some(Reflected { b, unit })
             };
             let (light, before) = (reflected()?, reflected()?);
-            let since = i32::try_from(from.count()?).ok()?;
-            let changes = from.count()?.min(3);
-            let [first, share, radius, omega] = [from.three()?, from.three()?, from.three()?, from.three()?];
-            let changes = (0..changes).map(|_| from.three()).collect::<Option<_>>()?;
-            let settling = Settling { first, changes, share, radius, omega, since };
+            let mut settling = Settling::new([0.0; 3]);
+            (settling.passes, settling.since) = (from.count()?, from.count()?);
+            for three in settling.reals() {
+                *three = from.three()?;
+            }
             let mut textures = Vec::new();
             for t in flats.textures.iter().flatten() {
                 let radiance = from.numbers(t.radiance.len())?;
