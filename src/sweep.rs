@@ -83,7 +83,7 @@ impl Default for SweepSettings {
             directions: 64,
             light_points: 16,
             max_bounces: 64,
-            target: 8e-3,
+            target: 4e-3,
             replicates: 4,
             flat_resolution: (32, 32),
             seed: 1,

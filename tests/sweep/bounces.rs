@@ -1,0 +1,106 @@
+//! How bounces end: what they leave out, and what replicates share.
+
+use super::{bumps, rms, run};
+use glam::DVec3;
+use isolume::polygon::Polygon;
+use isolume::scene::{Boundary, Scene, Surface, cornell_box};
+use isolume::sweep::SweepSettings;
+use isolume::volume::Lattice;
+
+/// What bounces leave out is known where they converged, replicates that start warm among them, and is not 0 where they were cut.
+#[test]
+fn the_residual_of_cut_bounces_is_not_known() {
+    let f = bumps(21);
+    let walls = cornell_box(f.lattice(), 0.0).unwrap();
+    let scene = Scene::new(f, Surface::default(), Boundary::Open, walls).unwrap();
+    for (max_bounces, replicates, known) in [(64, 1, true), (64, 3, true), (2, 1, false), (2, 3, false)] {
+        let settings =
+            SweepSettings { directions: 32, light_points: 4, max_bounces, replicates, ..SweepSettings::default() };
+        let got = run(&scene, settings);
+        println!("at most {max_bounces} bounces, {replicates} replicates: {} left out", got.residual);
+        assert_eq!(got.residual.is_finite(), known);
+        assert!(!known || got.residual > 0.0 && got.residual < settings.target);
+    }
+}
+
+/// The default box with a front, of one albedo.
+fn closed_box(lattice: &Lattice, albedo: DVec3) -> Vec<Polygon> {
+    let mut walls = cornell_box(lattice, 0.0).unwrap();
+    let corner = |(x, z): (f64, f64)| lattice.to_world(DVec3::new(x, 0.0, z) * lattice.far());
+    let front = [(0.0, 0.0), (0.0, 1.0), (1.0, 1.0), (1.0, 0.0)].map(corner).to_vec();
+    walls.push(Polygon::new("front", front, albedo, DVec3::ZERO).unwrap());
+    let reflects = walls.iter_mut().filter(|w| w.emission == DVec3::ZERO);
+    reflects.for_each(|w| w.albedo = albedo);
+    walls
+}
+
+/// Light that counts as settled against light that went on, in closed rooms that are bright, too: the last passes' directions are the
+/// same, so all that differs is what is missing.
+#[test]
+fn settled_light_misses_what_it_says() {
+    let f = bumps(41);
+    let default = cornell_box(f.lattice(), 0.0).unwrap();
+    let colour = DVec3::new(0.9, 0.6, 0.3);
+    let red = (colour, default.clone(), [7, 10]);
+    let room = |x, most| (DVec3::splat(x), closed_box(f.lattice(), DVec3::splat(x)), most);
+    let open = (DVec3::splat(0.75), default, [6, 9]);
+    for (albedo, walls, most) in [open, red, room(0.9, [12, 26]), room(0.97, [25, 28])] {
+        let surface = Surface { albedo: albedo.into(), ..Surface::default() };
+        let scene = Scene::new(f.clone(), surface, Boundary::Open, walls).unwrap();
+        let light = |max_bounces, target| {
+            let settings = SweepSettings {
+                directions: 32,
+                light_points: 4,
+                replicates: 1,
+                max_bounces,
+                target,
+                seed: 1,
+                flat_resolution: (16, 16),
+            };
+            run(&scene, settings)
+        };
+        let (direct, whole) = (light(0, 1.0), light(64, 2e-4));
+        for (target, most) in [3e-2, 4e-3].into_iter().zip(most) {
+            let got = light(64, target);
+            let all = |of: fn(f32, f32, f32) -> f32| -> f64 {
+                let both = got.sides[0].irradiance.iter().zip(&whole.sides[0].irradiance);
+                let three = both.zip(&direct.sides[0].irradiance);
+                three.flat_map(|((a, b), d)| (0..3).map(move |c| f64::from(of(a[c], b[c], d[c])))).sum()
+            };
+            let missing = all(|a, b, _| (a - b).abs()) / all(|_, b, d| b - d);
+            println!(
+                "{albedo}, target {target}: {missing:.5} is missing after {} passes, said {:.5}",
+                got.bounces, got.residual
+            );
+            assert!(missing < got.residual && got.residual < target && missing > 0.05 * got.residual);
+            assert!(got.bounces < whole.bounces && got.bounces <= most);
+        }
+    }
+}
+
+/// The light that replicates share while it spreads is that of all their luminaire points, not of the first one's few: with two each,
+/// the mean indirect light errs less than the mean direct light does (0.5 times as much; 1.4 times where the first one spread its own).
+#[test]
+fn what_bounces_is_the_light_of_all_replicates() {
+    let f = bumps(21);
+    let walls = cornell_box(f.lattice(), 0.0).unwrap();
+    let scene = Scene::new(f, Surface::default(), Boundary::Open, walls).unwrap();
+    let mean = |light_points, max_bounces, seed| {
+        let settings = SweepSettings { directions: 32, light_points, max_bounces, seed, ..SweepSettings::default() };
+        let side = &run(&scene, settings).sides[0];
+        side.irradiance.iter().map(|e| f64::from(e[1])).sum::<f64>()
+    };
+    let parts = |light_points, seed| {
+        let direct = mean(light_points, 0, seed);
+        [direct, mean(light_points, 64, seed) - direct]
+    };
+    let errors: Vec<[f64; 2]> = (1..=8)
+        .map(|seed| {
+            let (few, many) = (parts(2, seed), parts(64, seed));
+            [0, 1].map(|i| few[i] / many[i] - 1.0)
+        })
+        .collect();
+    let [direct, indirect] = [0, 1].map(|i| rms(errors.iter().map(|e| e[i])));
+    println!("direct {direct:.4}, indirect {indirect:.4} {errors:.4?}");
+    assert!(indirect < direct, "{indirect} of indirect, {direct} of direct light");
+}
