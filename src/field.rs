@@ -1,6 +1,10 @@
 //! The function h whose graph is illuminated: a volume's samples mapped so that the sweep is [0, 1], trilinear in
 //! every cell, with its gradient and the one receiver normal that every engine shares.
 
+mod rows;
+
+pub use rows::{FieldRows, GradientRow};
+
 use crate::error::{Error, Result};
 use crate::volume::{Lattice, Volume};
 use glam::DVec3;
@@ -115,21 +119,24 @@ impl Field {
     /// The same function on another lattice over the same Ω: exactly the same where that divides this one's cells.
     /// Receiver normals stay those of this field, so that a finer grid does not sharpen them.
     #[must_use]
-    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     pub fn resampled(&self, lattice: &Lattice) -> Self {
-        let scale = self.lattice.far() / lattice.far();
-        let samples = (0..lattice.len())
-            .into_par_iter()
-            .with_min_len(1 << 14)
-            .map(|o| self.value(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)) * scale) as f32)
-            .collect();
         Self {
             lattice: lattice.clone(),
             sweep: self.sweep,
-            samples,
+            samples: self.samples_at(lattice),
             largest: self.largest,
             coarse: Some(Arc::new(self.clone())),
         }
+    }
+
+    /// h at the points of another lattice over the same Ω, x fastest.
+    pub fn samples_at(&self, lattice: &Lattice) -> Vec<f32> {
+        let [nx, ny, _] = lattice.dims();
+        let rows = FieldRows::new(self, lattice);
+        let mut samples = vec![0.0; lattice.len()];
+        let each = samples.par_chunks_exact_mut(nx).enumerate().with_min_len(16);
+        each.for_each(|(row, to)| rows.values(row % ny, row / ny, to));
+        samples
     }
 
     /// Index coordinates of the coarse field at index coordinates of this one.
@@ -231,6 +238,12 @@ impl Field {
         if let Some(coarse) = &self.coarse {
             return coarse.receiver_gradient(self.to_coarse(coarse, DVec3::new(i as f64, j as f64, k as f64)));
         }
+        self.lattice.gradient_to_world(self.node_differences([i, j, k]))
+    }
+
+    /// [`Field::node_gradient`] in index space.
+    #[inline]
+    fn node_differences(&self, [i, j, k]: [usize; 3]) -> DVec3 {
         let dims = self.lattice.dims();
         let strides = [1, dims[0], dims[0] * dims[1]];
         let at = self.lattice.offset(i, j, k);
@@ -247,7 +260,7 @@ impl Field {
                 _ => 0.0,
             };
         }
-        self.lattice.gradient_to_world(g)
+        g
     }
 
     /// The receiver gradient at `p`: central differences at the nodes, interpolated trilinearly, per world unit.
@@ -328,9 +341,14 @@ fn trilinear_gradient(s: &[f64; 8], u: DVec3) -> DVec3 {
 /// `v` normalised, also for lengths whose square under- or overflows; `None` for 0 and non-finite.
 #[inline]
 fn unit(v: DVec3) -> Option<DVec3> {
-    let scale = v.abs().max_element();
+    has_direction(v).then(|| (v / v.abs().max_element()).normalize())
+}
+
+/// Whether a gradient is neither 0 nor NaN nor infinite: [`Field::falling_normal`] is there.
+#[inline]
+pub(crate) fn has_direction(v: DVec3) -> bool {
     // A largest component leaves NaN aside.
-    if scale > 0.0 && v.is_finite() { Some((v / scale).normalize()) } else { None }
+    v.abs().max_element() > 0.0 && v.is_finite()
 }
 
 #[cfg(test)]
@@ -425,6 +443,40 @@ mod tests {
             assert!((f.receiver_gradient(p) - fine.receiver_gradient(2.0 * p)).length() < 1e-9);
         }
         assert!((fine.node_gradient([3, 2, 5]) - f.receiver_gradient(DVec3::new(1.5, 1.0, 2.5))).length() < 1e-12);
+    }
+
+    /// A lattice whose points lie in cells and on nodes, the field's own, and those of a finer copy; gaps in the samples.
+    #[test]
+    fn rows_hold_what_points_do() {
+        let mut f = oblique(|x| (3.0 * x.x).sin() + (x.y * x.z * 0.002).cos());
+        f.samples[31] = f32::NAN;
+        let axes = f.lattice().axes();
+        let origin = f.lattice().origin();
+        let finer = |n: [usize; 3]| {
+            let far = DVec3::from_array(n.map(|n| (n - 1) as f64));
+            Lattice::new(n, origin, axes * DMat3::from_diagonal(f.lattice().far() / far)).unwrap()
+        };
+        let lattices = [finer([5, 4, 6]), finer([9, 7, 11]), finer([4, 9, 8])];
+        let copy = f.resampled(&lattices[1]);
+        let mut row = GradientRow::default();
+        let mut gaps = 0;
+        for (field, lattice) in lattices.iter().map(|l| (&f, l)).chain([(&copy, &lattices[1])]) {
+            let rows = FieldRows::new(field, lattice);
+            let scale = field.lattice().far() / lattice.far();
+            let [nx, ny, nz] = lattice.dims();
+            for (j, k) in (0..nz).flat_map(|k| (0..ny).map(move |j| (j, k))) {
+                let mut values = vec![0.0; nx];
+                rows.values(j, k, &mut values);
+                let gradients = rows.gradients(j, k, &mut row);
+                for i in 0..nx {
+                    let p = DVec3::new(i as f64, j as f64, k as f64) * scale;
+                    assert_eq!(values[i].to_bits(), (field.value(p) as f32).to_bits(), "{p}");
+                    assert!((gradients[i] - field.receiver_gradient(p)).length() < 1e-12, "{p}");
+                    gaps += usize::from(values[i].is_nan());
+                }
+            }
+        }
+        assert!(gaps > 4);
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Which points of a lattice over Ω the sweep's surfaces need, and points of the graph that can stand for them.
 
-use crate::field::Field;
+use crate::field::{Field, FieldRows, GradientRow, has_direction};
 use crate::rng::{Rng, Stage};
 use crate::volume::Lattice;
 use glam::DVec3;
@@ -30,13 +30,9 @@ pub fn local_position(field: &Field, lattice: &Lattice, o: usize) -> DVec3 {
 /// Where a lattice over Ω holds surfaces of the sweep.
 pub fn masks(field: &Field, lattice: &Lattice) -> Vec<Mask> {
     let dims = lattice.dims();
-    let at = |o: usize| local_position(field, lattice, o);
-    let values: Cow<'_, [f32]> = if lattice == field.lattice() {
-        field.samples().into()
-    } else {
-        #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-        (0..lattice.len()).into_par_iter().map(|o| field.value(at(o)) as f32).collect::<Vec<_>>().into()
-    };
+    let values: Cow<'_, [f32]> =
+        if lattice == field.lattice() { field.samples().into() } else { field.samples_at(lattice).into() };
+    let rows = FieldRows::new(field, lattice);
     let area = dims[0] * dims[1];
     let mut out = vec![Mask::Empty; lattice.len()];
     out.par_chunks_mut(SLICES * area).enumerate().for_each(|(chunk, out)| {
@@ -46,18 +42,25 @@ pub fn masks(field: &Field, lattice: &Lattice) -> Vec<Mask> {
             .map(|z| extrema(&values[z * area..(z + 1) * area], dims[0]))
             .collect();
         let below = first.min(1);
-        for (n, mask) in out.iter_mut().enumerate() {
-            let (z, i, o) = (n / area + below, n % area, first * area + n);
-            let h = values[o];
-            let [lo, hi] =
-                planes[z.saturating_sub(1)..(z + 2).min(planes.len())].iter().fold(NOTHING, |m, p| wider(m, p[i]));
-            *mask = if (0.0..=1.0).contains(&h) && field.falling_normal(at(o)).is_some() {
-                Mask::Valid
-            } else if lo <= 1.0 && hi >= 0.0 && lo < hi {
-                Mask::Filled
-            } else {
-                Mask::Empty
-            };
+        let mut row = GradientRow::default();
+        for (r, out) in out.chunks_exact_mut(dims[0]).enumerate() {
+            let (j, z) = (r % dims[1], r / dims[1]);
+            let values = &values[first * area + r * dims[0]..][..dims[0]];
+            let within = |h: f32| (0.0..=1.0).contains(&h);
+            let own = values.iter().any(|h| within(*h));
+            let gradients = if own { rows.gradients(j, first + z, &mut row) } else { &[] };
+            let (z, across) = (z + below, j * dims[0]);
+            for (i, (mask, &h)) in out.iter_mut().zip(values).enumerate() {
+                let around = planes[z.saturating_sub(1)..(z + 2).min(planes.len())].iter();
+                let [lo, hi] = around.fold(NOTHING, |m, p| wider(m, p[across + i]));
+                *mask = if within(h) && has_direction(gradients[i]) {
+                    Mask::Valid
+                } else if lo <= 1.0 && hi >= 0.0 && lo < hi {
+                    Mask::Filled
+                } else {
+                    Mask::Empty
+                };
+            }
         }
     });
     out
@@ -78,8 +81,7 @@ pub fn lights_itself(field: &Field, lattice: &Lattice, o: usize) -> bool {
         false => field.value(local_position(field, lattice, o)),
     };
     let h = value(o);
-    if !(-OVERSHOOT..=1.0 + OVERSHOOT).contains(&h) || field.falling_normal(local_position(field, lattice, o)).is_none()
-    {
+    if !may_light_itself(h) || field.falling_normal(local_position(field, lattice, o)).is_none() {
         return false;
     }
     let (mut first, mut second, mut step) = (0.0, 0.0, 1);
@@ -92,6 +94,11 @@ pub fn lights_itself(field: &Field, lattice: &Lattice, o: usize) -> bool {
         step *= n;
     }
     second / first < BEND
+}
+
+/// Whether a point with value `h` may hold light of its own level set, in the sweep or by [`lights_itself`].
+pub(crate) fn may_light_itself(h: f64) -> bool {
+    (-OVERSHOOT..=1.0 + OVERSHOOT).contains(&h)
 }
 
 /// Tells which points are to hold light of their own level set: the valid ones, and with `beyond` those just outside the sweep

@@ -171,6 +171,12 @@ impl Polygon {
         (0..n).map(to_edge).fold(f64::INFINITY, f64::min)
     }
 
+    /// Whether a point of the world is less than `reach` away.
+    pub fn is_nearer(&self, x: DVec3, reach: f64) -> bool {
+        // Its plane is no farther.
+        (x - self.vertices[0]).dot(self.normal).abs() < reach && self.distance(x) < reach
+    }
+
     /// Whether texture coordinates cover the polygon exactly.
     pub fn is_parallelogram(&self) -> bool {
         let v = &self.vertices;
@@ -346,6 +352,7 @@ mod tests {
             (a - 0.2 * s - 0.2 * t + 0.1 * p.normal(), 0.3),
         ] {
             assert!((p.distance(x) - expected).abs() < 1e-12, "{x}: {} {expected}", p.distance(x));
+            assert!(p.is_nearer(x, expected + 1e-9) && !p.is_nearer(x, expected - 1e-9), "{x}");
         }
     }
 

@@ -232,14 +232,15 @@ pub fn sweep_resumable(
         state.counts.masked = nodes as u64 - state.counts.valid;
     }
     let spare = Spare::default();
+    let isa = Isa::current();
     let run = Run {
         scene,
         settings,
         geometry: &geometry,
         slits: &slits,
-        mirror: Mirror::new(scene, &geometry, &slits),
+        mirror: Mirror::new(scene, &geometry, &slits, isa),
         sides: &sides,
-        isa: Isa::current(),
+        isa,
         saved,
         spare: &spare,
     };

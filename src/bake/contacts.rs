@@ -56,20 +56,26 @@ impl<'a> Contacts<'a> {
                 wall.albedo != DVec3::ZERO && scene.boundary == Boundary::Open
             })
             .collect();
-        let on_face = |o: usize| lattice.ijk(o).into_iter().zip(dims).any(|(i, n)| i == 0 || i == n - 1);
         let touching = |o: usize| {
             let x = lattice.to_world(local_position(&scene.field, lattice, o));
             let touches = |w: &u32| {
                 let wall = &scene.polygons()[*w as usize];
-                wall.distance(x) < near && (centre - x).dot(wall.normal()) > 0.0
+                wall.is_nearer(x, near) && (centre - x).dot(wall.normal()) > 0.0
             };
             let mut touched = walls.iter().copied().filter(touches);
             let found: [Option<u32>; MOST] = std::array::from_fn(|_| touched.next());
             // Behind a luminaire that covers the wall it is dark.
             found[0].filter(|_| !scene.covers(x)).map(|_| (o, found))
         };
-        let points = (0..lattice.len()).into_par_iter().with_min_len(1 << 12);
-        let points = points.filter(|&o| !walls.is_empty() && on_face(o) && holds(o)).filter_map(touching).collect();
+        let [nx, ny, nz] = dims;
+        let rows = if walls.is_empty() { 0 } else { ny * nz };
+        // Of a row within Ω both ends are on its faces.
+        let on_faces = |row: usize| {
+            let within = (1..ny - 1).contains(&(row % ny)) && (1..nz - 1).contains(&(row / ny));
+            (0..nx).step_by(if within { nx - 1 } else { 1 }).map(move |i| row * nx + i)
+        };
+        let points = (0..rows).into_par_iter().with_min_len(16).flat_map_iter(on_faces);
+        let points = points.filter(|&o| holds(o)).filter_map(touching).collect();
         Self { scene, points }
     }
 

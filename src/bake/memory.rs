@@ -59,12 +59,12 @@ const SWEPT_SIDE: u64 = 26;
 const SUMMED_SIDE: u64 = 9;
 /// Per point and swept side while light settles, before there are such sums: what lines read a pass before, here and in a checkpoint;
 /// and of the sums' bytes those of the spread.
-const SETTLING_SIDE: u64 = 16;
+const SETTLING_SIDE: u64 = 14;
 const SPREAD_SIDE: u64 = 3;
 
 /// Bytes per point and side that its checkpoint holds while a replicate is under way, besides the sums; and per stored side,
 /// when all are done.
-const KEPT_SIDE: u64 = 14;
+const KEPT_SIDE: u64 = 12;
 const DONE_SIDE: u64 = 15;
 
 /// Bytes per fitted point: seven vectors of conjugate gradients.

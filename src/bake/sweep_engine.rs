@@ -144,8 +144,10 @@ fn beside_luminaires(scene: &Scene, masks: &[Mask]) -> Vec<usize> {
     let reach = NEAR * lattice.spacing().max_element();
     let lights: Vec<&Polygon> = scene.luminaires().iter().map(|&l| &scene.polygons()[l as usize]).collect();
     let near = |&o: &usize| {
-        let x = lattice.to_world(local_position(&scene.field, lattice, o));
-        masks[o] == Mask::Valid && lights.iter().any(|light| light.distance(x) < reach)
+        masks[o] == Mask::Valid && {
+            let x = lattice.to_world(local_position(&scene.field, lattice, o));
+            lights.iter().any(|light| light.is_nearer(x, reach))
+        }
     };
     (0..masks.len()).into_par_iter().with_min_len(1 << 12).filter(near).collect()
 }

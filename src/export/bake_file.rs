@@ -5,11 +5,11 @@ use super::multi_block;
 use super::picture::srgb_encode;
 use crate::bake::Bake;
 use crate::error::{Error, Result};
-use crate::field::{Field, Sweep};
+use crate::field::{Field, FieldRows, Sweep};
 use crate::flat::{self, FlatTexture};
 use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
-use crate::mask::{Mask, local_position};
+use crate::mask::Mask;
 use crate::polygon::Polygon;
 use crate::reflectance::Reflectance;
 use crate::scene::{Boundary, Member, Policy, Scene, Surface};
@@ -117,11 +117,9 @@ pub fn write(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
     let lattice = &bake.lattice;
     let own = lattice == &volume.lattice;
     let sweep = scene.field.sweep();
+    let rows = FieldRows::new(&scene.field, lattice);
     let value = |o: usize| {
-        if own {
-            return volume.value(o) as f32;
-        }
-        sweep.from_unit(scene.field.value(local_position(&scene.field, lattice, o))) as f32
+        if own { volume.value(o) as f32 } else { sweep.from_unit(rows.value(lattice.ijk(o))) as f32 }
     };
     let exposure = bake.exposure as f32;
     let mut textures = Vec::new();

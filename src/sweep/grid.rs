@@ -5,9 +5,9 @@ use super::directions::Layout;
 use super::half::{Half4, decode, encode};
 use super::normals;
 use super::planes::{Planes, Spare, transpose, transposed};
-use crate::field::Field;
+use crate::field::{Field, FieldRows, GradientRow};
 use crate::flattened::Side;
-use crate::mask::lights_itself;
+use crate::mask::{lights_itself, may_light_itself};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
@@ -37,20 +37,33 @@ pub(super) struct Blocks {
 }
 
 impl Blocks {
-    /// The blocks of nodes that `is` holds, in rows of `nu`; with `reach` neighbours along the row count too.
-    fn new(nu: usize, rows: usize, (size, reach): (usize, usize), is: impl Fn(usize) -> bool + Sync) -> Self {
-        let rows = (0..rows)
-            .into_par_iter()
-            .with_min_len(64)
-            .map(|row| {
-                let mut bits = 0u64;
-                for i in (0..nu).filter(|i| is(row * nu + i)) {
-                    bits |= 1 << (i.saturating_sub(reach) / size) | 1 << ((i + reach).min(nu - 1) / size);
+    /// The blocks of nodes that `is` holds, in rows of `nu`; those of neighbours along the row, up to `reach`, count too.
+    fn along(nu: usize, rows: usize, (size, reach): (usize, usize), is: impl Fn(usize) -> bool + Sync) -> Self {
+        let holds = |row: usize, block: usize| {
+            let (a, b) = ((block * size).saturating_sub(reach), ((block + 1) * size + reach).min(nu));
+            // No early end: vectors look at many nodes at a time.
+            (a..b).fold(false, |any, i| any | is(row * nu + i))
+        };
+        let bits = |row| (0..nu.div_ceil(size)).fold(0, |bits, block| bits | u64::from(holds(row, block)) << block);
+        Self { size, rows: (0..rows).into_par_iter().with_min_len(64).map(bits).collect() }
+    }
+
+    /// The same in y, z, x order of nodes in x, y, z order.
+    fn across([nx, ny, nz]: [usize; 3], (size, reach): (usize, usize), is: impl Fn(usize) -> bool + Sync) -> Self {
+        let slice = |z: usize| {
+            let mut rows = vec![0u64; nx];
+            for y in 0..ny {
+                let (a, b) = (y.saturating_sub(reach) / size, (y + reach).min(ny - 1) / size);
+                let bits = (u64::MAX << a) & (u64::MAX >> (63 - b));
+                let at = (z * ny + y) * nx;
+                for (x, row) in rows.iter_mut().enumerate() {
+                    *row |= if is(at + x) { bits } else { 0 };
                 }
-                bits
-            })
-            .collect();
-        Self { size, rows }
+            }
+            rows
+        };
+        let slices: Vec<Vec<u64>> = (0..nz).into_par_iter().with_max_len(4).map(slice).collect();
+        Self { size, rows: (0..nx).flat_map(|x| slices.iter().map(move |slice| slice[x])).collect() }
     }
 
     /// Joins every row with its neighbours along both other axes, the faster of which has `inner` rows.
@@ -115,11 +128,18 @@ impl Source<'_> {
 impl<'a> Geometry<'a> {
     pub(super) fn new(field: &'a Field) -> Self {
         let (dims, h) = (field.lattice().dims(), field.samples());
-        let mut normals: Vec<u32> = (0..h.len())
-            .into_par_iter()
-            .with_min_len(1 << 12)
-            .map(|at| normals::encode(-field.node_gradient(field.lattice().ijk(at))))
-            .collect();
+        let mut normals = vec![0; h.len()];
+        let [nx, ny, nz] = dims;
+        let rows = FieldRows::new(field, field.lattice());
+        let each = normals.par_chunks_exact_mut(nx).zip(h.par_chunks_exact(nx)).enumerate().with_min_len(16);
+        each.for_each_init(GradientRow::default, |gradients, (row, (normals, h))| {
+            let wanted = |h: f32| may_light_itself(f64::from(h));
+            if !h.iter().any(|h| wanted(*h)) {
+                return;
+            }
+            let nodes = normals.iter_mut().zip(h).zip(rows.gradients(row % ny, row / ny, gradients));
+            nodes.filter(|((_, h), _)| wanted(**h)).for_each(|((normal, _), g)| *normal = normals::encode(-*g));
+        });
         let on_surface = |(h, n): (&f32, &u32)| (0.0..=1.0).contains(h) && *n != 0;
         let mut lit: Vec<bool> = h.par_iter().zip(&normals).with_min_len(1 << 14).map(on_surface).collect();
         let near = |at: &u32| normals[*at as usize] != 0 && lights_itself(field, field.lattice(), *at as usize);
@@ -129,24 +149,16 @@ impl<'a> Geometry<'a> {
         normals.par_iter_mut().zip(&lit).with_min_len(1 << 14).filter(|(_, lit)| !**lit).for_each(|(n, _)| *n = 0);
         let rings = rings(dims, &lit);
         let h_transposed = transposed(h, dims);
-        let [nx, ny, nz] = dims;
-        // From y, z, x order.
-        let place = |at: usize| {
-            let (row, y) = (at / ny, at % ny);
-            (row % nz * ny + y) * nx + row / nz
-        };
         // Whole vectors are accumulated; packs of lines start anywhere.
         let whole = |n: usize| (n.div_ceil(64).next_multiple_of(16), 0);
-        let lit_blocks = [
-            Blocks::new(nx, ny * nz, whole(nx), |at| lit[at]),
-            Blocks::new(ny, nz * nx, whole(ny), |at| lit[place(at)]),
-        ];
+        let lit_blocks =
+            [Blocks::along(nx, ny * nz, whole(nx), |at| lit[at]), Blocks::across(dims, whole(ny), |at| lit[at])];
         let fine = |n: usize| (n.div_ceil(64), 1);
         let awake = [Side::Lower, Side::Higher].map(|side| {
-            let reaches = |h: f32| if side == Side::Lower { !(h < 0.0) } else { !(h > 1.0) };
+            let reaches = |at: usize| if side == Side::Lower { !(h[at] < 0.0) } else { !(h[at] > 1.0) };
             [
-                Blocks::new(nx, ny * nz, fine(nx), |at| reaches(h[at])).joined(ny),
-                Blocks::new(ny, nz * nx, fine(ny), |at| reaches(h_transposed[at])).joined(nz),
+                Blocks::along(nx, ny * nz, fine(nx), reaches).joined(ny),
+                Blocks::across(dims, fine(ny), reaches).joined(nz),
             ]
         });
         Self { dims, h, h_transposed, normals, rings, lit_blocks, awake }
@@ -310,12 +322,15 @@ fn ring([nx, ny, nz]: [usize; 3], known: &[bool]) -> Vec<u32> {
         to
     };
     let wide = along(&along(&along(known, 1, nx), nx, ny), nx * ny, nz);
-    (0..known.len())
-        .into_par_iter()
-        .with_min_len(1 << 14)
-        .filter(|&at| wide[at] && !known[at])
-        .map(|at| at as u32)
-        .collect()
+    // Most runs of nodes have none.
+    const RUN: usize = 256;
+    let runs = wide.par_chunks(RUN).zip(known.par_chunks(RUN)).enumerate().with_min_len(64);
+    runs.flat_map_iter(|(run, (wide, known))| {
+        let any = wide.iter().zip(known).fold(false, |any, (wide, known)| any | (*wide & !*known));
+        let places = if any { 0..wide.len() } else { 0..0 };
+        places.filter(move |&i| wide[i] && !known[i]).map(move |i| (run * RUN + i) as u32)
+    })
+    .collect()
 }
 
 /// Nodes without light that share a cell with a lit node, then those that share a cell with these.
@@ -335,6 +350,42 @@ mod tests {
     use super::*;
     use crate::field::Sweep;
     use crate::volume::{Lattice, Samples, Volume};
+
+    /// Blocks of every size, of nodes in either order, against all nodes one by one.
+    #[test]
+    fn blocks_hold_what_is_within_reach() {
+        let dims = [37, 9, 11];
+        let [nx, ny, nz] = dims;
+        let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::ONE).unwrap();
+        let is = |o: usize| matches!(lattice.ijk(o), [5, 3, _] | [36, 8, 2] | [_, 0, 7]);
+        for (size, reach) in [(1, 0), (1, 1), (2, 1), (16, 0), (16, 1)] {
+            let (along, across) =
+                (Blocks::along(nx, ny * nz, (size, reach), is), Blocks::across(dims, (size, reach), is));
+            let holds = |n: usize, block: usize, at: &dyn Fn(usize) -> usize| {
+                (0..n).any(|i| is(at(i)) && (i.saturating_sub(reach) / size..=(i + reach) / size).contains(&block))
+            };
+            for (y, z) in (0..nz).flat_map(|z| (0..ny).map(move |y| (y, z))) {
+                for block in 0..nx.div_ceil(size) {
+                    let expected = holds(nx, block, &|x| lattice.offset(x, y, z));
+                    assert_eq!(
+                        along.rows[z * ny + y] >> block & 1 == 1,
+                        expected,
+                        "{size} {reach}: {block} of {y} {z}"
+                    );
+                }
+            }
+            for (x, z) in (0..nz).flat_map(|z| (0..nx).map(move |x| (x, z))) {
+                for block in 0..ny.div_ceil(size) {
+                    let expected = holds(ny, block, &|y| lattice.offset(x, y, z));
+                    assert_eq!(
+                        across.rows[x * nz + z] >> block & 1 == 1,
+                        expected,
+                        "{size} {reach}: {block} of {x} {z}"
+                    );
+                }
+            }
+        }
+    }
 
     /// Lit nodes in a corner, across blocks of rows, and in a row of their own.
     #[test]

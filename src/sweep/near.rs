@@ -6,6 +6,7 @@ use super::grid::Geometry;
 use super::pack::LANES;
 use super::points::Points;
 use super::segments::Segments;
+use crate::field::Field;
 use crate::flattened::Side;
 use crate::isa::Isa;
 use crate::luminaire::{Aim, unoccluded};
@@ -37,51 +38,92 @@ pub(super) fn look(
         if !(lo.y..=hi.y).contains(&j) || !(lo.z..=hi.z).contains(&k) {
             return;
         }
+        let mut looks =
+            Looks { isa, h: geometry.h, sums, segments: Segments::NONE, taken: 0, looks: [Look::NONE; LANES] };
         geometry.lit_nodes(row, |i| {
             let x = DVec3::new(i as f64, j, k);
             let world = lattice.to_world(x);
-            if !(lo.x..=hi.x).contains(&x.x) || light.distance(world) >= reach {
+            if !(lo.x..=hi.x).contains(&x.x) || !light.is_nearer(world, reach) {
                 return;
             }
             let at = row * nx + i;
             let Some(normal) = geometry.normal(at) else { return };
             let h = geometry.h[at];
             for (s, &side) in sides.iter().enumerate() {
+                looks.sums[i * per + s] = [0.0; 2];
                 let normal = if side == Side::Lower { normal } else { -normal };
                 let open = unoccluded(light, world, normal);
-                let aim = if open > 0.0 { Aim::best(light, world, normal, open) } else { None };
+                let Some(aim) = (if open > 0.0 { Aim::best(light, world, normal, open) } else { None }) else {
+                    continue;
+                };
                 let key = 1 << 62 | u64::from(number) << 40 | (at * per + s) as u64;
                 let set = Sobol::set(seed, Stage::Sweep, key);
-                let sample = |aim: &Aim, n: usize| {
-                    let (y, g) = aim.sample(set.point2((replicate * count + n) as u32, 0));
-                    (lattice.to_index(y), g)
-                };
-                let mut sum = [0f64; 2];
-                for first in (0..count).step_by(LANES) {
-                    let Some(aim) = &aim else { break };
-                    let mut segments = Segments::NONE;
-                    let mut weights = [0.0; LANES];
-                    for (lane, weight) in weights.iter_mut().enumerate().take(count - first) {
-                        let (y, g) = sample(aim, first + lane);
-                        sum[1] += g;
-                        if g > 0.0 && !blockers.block(number, None, y, x) {
-                            *weight = g;
-                            segments.set_before(lane, &scene.field, y, x);
-                        }
-                    }
-                    isa.extrema(geometry.h, &mut segments);
-                    for (lane, g) in weights.into_iter().enumerate() {
-                        let open = match side {
-                            Side::Lower => segments.most[lane] < h,
-                            Side::Higher => segments.least[lane] >= h,
-                        };
-                        sum[0] += if open { g } else { 0.0 };
+                for n in replicate * count..(replicate + 1) * count {
+                    let (y, g) = aim.sample(set.point2(n as u32, 0));
+                    looks.sums[i * per + s][1] += g as f32;
+                    let y = lattice.to_index(y);
+                    if g > 0.0 && !blockers.block(number, None, y, x) {
+                        looks.add(&scene.field, [y, x], Look { place: i * per + s, side, h, g: g as f32 });
                     }
                 }
-                sums[i * per + s] = sum.map(|x| x as f32);
             }
         });
+        looks.finish();
     });
+}
+
+/// One from a node at a point.
+#[derive(Clone, Copy)]
+struct Look {
+    /// Where the node's sums are, its side and its isovalue.
+    place: usize,
+    side: Side,
+    h: f32,
+    /// What the point gives if it is seen.
+    g: f32,
+}
+
+impl Look {
+    const NONE: Self = Self { place: 0, side: Side::Lower, h: 0.0, g: 0.0 };
+}
+
+/// Looks of the nodes of a row, as many at a time as there are lanes.
+struct Looks<'a> {
+    isa: Isa,
+    h: &'a [f32],
+    sums: &'a mut [[f32; 2]],
+    segments: Segments,
+    taken: usize,
+    looks: [Look; LANES],
+}
+
+impl Looks<'_> {
+    fn add(&mut self, field: &Field, [y, x]: [DVec3; 2], look: Look) {
+        let enough = match look.side {
+            Side::Lower => [f32::NEG_INFINITY, look.h],
+            Side::Higher => [look.h, f32::INFINITY],
+        };
+        self.segments.set_before(self.taken, field, y, x, enough);
+        self.looks[self.taken] = look;
+        self.taken += 1;
+        if self.taken == LANES {
+            self.finish();
+        }
+    }
+
+    /// Adds what those that were taken see.
+    fn finish(&mut self) {
+        self.isa.extrema(self.h, &mut self.segments);
+        let Segments { least, most, .. } = &self.segments;
+        for (lane, look) in self.looks[..self.taken].iter().enumerate() {
+            let open = match look.side {
+                Side::Lower => most[lane] < look.h,
+                Side::Higher => least[lane] >= look.h,
+            };
+            self.sums[look.place][0] += if open { look.g } else { 0.0 };
+        }
+        (self.segments, self.taken) = (Segments::NONE, 0);
+    }
 }
 
 /// Bounds of all nodes within `reach` of a luminaire.

@@ -6,6 +6,7 @@ use super::half::{self, Half4};
 use super::planes::NodeLight;
 use super::settling::Sums;
 use super::slits::Slits;
+use crate::isa::Isa;
 use crate::scene::Scene;
 use glam::DVec3;
 use rayon::prelude::*;
@@ -34,11 +35,12 @@ pub(super) struct Mirror<'a> {
     scene: &'a Scene,
     geometry: &'a Geometry<'a>,
     slits: &'a Slits,
+    isa: Isa,
 }
 
 impl<'a> Mirror<'a> {
-    pub(super) fn new(scene: &'a Scene, geometry: &'a Geometry<'a>, slits: &'a Slits) -> Self {
-        Self { scene, geometry, slits }
+    pub(super) fn new(scene: &'a Scene, geometry: &'a Geometry<'a>, slits: &'a Slits, isa: Isa) -> Self {
+        Self { scene, geometry, slits, isa }
     }
 
     /// Which nodes of a row along x have light of their own to reflect: 1, the others 0.
@@ -87,7 +89,16 @@ impl<'a> Mirror<'a> {
         flats.pack(unit);
         let [nx, ny, nz] = self.geometry.dims;
         let n = nx * ny * nz;
-        let from = unit / memory.unit;
+        let job = Job {
+            light,
+            emission: emission.map(|e| unit * e),
+            over_pi: greatest.map(|rho| unit * rho),
+            by_node: by_node.as_deref(),
+            unit,
+            old: relaxed.map(|(old, _)| (old, unit / old.unit)),
+            omega,
+            memory: unit / memory.unit,
+        };
         let mut memory = memory.b.into_iter();
         let mut sums = Sums::default();
         let b = (0..sides).map(|s| {
@@ -101,12 +112,11 @@ impl<'a> Mirror<'a> {
                     (k > 0).then(|| row - ny),
                     (k + 1 < nz).then_some(row + ny),
                 ];
-                let mut sums = Sums::default();
-                let Rows { shown, light: rows, laplacian } = rows;
+                let shown = &mut rows.shown;
                 self.shown(row, &mut shown[0]);
                 if !shown[0].contains(&1.0) {
                     b.fill([0; 4]);
-                    return sums;
+                    return Sums::default();
                 }
                 for (shown, row) in shown.iter_mut().zip(beside).skip(1) {
                     match row {
@@ -114,38 +124,7 @@ impl<'a> Mirror<'a> {
                         None => shown.clear(),
                     }
                 }
-                for c in 0..3 {
-                    for (to, row) in rows.iter_mut().zip(beside) {
-                        to.clear();
-                        if let Some(row) = row {
-                            to.resize(nx, 0.0);
-                            light.iter().for_each(|(light, scale)| light.add((s, c), *scale, row * nx, to));
-                        }
-                    }
-                    sharpen(rows, shown, laplacian);
-                    let (le, rho) = (unit * emission[c], unit * greatest[c]);
-                    let y = rows[0].iter_mut().zip(&shown[0]);
-                    if let Some(by_node) = &by_node {
-                        y.zip(&by_node[row * nx..]).for_each(|((y, is), rho)| *y = is * (le + unit * rho[c] * *y));
-                    } else {
-                        y.for_each(|(y, is)| *y = is * (le + rho * *y));
-                    }
-                    let y = &rows[0];
-                    if let Some((old, _)) = relaxed {
-                        let x = old.b[s][row * nx..].iter().map(|x| unit / old.unit * half::decode(x[c]));
-                        (sums.change[c], sums.drift[c]) = changed(y, &shown[0], x);
-                    }
-                    sums.light[c] = y.iter().map(|y| f64::from(*y)).sum();
-                    if omega[c] == 1.0 {
-                        b.iter_mut().zip(y).for_each(|(b, y)| b[c] = half::encode(*y));
-                        continue;
-                    }
-                    for (b, y) in b.iter_mut().zip(y) {
-                        let before = from * half::decode(b[c]);
-                        b[c] = half::encode((before + omega[c] * (y - before)).max(0.0));
-                    }
-                }
-                sums
+                self.isa.reflect(&job, s, beside, rows, b)
             });
             // Added up row after row: the same bits on any number of threads.
             let rows: Vec<Sums> = rows.collect();
@@ -166,17 +145,116 @@ type Cross = [Vec<f32>; 5];
 
 /// Rows of nodes at work.
 #[derive(Default)]
-struct Rows {
+pub(super) struct Rows {
     shown: Cross,
     light: Cross,
     laplacian: Vec<f32>,
+    /// What the row reflects, per channel, times the unit.
+    reflected: [Vec<f32>; 3],
+}
+
+/// What is done to every row of nodes.
+pub(super) struct Job<'a> {
+    light: &'a [(NodeLight<'a>, f32)],
+    /// Times the unit.
+    emission: [f32; 3],
+    /// ρ/π, times the unit; where it differs from node to node, as it is.
+    over_pi: [f32; 3],
+    by_node: Option<&'a [[f32; 3]]>,
+    unit: f32,
+    /// What the pass read, and what makes it of this unit.
+    old: Option<(&'a Reflected, f32)>,
+    omega: [f32; 3],
+    /// What makes `b` as it was of this unit.
+    memory: f32,
+}
+
+/// What nodes of a row reflect on side `s`, into `b`. `beside` are the numbers of the row and of those around it, of which `rows` tell what
+/// is shown.
+#[inline(always)]
+pub(super) fn reflect_row(job: &Job, s: usize, beside: [Option<usize>; 5], rows: &mut Rows, b: &mut [Half4]) -> Sums {
+    let nx = b.len();
+    let first = beside[0].map_or(0, |row| row * nx);
+    let Rows { shown, light, laplacian, reflected } = rows;
+    for c in 0..3 {
+        for (to, row) in light.iter_mut().zip(beside) {
+            to.clear();
+            if let Some(row) = row {
+                to.resize(nx, 0.0);
+                job.light.iter().for_each(|(light, scale)| light.add((s, c), *scale, row * nx, to));
+            }
+        }
+        sharpen(light, shown, laplacian);
+        reflected[c].clear();
+        reflected[c].extend_from_slice(&light[0]);
+        let (y, is) = (&mut reflected[c][..nx], &shown[0][..nx]);
+        let le = job.emission[c];
+        if let Some(by_node) = job.by_node {
+            let by_node = &by_node[first..][..nx];
+            for i in 0..nx {
+                y[i] = is[i] * (le + job.unit * by_node[i][c] * y[i]);
+            }
+        } else {
+            for i in 0..nx {
+                y[i] = is[i] * (le + job.over_pi[c] * y[i]);
+            }
+        }
+    }
+    let mut sums = Sums::default();
+    let [r, g, blue] = reflected;
+    let y = [&r[..nx], &g[..nx], &blue[..nx]];
+    sums.light = [0, 1, 2].map(|c| sum(y[c]));
+    if let Some((old, scale)) = job.old {
+        let old = &old.b[s][first..][..nx];
+        for c in 0..3 {
+            (sums.change[c], sums.drift[c]) = changed(y[c], &shown[0], laplacian, |i| scale * half::decode(old[i][c]));
+        }
+    }
+    if job.omega == [1.0; 3] {
+        for i in 0..nx {
+            b[i] = [half::encode(y[0][i]), half::encode(y[1][i]), half::encode(y[2][i]), 0];
+        }
+        return sums;
+    }
+    for i in 0..nx {
+        let next = |c: usize| {
+            let before = job.memory * half::decode(b[i][c]);
+            half::encode((before + job.omega[c] * (y[c][i] - before)).max(0.0))
+        };
+        b[i] = [next(0), next(1), next(2), 0];
+    }
+    sums
+}
+
+/// Partial sums, so that vectors can be added.
+const PARTS: usize = 8;
+
+/// Σ x.
+#[inline(always)]
+fn sum(x: &[f32]) -> f64 {
+    let (whole, rest) = x.as_chunks::<PARTS>();
+    let mut parts = [0f64; PARTS];
+    for x in whole {
+        for i in 0..PARTS {
+            parts[i] += f64::from(x[i]);
+        }
+    }
+    parts.iter().sum::<f64>() + rest.iter().map(|x| f64::from(*x)).sum::<f64>()
 }
 
 /// Σ|y − x| and Σ(y − x) over nodes that are shown; y as it will be kept.
 #[inline(always)]
-fn changed(y: &[f32], shown: &[f32], x: impl Iterator<Item = f32>) -> (f64, f64) {
-    let changes = y.iter().zip(shown).zip(x).map(|((y, is), x)| f64::from(is * (half::decode(half::encode(*y)) - x)));
-    changes.fold((0.0, 0.0), |(sum, drift), x| (sum + x.abs(), drift + x))
+fn changed(y: &[f32], shown: &[f32], change: &mut Vec<f32>, x: impl Fn(usize) -> f32) -> (f64, f64) {
+    let n = y.len();
+    change.clear();
+    change.resize(n, 0.0);
+    let (change, shown) = (&mut change[..n], &shown[..n]);
+    for i in 0..n {
+        change[i] = shown[i] * (half::decode(half::encode(y[i])) - x(i));
+    }
+    let drift = sum(change);
+    change.iter_mut().for_each(|x| *x = x.abs());
+    (sum(change), drift)
 }
 
 /// Sharpens the first row of irradiance, against its neighbours that are shown.
@@ -203,6 +281,7 @@ fn sharpen(light: &mut Cross, shown: &Cross, laplacian: &mut Vec<f32>) {
 mod tests {
     use super::*;
     use crate::rng::{Rng, Stage};
+    use crate::sweep::planes::HalfPlanes;
 
     /// Of a field whose second differences are known: read as lines do, at any place, it is itself on average. Without sharpening the
     /// mean would be off by 0.083.
@@ -258,6 +337,46 @@ mod tests {
             sharpen(&mut sharp, &rows(&is, row), &mut Vec::new());
             for (sharp, _) in sharp[0].iter().zip(&shown[10 * row..]).filter(|x| *x.1) {
                 assert_eq!(*sharp, 0.7);
+            }
+        }
+    }
+
+    /// Rows of random light, some of it not shown, with and without memory, ω and an albedo of every node's own.
+    #[test]
+    fn every_instruction_set_reflects_the_same_bits() {
+        let (nx, rows) = (61, 5);
+        let mut rng = Rng::stream(3, Stage::Test, 0);
+        let mut random = |n: usize| -> Vec<f32> { (0..n).map(|_| (rng.unit() * 1.3 - 0.3).max(0.0) as f32).collect() };
+        let planes: Vec<[Vec<f32>; 3]> = vec![std::array::from_fn(|_| random(nx * rows))];
+        let half = vec![HalfPlanes::new(&planes[0], 0.7, None)];
+        let shown: Cross = std::array::from_fn(|_| random(nx).iter().map(|x| f32::from(*x > 0.1)).collect());
+        let albedo: Vec<[f32; 3]> = random(nx * rows).iter().map(|x| [*x, 0.5 * x, 0.3]).collect();
+        let packed = |x: Vec<f32>| x.iter().map(|x| [half::encode(*x), half::encode(0.3 * x), 0, 0]).collect();
+        let old = Reflected { b: vec![packed(random(nx * rows))], unit: 2.0 };
+        let before: Vec<Half4> = packed(random(nx));
+        for (by_node, omega) in [(None, None), (None, Some([1.2, 1.1, 1.0])), (Some(&albedo[..]), Some([1.0; 3]))] {
+            let job = Job {
+                light: &[(NodeLight::Full(&planes), 1.0), (NodeLight::Half(&half), 0.5)],
+                emission: [0.1, 0.0, 0.2],
+                over_pi: [0.4, 0.6, 0.2],
+                by_node,
+                unit: 4.0,
+                old: omega.map(|_| (&old, 2.0)),
+                omega: omega.unwrap_or([1.0; 3]),
+                memory: 0.5,
+            };
+            let run = |isa: Isa| {
+                let mut b = before.clone();
+                let mut rows = Rows { shown: shown.clone(), ..Rows::default() };
+                let beside = [Some(2), Some(1), Some(3), Some(0), Some(4)];
+                let sums = isa.reflect(&job, 0, beside, &mut rows, &mut b);
+                (b, [sums.light, sums.change, sums.drift].map(|x| x.map(f64::to_bits)))
+            };
+            let plain = run(Isa::PLAIN);
+            let lit = plain.0.iter().filter(|b| b[1] > 0).count();
+            assert!(plain.0.iter().all(|b| b[3] == 0) && lit > nx / 4, "{lit}");
+            for isa in Isa::found() {
+                assert_eq!(plain, run(isa), "{isa:?}");
             }
         }
     }

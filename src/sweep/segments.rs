@@ -1,4 +1,4 @@
-//! Extrema of h along many segments at once: what stands between points of a wall and points of a luminaire.
+//! Extrema of h along many segments at once: what stands between receivers and points of a luminaire.
 
 use super::pack::LANES;
 use crate::field::Field;
@@ -15,12 +15,15 @@ pub(super) struct Segments {
     pub last: [[i32; LANES]; 2],
     /// Strides of the two other axes and the dominant one.
     pub stride: [[i32; LANES]; 3],
-    /// First slice and number of slices, all inside Ω.
+    /// First slice, number of slices, all inside Ω, and the way from one to the next: 1 or −1.
     pub first: [i32; LANES],
     pub count: [i32; LANES],
+    pub way: [i32; LANES],
     /// Least and greatest h so far.
     pub least: [f32; LANES],
     pub most: [f32; LANES],
+    /// Who finds less than the first or as much as the second looks no further.
+    pub enough: [[f32; LANES]; 2],
 }
 
 impl Segments {
@@ -32,8 +35,10 @@ impl Segments {
         stride: [[0; LANES]; 3],
         first: [0; LANES],
         count: [0; LANES],
+        way: [1; LANES],
         least: [f32::INFINITY; LANES],
         most: [f32::NEG_INFINITY; LANES],
+        enough: [[f32::NEG_INFINITY; LANES], [f32::INFINITY; LANES]],
     };
 
     /// Takes the segment from local `a` to `b` into `lane`, clipped to Ω, with h at its ends; (∞, −∞) if it misses Ω.
@@ -41,9 +46,11 @@ impl Segments {
         self.place::<false>(lane, field, a, b);
     }
 
-    /// As [`Segments::set`] to a node, without h at that node itself.
-    pub(super) fn set_before(&mut self, lane: usize, field: &Field, a: DVec3, node: DVec3) {
+    /// As [`Segments::set`] to a node, without h at that node itself, from the node on until less than `enough`\[0\] or as much as
+    /// `enough`\[1\] is found.
+    pub(super) fn set_before(&mut self, lane: usize, field: &Field, a: DVec3, node: DVec3, enough: [f32; 2]) {
         self.place::<true>(lane, field, a, node);
+        (self.enough[0][lane], self.enough[1][lane]) = enough.into();
     }
 
     #[allow(
@@ -99,16 +106,21 @@ impl Segments {
         } else if BEFORE {
             first += 1;
         }
-        (self.first[lane], self.count[lane]) = (first, (end + 1 - first).max(0));
+        self.count[lane] = (end + 1 - first).max(0);
+        (self.first[lane], self.way[lane]) = if BEFORE && d[axis] > 0.0 { (end, -1) } else { (first, 1) };
     }
 
-    /// Takes h of all slices into the extrema, bilinear in each; NaN counts nothing. `h`: the samples of the fields of
-    /// [`Segments::set`].
+    /// Takes h of all slices into the extrema, bilinear in each, or of as many as a lane needs to find enough; NaN counts nothing.
+    /// `h`: the samples of the fields of [`Segments::set`].
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
     pub(super) fn march(&mut self, h: &[f32]) {
         for lane in 0..LANES {
             let stride = self.stride.map(|s| s[lane] as usize);
-            for k in self.first[lane]..self.first[lane] + self.count[lane] {
+            for step in 0..self.count[lane] {
+                if self.least[lane] < self.enough[0][lane] || self.most[lane] >= self.enough[1][lane] {
+                    break;
+                }
+                let k = self.first[lane] + step * self.way[lane];
                 let x = [0, 1].map(|i| (self.start[i][lane] + k as f32 * self.slope[i][lane]).max(0.0));
                 let cell = [0, 1].map(|i| (x[i] as i32).min(self.last[i][lane]));
                 let [f, g] = [0, 1].map(|i| (x[i] - cell[i] as f32).min(1.0));
@@ -163,6 +175,50 @@ mod tests {
                 assert!(off < 1e-5, "{a} to {b}: {off}");
             }
         }
+    }
+
+    /// From nodes of noise to points around: whether all is below or none, told from the slices that are needed, is what all of them tell,
+    /// and the first ones beside the node are enough to tell that something is there.
+    #[test]
+    fn who_has_found_enough_looks_no_further() {
+        let mut rng = Rng::stream(4, Stage::Test, 0);
+        let noise = field([12, 9, 15], |_| rng.unit());
+        let mut rng = Rng::stream(5, Stage::Test, 0);
+        let mut told = [0; 2];
+        for _ in 0..200 {
+            let mut point = || DVec3::new(rng.unit(), rng.unit(), rng.unit());
+            let node = (point() * noise.lattice().far()).round();
+            let ends: [DVec3; LANES] = std::array::from_fn(|_| node + 12.0 * (point() - 0.5));
+            let h = noise.value(node) as f32;
+            let marched = |enough| {
+                let mut segments = Segments::NONE;
+                ends.iter().enumerate().for_each(|(lane, y)| segments.set_before(lane, &noise, *y, node, enough));
+                segments.march(noise.samples());
+                segments
+            };
+            let all = marched([f32::NEG_INFINITY, f32::INFINITY]);
+            let [lower, higher] = [marched([f32::NEG_INFINITY, h]), marched([h, f32::INFINITY])];
+            for (lane, end) in ends.into_iter().enumerate() {
+                assert_eq!(lower.most[lane] < h, all.most[lane] < h, "lower side");
+                assert_eq!(higher.least[lane] >= h, all.least[lane] >= h, "higher side");
+                told[0] += usize::from(all.most[lane] >= h && lower.most[lane] < all.most[lane]);
+                // In the slice next to the node, if not at the other end.
+                let slices = |count: i32| {
+                    let mut first = Segments::NONE;
+                    first.set_before(0, &noise, end, node, [f32::NEG_INFINITY, f32::INFINITY]);
+                    first.count[0] = first.count[0].min(count);
+                    first.march(noise.samples());
+                    first.most[0]
+                };
+                let d = node - end;
+                let beside = noise.value(node - d / d.abs().max_element()) as f32;
+                if slices(0) < h && beside >= h && lower.count[lane] > 0 {
+                    assert!((lower.most[lane] - beside).abs() < 1e-5 && (slices(1) - beside).abs() < 1e-5);
+                    told[1] += 1;
+                }
+            }
+        }
+        assert!(told[0] > 500 && told[1] > 200, "{told:?}");
     }
 
     /// A segment that runs from outside through a ramp, and one that misses it.

@@ -16,8 +16,11 @@ use super::fans::march_row;
 use super::flats::Flats;
 use super::gather::{COSINES, accumulate_row, sum_cosines};
 use super::grid::Source;
+use super::half::Half4;
 use super::pack::{Light, Pack, Plan, Way};
+use super::reflect::{Job, Rows, reflect_row};
 use super::segments::Segments;
+use super::settling::Sums;
 use crate::isa::{Isa, Kind};
 
 /// Brings `x`, which is needed soon, into the cache.
@@ -77,6 +80,9 @@ impl Isa {
         e: [&mut [f32]; 3], n: &[u32], omega: [f32; 3], light: [[&[f32]; 3]; 2], line0: usize,
         f: [f32; 2], range: (usize, usize)
     ));
+    dispatch!(reflect, reflect_row, (
+        job: &Job, s: usize, beside: [Option<usize>; 5], rows: &mut Rows, b: &mut [Half4]
+    ) -> Sums);
 
     /// [`march_row`].
     pub(super) fn march(self, row: &[f32], place: [f32; 2], extrema: [&mut [f32]; 2], out: &mut [u8], turn: u8) {

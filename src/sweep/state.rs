@@ -83,8 +83,9 @@ impl State {
     /// Everything as bytes, with the passes of a replicate that is under way.
     pub(super) fn bytes(&self, passes: Option<&Passes>, flats: &Flats) -> Vec<u8> {
         let Totals { lighting, direct, light, spread, parts, .. } = &self.total;
+        // If all nodes are lit.
         let numbers = 12 * lighting.len() + 6 * (direct.len() + light.len()) + 3 * spread.len();
-        let under_way = passes.map_or(0, |p| 8 * (p.light.b.len() + p.before.b.len()));
+        let under_way = passes.map_or(0, |p| 6 * (p.light.b.len() + p.before.b.len()));
         // The flats are small beside it.
         let mut out = Writer { bytes: Vec::with_capacity(self.total.nodes() * (numbers + under_way) + (1 << 16)) };
         out.count(self.done);
@@ -117,7 +118,7 @@ impl State {
             for reflected in [&p.light, &p.before] {
                 out.numbers(&[reflected.unit]);
                 out.count(reflected.b.len());
-                reflected.b.iter().for_each(|b| out.halves(b.as_flattened().iter().copied()));
+                reflected.b.iter().for_each(|b| (0..3).for_each(|c| out.halves(b.iter().map(|b| b[c]))));
             }
             out.count(p.settling.passes);
             out.count(p.settling.since);
@@ -230,6 +231,9 @@ struct Parsed {
     passes: Option<(Passes, Vec<[Vec<f32>; 2]>)>,
 }
 
+/// Numbers that are left out together if all are 0.
+const RUN: usize = 512;
+
 /// Numbers as little-endian bytes.
 struct Writer {
     bytes: Vec<u8>,
@@ -252,11 +256,17 @@ impl Writer {
         self.words(halves.map(u16::to_le_bytes));
     }
 
-    fn words<const N: usize>(&mut self, words: impl ExactSizeIterator<Item = [u8; N]>) {
-        let before = self.bytes.len();
-        self.bytes.resize(before + N * words.len(), 0);
-        // Of known number: extending by what is flattened takes five times as long.
-        self.bytes[before..].as_chunks_mut().0.iter_mut().zip(words).for_each(|(to, word)| *to = word);
+    /// In runs of [`RUN`], each behind a byte that says whether any is not 0: what is not lit takes no room.
+    fn words<const N: usize>(&mut self, mut words: impl ExactSizeIterator<Item = [u8; N]>) {
+        let mut run = [[0; N]; RUN];
+        while words.len() > 0 {
+            let count = words.len().min(RUN);
+            run.iter_mut().zip(words.by_ref().take(count)).for_each(|(to, word)| *to = word);
+            let run = run[..count].as_flattened();
+            let any = run.iter().fold(0, |any, byte| any | byte) != 0;
+            self.bytes.push(u8::from(any));
+            self.bytes.extend_from_slice(if any { run } else { &[] });
+        }
     }
 
     fn half_planes(&mut self, light: &HalfPlanes) {
@@ -287,22 +297,34 @@ impl Reader<'_> {
     }
 
     fn numbers(&mut self, n: usize) -> Option<Vec<f32>> {
-        let (head, rest) = self.bytes.split_at_checked(n.checked_mul(4)?)?;
-        self.bytes = rest;
-        Some(head.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect())
+        self.words(n, f32::from_le_bytes)
     }
 
     fn halves(&mut self, n: usize) -> Option<Vec<u16>> {
-        let (head, rest) = self.bytes.split_at_checked(n.checked_mul(2)?)?;
-        self.bytes = rest;
-        Some(head.as_chunks().0.iter().map(|b| u16::from_le_bytes(*b)).collect())
+        self.words(n, u16::from_le_bytes)
+    }
+
+    /// What [`Writer::words`] wrote of `n` numbers.
+    fn words<T: Clone + Default, const N: usize>(&mut self, n: usize, number: impl Fn([u8; N]) -> T) -> Option<Vec<T>> {
+        let mut numbers = Vec::with_capacity(n);
+        while numbers.len() < n {
+            let count = RUN.min(n - numbers.len());
+            let (any, rest) = self.bytes.split_first()?;
+            self.bytes = rest;
+            if *any == 0 {
+                numbers.resize(numbers.len() + count, T::default());
+                continue;
+            }
+            let (run, rest) = self.bytes.split_at_checked(count * N)?;
+            self.bytes = rest;
+            numbers.extend(run.as_chunks().0.iter().map(|b| number(*b)));
+        }
+        Some(numbers)
     }
 
     fn four_halves(&mut self, n: usize) -> Option<Vec<Half4>> {
-        let (head, rest) = self.bytes.split_at_checked(n.checked_mul(8)?)?;
-        self.bytes = rest;
-        let four = |b: &[u8; 8]| std::array::from_fn(|i| u16::from_le_bytes([b[2 * i], b[2 * i + 1]]));
-        Some(head.as_chunks().0.iter().map(four).collect())
+        let [r, g, b] = [self.halves(n)?, self.halves(n)?, self.halves(n)?];
+        Some(r.into_iter().zip(g).zip(b).map(|((r, g), b)| [r, g, b, 0]).collect())
     }
 
     fn half_planes(&mut self, sides: usize, nodes: usize) -> Option<Vec<HalfPlanes>> {
@@ -315,5 +337,36 @@ impl Reader<'_> {
 
     fn planes(&mut self, sides: usize, nodes: usize) -> Option<Vec<Planes>> {
         (0..sides).map(|_| Some([self.numbers(nodes)?, self.numbers(nodes)?, self.numbers(nodes)?])).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Runs of zeros, numbers that are not, minus zero among zeros, and an end within a run.
+    #[test]
+    fn numbers_survive_and_zeros_take_no_room() {
+        let n = 20 * RUN + 17;
+        let mut numbers: Vec<f32> = (0..n).map(|i| if i / RUN % 5 == 3 { 1.0 + i as f32 } else { 0.0 }).collect();
+        numbers[9 * RUN + 5] = -0.0;
+        numbers[n - 1] = f32::NAN;
+        let halves: Vec<u16> = numbers.iter().map(|x| (x.to_bits() >> 16) as u16).collect();
+        let mut out = Writer { bytes: Vec::new() };
+        out.numbers(&numbers);
+        out.halves(halves.iter().copied());
+        // Four whole runs, the one of minus zero and the end.
+        assert_eq!(out.bytes.len(), 2 * 21 + (5 * RUN + 17) * (4 + 2));
+        let read = |bytes: &[u8]| {
+            let mut from = Reader { bytes };
+            let both = (from.numbers(n)?, from.halves(n)?);
+            from.bytes.is_empty().then_some(both)
+        };
+        let back = read(&out.bytes).unwrap();
+        assert!(back.0.iter().map(|x| x.to_bits()).eq(numbers.iter().map(|x| x.to_bits())));
+        assert_eq!(back.1, halves);
+        for cut in [1, 17, out.bytes.len() / 2, out.bytes.len()] {
+            assert_eq!(read(&out.bytes[..out.bytes.len() - cut]), None);
+        }
     }
 }

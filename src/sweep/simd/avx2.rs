@@ -145,12 +145,21 @@ pub(super) fn extrema(h: &[f32], s: &mut Segments) {
         let (start, slope) = (s.start.each_ref(), s.slope.each_ref());
         let (start, slope) = (start.map(|x| floats(x, half)), slope.map(|x| floats(x, half)));
         let (last, stride) = (s.last.each_ref().map(|x| ints(x, half)), s.stride.each_ref().map(|x| ints(x, half)));
-        let (first, count) = (ints(&s.first, half), ints(&s.count, half));
+        let (first, count, way) = (ints(&s.first, half), ints(&s.count, half), ints(&s.way, half));
+        let enough = s.enough.each_ref().map(|x| floats(x, half));
         let (mut least, mut most) = (floats(&s.least, half), floats(&s.most, half));
         let (zero, one) = (_mm256_setzero_ps(), _mm256_set1_ps(1.0));
         for step in 0..s.count[half * HALF..][..HALF].iter().copied().max().unwrap_or(0) {
             let step = _mm256_set1_epi32(step);
-            let k = _mm256_add_epi32(first, step);
+            let found = _mm256_or_ps(
+                _mm256_cmp_ps::<_CMP_LT_OQ>(least, enough[0]),
+                _mm256_cmp_ps::<_CMP_GE_OQ>(most, enough[1]),
+            );
+            let wanted = _mm256_andnot_si256(_mm256_castps_si256(found), _mm256_cmpgt_epi32(count, step));
+            if _mm256_testz_si256(wanted, wanted) == 1 {
+                break;
+            }
+            let k = _mm256_add_epi32(first, _mm256_mullo_epi32(step, way));
             let slice = _mm256_cvtepi32_ps(k);
             let place = |i: usize| {
                 let x = _mm256_max_ps(_mm256_add_ps(start[i], _mm256_mul_ps(slice, slope[i])), zero);
@@ -164,7 +173,7 @@ pub(super) fn extrema(h: &[f32], s: &mut Segments) {
             let (over, opposite) = (_mm256_add_epi32(at, stride[1]), _mm256_add_epi32(beside, stride[1]));
             let exists = |at| _mm256_cmpeq_epi32(_mm256_min_epu32(at, greatest), at);
             let mask = _mm256_and_si256(
-                _mm256_and_si256(_mm256_cmpgt_epi32(count, step), exists(at)),
+                _mm256_and_si256(wanted, exists(at)),
                 _mm256_and_si256(exists(beside), _mm256_and_si256(exists(over), exists(opposite))),
             );
             let mask = _mm256_castsi256_ps(mask);

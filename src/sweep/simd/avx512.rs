@@ -71,12 +71,18 @@ pub(super) fn extrema(h: &[f32], s: &mut Segments) {
     let (start, slope) = ([floats(&s.start[0]), floats(&s.start[1])], [floats(&s.slope[0]), floats(&s.slope[1])]);
     let (last, stride) = ([ints(&s.last[0]), ints(&s.last[1])], [ints(&s.stride[0]), ints(&s.stride[1])]);
     let (first, count, across) = (ints(&s.first), ints(&s.count), ints(&s.stride[2]));
+    let (way, enough) = (ints(&s.way), [floats(&s.enough[0]), floats(&s.enough[1])]);
     let (mut least, mut most) = (floats(&s.least), floats(&s.most));
     let (zero, one) = (_mm512_setzero_ps(), _mm512_set1_ps(1.0));
     let end = _mm512_set1_epi32(h.len() as i32);
     for step in 0..s.count.iter().copied().max().unwrap_or(0) {
         let step = _mm512_set1_epi32(step);
-        let k = _mm512_add_epi32(first, step);
+        let wanted = _mm512_cmp_epi32_mask::<_MM_CMPINT_LT>(step, count)
+            & !(_mm512_cmp_ps_mask::<_CMP_LT_OQ>(least, enough[0]) | _mm512_cmp_ps_mask::<_CMP_GE_OQ>(most, enough[1]));
+        if wanted == 0 {
+            break;
+        }
+        let k = _mm512_add_epi32(first, _mm512_mullo_epi32(step, way));
         let slice = _mm512_cvtepi32_ps(k);
         let place = |i: usize| {
             let x = _mm512_max_ps(_mm512_add_ps(start[i], _mm512_mul_ps(slice, slope[i])), zero);
@@ -89,8 +95,7 @@ pub(super) fn extrema(h: &[f32], s: &mut Segments) {
         let beside = _mm512_add_epi32(at, stride[0]);
         let [over, opposite] = [at, beside].map(|x| _mm512_add_epi32(x, stride[1]));
         let exists = |at| _mm512_cmp_epu32_mask::<_MM_CMPINT_LT>(at, end);
-        let mask = _mm512_cmp_epi32_mask::<_MM_CMPINT_LT>(step, count)
-            & (exists(at) & exists(beside) & exists(over) & exists(opposite));
+        let mask = wanted & exists(at) & exists(beside) & exists(over) & exists(opposite);
         // SAFETY: in lanes of the mask all four places, as unsigned numbers, are below the length of `h`, which is below 2³¹.
         let [a, b, c, d] = unsafe {
             let sample = |at| _mm512_mask_i32gather_ps::<4>(zero, mask, at, h.as_ptr());
