@@ -364,26 +364,17 @@ mod tests {
             let holds = |n: usize, block: usize, at: &dyn Fn(usize) -> usize| {
                 (0..n).any(|i| is(at(i)) && (i.saturating_sub(reach) / size..=(i + reach) / size).contains(&block))
             };
-            for (y, z) in (0..nz).flat_map(|z| (0..ny).map(move |y| (y, z))) {
-                for block in 0..nx.div_ceil(size) {
-                    let expected = holds(nx, block, &|x| lattice.offset(x, y, z));
-                    assert_eq!(
-                        along.rows[z * ny + y] >> block & 1 == 1,
-                        expected,
-                        "{size} {reach}: {block} of {y} {z}"
-                    );
+            let check = |blocks: &Blocks, n: usize, at: &dyn Fn(usize, usize) -> usize| {
+                for (row, bits) in blocks.rows.iter().enumerate() {
+                    for block in 0..n.div_ceil(size) {
+                        let expected = holds(n, block, &|i| at(row, i));
+                        assert_eq!(bits >> block & 1 == 1, expected, "{size} {reach}: block {block} of row {row}");
+                    }
                 }
-            }
-            for (x, z) in (0..nz).flat_map(|z| (0..nx).map(move |x| (x, z))) {
-                for block in 0..ny.div_ceil(size) {
-                    let expected = holds(ny, block, &|y| lattice.offset(x, y, z));
-                    assert_eq!(
-                        across.rows[x * nz + z] >> block & 1 == 1,
-                        expected,
-                        "{size} {reach}: {block} of {x} {z}"
-                    );
-                }
-            }
+            };
+            assert_eq!((along.rows.len(), across.rows.len()), (ny * nz, nx * nz));
+            check(&along, nx, &|row, x| lattice.offset(x, row % ny, row / ny));
+            check(&across, ny, &|row, y| lattice.offset(row / nz, y, row % nz));
         }
     }
 

@@ -149,6 +149,7 @@ pub(super) fn extrema(h: &[f32], s: &mut Segments) {
         let enough = s.enough.each_ref().map(|x| floats(x, half));
         let (mut least, mut most) = (floats(&s.least, half), floats(&s.most, half));
         let (zero, one) = (_mm256_setzero_ps(), _mm256_set1_ps(1.0));
+        let mut k = first;
         for step in 0..s.count[half * HALF..][..HALF].iter().copied().max().unwrap_or(0) {
             let step = _mm256_set1_epi32(step);
             let found = _mm256_or_ps(
@@ -159,7 +160,6 @@ pub(super) fn extrema(h: &[f32], s: &mut Segments) {
             if _mm256_testz_si256(wanted, wanted) == 1 {
                 break;
             }
-            let k = _mm256_add_epi32(first, _mm256_mullo_epi32(step, way));
             let slice = _mm256_cvtepi32_ps(k);
             let place = |i: usize| {
                 let x = _mm256_max_ps(_mm256_add_ps(start[i], _mm256_mul_ps(slice, slope[i])), zero);
@@ -188,6 +188,7 @@ pub(super) fn extrema(h: &[f32], s: &mut Segments) {
             // Of NaN and a number min and max return the second, the number.
             least = _mm256_blendv_ps(least, _mm256_min_ps(value, least), mask);
             most = _mm256_blendv_ps(most, _mm256_max_ps(value, most), mask);
+            k = _mm256_add_epi32(k, way);
         }
         // SAFETY: eight of sixteen numbers each.
         unsafe {

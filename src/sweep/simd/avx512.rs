@@ -75,6 +75,7 @@ pub(super) fn extrema(h: &[f32], s: &mut Segments) {
     let (mut least, mut most) = (floats(&s.least), floats(&s.most));
     let (zero, one) = (_mm512_setzero_ps(), _mm512_set1_ps(1.0));
     let end = _mm512_set1_epi32(h.len() as i32);
+    let mut k = first;
     for step in 0..s.count.iter().copied().max().unwrap_or(0) {
         let step = _mm512_set1_epi32(step);
         let wanted = _mm512_cmp_epi32_mask::<_MM_CMPINT_LT>(step, count)
@@ -82,7 +83,6 @@ pub(super) fn extrema(h: &[f32], s: &mut Segments) {
         if wanted == 0 {
             break;
         }
-        let k = _mm512_add_epi32(first, _mm512_mullo_epi32(step, way));
         let slice = _mm512_cvtepi32_ps(k);
         let place = |i: usize| {
             let x = _mm512_max_ps(_mm512_add_ps(start[i], _mm512_mul_ps(slice, slope[i])), zero);
@@ -109,6 +109,7 @@ pub(super) fn extrema(h: &[f32], s: &mut Segments) {
         let higher = _mm512_mask_cmp_ps_mask::<_CMP_GT_OQ>(mask, value, most);
         least = _mm512_mask_mov_ps(least, lower, value);
         most = _mm512_mask_mov_ps(most, higher, value);
+        k = _mm512_add_epi32(k, way);
     }
     // SAFETY: sixteen numbers each.
     unsafe {
