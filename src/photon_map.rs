@@ -4,6 +4,9 @@
 //! dA dc = |∇h| dV. So E = Σ w K / ∫ K |∇h| dV, both over what the estimate accepts: the ball ∩ Ω ∩ {|h − c| ≤ τ} ∩
 //! normal cone. Normalising over the accepted set makes borders, thin sheets and τ unbiased.
 
+mod cells;
+mod slots;
+mod shares;
 mod measure;
 
 mod density;

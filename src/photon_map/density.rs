@@ -10,14 +10,15 @@
 //! That, too, is found once per bin, as light is at the photons of \[Christensen99\]: an estimate blends what the bins of the
 //! eight cells around it say of its place.
 
-use super::measure::{self, Bin, Cells, octant};
+use super::cells::Cells;
+use super::measure::{self, Bin, octant};
 use super::{EstimateSettings, Irradiance};
 use crate::direct::luminance;
 use crate::field::Field;
 use crate::linear_fit::Moments;
 use crate::photon::SurfacePhoton;
 use crate::scene::Scene;
-use glam::{DVec3, DVec4, Vec3};
+use glam::{DVec3, DVec4, Vec3, Vec4};
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -46,6 +47,7 @@ struct Light {
 }
 
 /// A bin beside another.
+#[derive(Clone, Copy, Default)]
 struct Neighbour {
     number: u32,
     /// The square of its distance, and its offset, in bins.
@@ -71,9 +73,10 @@ pub(super) struct PhotonDensity<'a> {
 const LEAST: f32 = 1.05;
 const FIRST: f32 = 2.0;
 const MOST: f32 = 5.0;
-/// Photons of an estimate per photon of a bin, and the most photons that bins are meant to hold on average.
+/// Photons of an estimate per photon of a bin, and how many photons bins are meant to hold on average. Fewer would take longer to
+/// fit than to trace.
 const SHARE: f64 = 8.0;
-const FULL: f64 = 8.0;
+const FILL: [f64; 2] = [4.0, 8.0];
 
 impl<'a> PhotonDensity<'a> {
     /// Counts the photons that `keep` accepts. Cells hold whole voxels, as many as make for a few photons in each that
@@ -86,13 +89,13 @@ impl<'a> PhotonDensity<'a> {
         settings: EstimateSettings,
     ) -> Self {
         let (field, lattice) = (&scene.field, scene.lattice());
-        let kept: Vec<&SurfacePhoton> = photons.iter().filter(|p| keep(p)).collect();
+        let kept = photons.par_iter().with_min_len(1024).filter(|p| keep(p)).count();
         let axes = lattice.axes();
         let spacing = DVec3::from_array(std::array::from_fn(|a| axes.col(a).length()));
         let volume = axes.determinant().abs();
         let passed = field.samples().par_iter().filter(|h| (0.0..=1.0).contains(*h)).count();
-        let per_bin = (settings.photons as f64 / SHARE).clamp(1.0, FULL);
-        let voxels = (per_bin * passed as f64 / kept.len().max(1) as f64).max(1.0);
+        let per_bin = (settings.photons as f64 / SHARE).clamp(FILL[0], FILL[1]);
+        let voxels = (per_bin * passed as f64 / kept.max(1) as f64).max(1.0);
         let wanted = (volume * voxels).cbrt();
         let dims = lattice.dims();
         let factor: [usize; 3] = std::array::from_fn(|a| ((wanted / spacing[a]).round() as usize).clamp(1, dims[a]));
@@ -100,20 +103,7 @@ impl<'a> PhotonDensity<'a> {
         let (starts, bins) = measure::bins(field, &cells, settings.tau);
         let edge = (volume * factor.iter().product::<usize>() as f64).cbrt();
         let mut density = Self { field, settings, cells, starts, bins, light: Vec::new(), edge };
-        let places: Vec<Option<usize>> =
-            kept.par_iter().with_min_len(1024).map(|p| density.own(p.position.as_dvec3()).1).collect();
-        // Squares of a photon's power, of the world's fourth power of length, do not fit f32.
-        let unit = lattice.unit().powi(-2) as f32;
-        let mut tallies = vec![Tally::default(); density.bins.len()];
-        for (p, place) in kept.iter().zip(places) {
-            let Some(bin) = place.map(|n| &mut tallies[n]) else { continue };
-            let power = unit * p.power * p.foreshortening;
-            bin.power += power;
-            bin.squares += luminance(power.as_dvec3()).powi(2) as f32;
-        }
-        for tally in &mut tallies {
-            tally.luminance = luminance(tally.power.as_dvec3()) as f32;
-        }
+        let tallies = density.tallies(photons, keep, lattice.unit().powi(-2) as f32);
         density.light = density
             .bins
             .par_iter()
@@ -123,6 +113,41 @@ impl<'a> PhotonDensity<'a> {
         density
     }
 
+    /// What the photons that `keep` accepts carry into the bins. `scale`: of power.
+    #[allow(clippy::cast_possible_truncation, reason = "storage is f32; numbers of bins are 32 bits wide")]
+    fn tallies(
+        &self,
+        photons: &[SurfacePhoton],
+        keep: impl Fn(&SurfacePhoton) -> bool + Sync,
+        scale: f32,
+    ) -> Vec<Tally> {
+        let landing = |p: &SurfacePhoton| -> Option<(u32, Vec3)> {
+            let position = p.position.as_dvec3();
+            let own = self.own(position, || self.field.falling_normal(position).unwrap_or_default().as_vec3())?;
+            // Squares of a photon's power, of the world's fourth power of length, do not fit f32.
+            Some((own as u32, scale * p.power * p.foreshortening))
+        };
+        let landings: Vec<Vec<(u32, Vec3)>> = photons
+            .par_chunks(1 << 12)
+            .map(|photons| photons.iter().filter(|p| keep(p)).filter_map(landing).collect())
+            .collect();
+        let mut tallies = vec![Tally::default(); self.bins.len()];
+        // Every thread looks at all photons, for bins of its own: photon after photon on any number of threads.
+        let length = tallies.len().div_ceil(rayon::current_num_threads()).max(1);
+        tallies.par_chunks_mut(length).enumerate().for_each(|(n, tallies)| {
+            for (bin, power) in landings.iter().flatten() {
+                if let Some(tally) = (*bin as usize).checked_sub(n * length).and_then(|bin| tallies.get_mut(bin)) {
+                    tally.power += *power;
+                    tally.squares += luminance(power.as_dvec3()).powi(2) as f32;
+                }
+            }
+            for tally in tallies {
+                tally.luminance = luminance(tally.power.as_dvec3()) as f32;
+            }
+        });
+        tallies
+    }
+
     /// The bins of cells `from` to `to` of row (j, k).
     #[inline]
     fn row(&self, from: usize, to: usize, j: usize, k: usize) -> Range<usize> {
@@ -130,70 +155,64 @@ impl<'a> PhotonDensity<'a> {
         self.starts[row + from] as usize..self.starts[row + to + 1] as usize
     }
 
-    /// The normal at a local position, and the bin it belongs to: of its octant, or the one that faces most alike.
+    /// The bin that a local position belongs to: of the octant of its normal, or the one that faces most alike.
     #[inline]
-    fn own(&self, position: DVec3) -> (Vec3, Option<usize>) {
-        let normal = self.field.falling_normal(position).unwrap_or_default();
-        let normal = normal.as_vec3();
+    fn own(&self, position: DVec3, normal: impl FnOnce() -> Vec3) -> Option<usize> {
         let place = self.cells.place(position);
         let [i, j, k] = [0, 1, 2].map(|a| self.cells.cell(a, place[a]));
-        let octant = octant(normal.into());
-        let mut best = (f32::NEG_INFINITY, None);
-        for n in self.row(i, i, j, k) {
+        let bins = self.row(i, i, j, k);
+        if bins.len() < 2 {
+            return bins.into_iter().next();
+        }
+        let normal = normal();
+        let octant = octant(normal);
+        let alike = |n: usize| {
             let bin = &self.bins[n];
-            let alike = if bin.octant == octant { 2.0 } else { bin.normal.dot(normal) };
-            if alike > best.0 {
-                best = (alike, Some(n));
-            }
-        }
-        (normal, best.1)
-    }
-
-    /// Calls `visit(bin, d², d)` for the numbers of the bins within `radius` of `place`, at offset d; all in bins.
-    #[inline]
-    fn around(&self, place: Vec3, radius: f32, mut visit: impl FnMut(usize, f32, Vec3)) {
-        // How far a coordinate is from a cell's span.
-        let beyond = |at: f32, cell: usize| (cell as f32 - at).max(at - cell as f32 - 1.0).max(0.0);
-        let r2 = radius * radius;
-        for k in self.cells.cell(2, place.z - radius)..=self.cells.cell(2, place.z + radius) {
-            let left = r2 - beyond(place.z, k).powi(2);
-            for j in self.cells.cell(1, place.y - radius)..=self.cells.cell(1, place.y + radius) {
-                let left = left - beyond(place.y, j).powi(2);
-                if left <= 0.0 {
-                    continue;
-                }
-                let half = left.sqrt();
-                for n in self.row(self.cells.cell(0, place.x - half), self.cells.cell(0, place.x + half), j, k) {
-                    let d = self.bins[n].centroid - place;
-                    let d2 = d.length_squared();
-                    if d2 < r2 {
-                        visit(n, d2, d);
-                    }
-                }
-            }
-        }
+            if bin.octant == octant { 2.0 } else { bin.normal.dot(normal) }
+        };
+        bins.map(|n| (alike(n), n)).max_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, n)| n)
     }
 
     /// Whether light at `isovalue` and `normal` is `bin`'s.
-    #[inline]
+    #[inline(always)]
     fn accepts(&self, bin: &Bin, isovalue: f32, normal: Vec3) -> bool {
-        (bin.isovalue - isovalue).abs() <= bin.reach && bin.normal.dot(normal) >= self.settings.cone as f32
+        ((bin.isovalue - isovalue).abs() <= bin.reach) & (bin.normal.dot(normal) >= self.settings.cone as f32)
     }
 
     /// The bins within `radius` of one that are alike.
     #[allow(clippy::cast_possible_truncation, reason = "numbers of bins are 32 bits wide")]
     fn alike(&self, at: &Bin, radius: f32, near: &mut Vec<Neighbour>) {
-        near.clear();
-        self.around(at.centroid, radius, |n, d2, d| {
-            if self.accepts(&self.bins[n], at.isovalue, at.normal) {
-                near.push(Neighbour { number: n as u32, d2, d });
+        // How far a coordinate is from a cell's span.
+        let beyond = |at: f32, cell: usize| (cell as f32 - at).max(at - cell as f32 - 1.0).max(0.0);
+        let (place, r2) = (at.centroid, radius * radius);
+        let cells = |axis: usize| [place[axis] - radius, place[axis] + radius].map(|at| self.cells.cell(axis, at));
+        let [across, rows, layers] = [0, 1, 2].map(cells);
+        let mut found = 0;
+        for k in layers[0]..=layers[1] {
+            let left = r2 - beyond(place.z, k).powi(2);
+            for j in rows[0]..=rows[1] {
+                if left <= beyond(place.y, j).powi(2) {
+                    continue;
+                }
+                // How far the ball goes along a row costs more than the few bins beyond it.
+                let row = self.row(across[0], across[1], j, k);
+                if near.len() < found + row.len() {
+                    near.resize(2 * found + row.len(), Neighbour::default());
+                }
+                // Which are alike is hard to foretell: each is written down, and the next over it if it is not.
+                for (n, bin) in (row.start..).zip(&self.bins[row]) {
+                    let d = bin.centroid - place;
+                    let d2 = d.length_squared();
+                    near[found] = Neighbour { number: n as u32, d2, d };
+                    found += usize::from((d2 < r2) & self.accepts(bin, at.isovalue, at.normal));
+                }
             }
-        });
+        }
+        near.truncate(found);
     }
 
     /// The light that the bins around one that are alike have, within the radius that holds the photons asked for, so far as
     /// bins allow.
-    #[allow(clippy::cast_possible_truncation, reason = "f32 does")]
     fn fitted(&self, at: &Bin, tallies: &[Tally], near: &mut Vec<Neighbour>) -> Light {
         let wanted = self.settings.photons as f32;
         // Photons of equal power that would be as noisy as those around.
@@ -219,25 +238,30 @@ impl<'a> PhotonDensity<'a> {
         if radius > known {
             self.alike(at, radius, near);
         }
+        near.retain(|n| n.d2 < radius * radius);
         let scale = 1.0 / radius;
+        let kernel = |d2: f32| 1.0 - d2 * scale * scale;
         let mut fit = Fit::default();
-        for neighbour in near.iter().filter(|n| n.d2 < radius * radius) {
+        for neighbour in near.iter() {
             let n = neighbour.number as usize;
-            let kernel = 1.0 - neighbour.d2 * scale * scale;
-            fit.add(self.bins[n].measure, &tallies[n], kernel, neighbour.d * scale);
+            fit.add(self.bins[n].measure, tallies[n].power, kernel(neighbour.d2), neighbour.d * scale);
         }
-        let (value, slope, variance) = fit.solve();
-        Light { value, slope: slope.map(|s| s * scale), variance, radius }
+        let Some((value, slope, weights)) = fit.solve() else { return Light { radius, ..Light::default() } };
+        let variance = near.iter().map(|neighbour| {
+            let weight = weights.dot((neighbour.d * scale).extend(1.0)) * kernel(neighbour.d2);
+            weight * weight * tallies[neighbour.number as usize].squares
+        });
+        Light { value, slope: slope.map(|s| s * scale), variance: variance.sum(), radius }
     }
 
     /// See [`super::PhotonMap::irradiance`]: the light of the bins around that are alike, by their part of the place.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "storage is f32; cells are clamped")]
     pub(super) fn irradiance(&self, position: DVec3, isovalue: f64) -> Irradiance {
-        let (normal, own) = self.own(position);
+        let normal = self.field.falling_normal(position).unwrap_or_default().as_vec3();
         let place = self.cells.place(position);
         let low = (place - 0.5).floor();
         let high = place - 0.5 - low;
-        let (mut mean, mut variance, mut weight) = (Vec3::ZERO, 0.0, 0.0);
+        let (mut mean, mut variance, mut radius, mut weight) = (Vec3::ZERO, 0.0, 0.0, 0.0);
         for corner in 0..8 {
             let step = Vec3::new((corner & 1) as f32, (corner >> 1 & 1) as f32, (corner >> 2) as f32);
             let cell = low + step;
@@ -252,21 +276,23 @@ impl<'a> PhotonDensity<'a> {
                     let (light, d, w) = (&self.light[n], place - bin.centroid, part * bin.measure);
                     mean += w * (light.value + d.x * light.slope[0] + d.y * light.slope[1] + d.z * light.slope[2]);
                     variance += w * light.variance;
+                    radius += w * light.radius;
                     weight += w;
                 }
             }
         }
-        let own = own.map(|n| &self.light[n]);
         if weight > 0.0 {
-            (mean, variance) = (mean / weight, variance / weight);
-        } else if let Some(light) = own {
+            (mean, variance, radius) = (mean / weight, variance / weight, radius / weight);
+        } else if let Some(own) = self.own(position, || normal) {
             // A tip or a crease, whose bin has another mean normal than the place itself.
-            (mean, variance) = (light.value, light.variance);
+            Light { value: mean, variance, radius, .. } = self.light[own];
+        } else {
+            radius = MOST;
         }
         Irradiance {
             mean: mean.max(Vec3::ZERO).as_dvec3(),
             variance: f64::from(variance),
-            radius: f64::from(own.map_or(MOST, |l| l.radius)) * self.edge,
+            radius: f64::from(radius) * self.edge,
         }
     }
 }
@@ -276,38 +302,104 @@ impl<'a> PhotonDensity<'a> {
 struct Fit {
     /// Weighted by K D.
     measure: Moments,
-    /// Weighted by K² Σ lum².
-    noise: Moments,
     /// Σ K P (1, d).
     power: [Vec3; 4],
 }
 
 impl Fit {
     #[inline]
-    fn add(&mut self, measure: f32, tally: &Tally, kernel: f32, d: Vec3) {
+    fn add(&mut self, measure: f32, power: Vec3, kernel: f32, d: Vec3) {
         self.measure.add(kernel * measure, d);
-        self.noise.add(kernel * kernel * tally.squares, d);
-        let p = tally.power * kernel;
+        let p = power * kernel;
         self.power[0] += p;
         self.power[1] += p * d.x;
         self.power[2] += p * d.y;
         self.power[3] += p * d.z;
     }
 
-    /// The value at d = 0, its slope, and the variance of the value's luminance. A channel that the slope would drive below 0
-    /// falls back to the mean.
-    fn solve(&self) -> (Vec3, [Vec3; 3], f32) {
+    /// The value at d = 0, its slope, and what (d, 1) K P is multiplied with to give the value's part of a place, if there is
+    /// any. A channel that the slope would drive below 0 falls back to the mean.
+    fn solve(&self) -> Option<(Vec3, [Vec3; 3], Vec4)> {
         let weight = self.measure.weight();
         if weight <= 0.0 {
-            return Default::default();
+            return None;
         }
         let inverse = self.measure.inverse();
         let p = self.power.map(|p| p.as_dvec3());
         let of = |g: DVec4| (g.x * p[0] + g.y * p[1] + g.z * p[2] + g.w * p[3]).as_vec3();
         let value = of(inverse.x_axis);
         let lit = value.cmpge(Vec3::ZERO);
-        let variance = inverse.x_axis.dot(self.noise.matrix() * inverse.x_axis).max(0.0);
         let slope = [inverse.y_axis, inverse.z_axis, inverse.w_axis].map(|g| Vec3::select(lit, of(g), Vec3::ZERO));
-        (Vec3::select(lit, value, self.power[0] / weight), slope, variance as f32)
+        let weights = inverse.x_axis.as_vec4();
+        Some((
+            Vec3::select(lit, value, self.power[0] / weight),
+            slope,
+            Vec4::new(weights.y, weights.z, weights.w, weights.x),
+        ))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::Sweep;
+    use crate::flattened::Side;
+    use crate::photon_map::Estimator;
+    use crate::rng::{Rng, Stage};
+    use crate::scene::{Boundary, Surface};
+    use crate::volume::{Lattice, Samples, Volume};
+
+    /// Photons of equal power anywhere in a ramp, fewer in half of it: as noisy as that many photons are, on either side.
+    #[test]
+    fn estimates_are_as_noisy_as_the_photons_asked_for() {
+        let lattice = Lattice::aligned([41; 3], DVec3::ZERO, DVec3::splat(0.5)).unwrap();
+        let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[0] as f64 / 40.0).collect();
+        let volume = Volume::new("ramp", lattice, Samples::F64(samples)).unwrap();
+        let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+        let scene = Scene::new(field, Surface::default(), Boundary::Open, Vec::new()).unwrap();
+        let bright = |p: DVec3| p.y < 20.0;
+        for (seed, photons, count) in [(1, 32, 60_000), (2, 32, 300_000), (3, 128, 60_000), (4, 128, 300_000)] {
+            let mut rng = Rng::stream(seed, Stage::Test, 0);
+            let mut landed = Vec::new();
+            while landed.len() < count {
+                let position = DVec3::from_array(std::array::from_fn(|_| 40.0 * rng.unit()));
+                if bright(position) || rng.unit() < 0.25 {
+                    landed.push(SurfacePhoton {
+                        position: position.as_vec3(),
+                        isovalue: position.x as f32 / 40.0,
+                        power: Vec3::ONE,
+                        foreshortening: 1.0,
+                        field: 0,
+                        bounces: 1,
+                        side: Side::Lower,
+                    });
+                }
+            }
+            let settings =
+                EstimateSettings { estimator: Estimator::Splat, photons, tau: 1.0, ..EstimateSettings::default() };
+            let density = PhotonDensity::new(&scene, &landed, |_| true, settings);
+            for side in [true, false] {
+                // Power to a level set's area, of which either half has 200.
+                let expected = count as f64 * if side { 0.8 } else { 0.2 } / 200.0;
+                let (mut sums, mut told, mut asked) = ([0.0; 2], 0.0, 0.0);
+                for _ in 0..20_000 {
+                    let p = DVec3::from_array(std::array::from_fn(|_| 8.0 + 24.0 * rng.unit()));
+                    let p = DVec3::new(p.x, if side { p.y * 0.25 + 3.0 } else { p.y * 0.25 + 29.0 }, p.z);
+                    let found = density.irradiance(p, p.x / 40.0);
+                    let off = luminance(found.mean) / expected - 1.0;
+                    sums = [sums[0] + off, sums[1] + off * off];
+                    told += found.variance / expected.powi(2);
+                    asked += 1.0;
+                }
+                let (mean, variance, told) = (sums[0] / asked, sums[1] / asked, told / asked);
+                let noise = variance * photons as f64;
+                // Epanechnikov's kernel in space leaves 1.43, few bins more; a half has some 40 places apart.
+                let as_asked = (0.7..3.5).contains(&noise) && (0.5..1.6).contains(&(told / variance));
+                assert!(
+                    as_asked && mean.abs() < 0.06,
+                    "{photons} of {count}, {side}: {noise}, {told}, {variance}, {mean}"
+                );
+            }
+        }
     }
 }

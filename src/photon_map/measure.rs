@@ -3,8 +3,11 @@
 //! One point stands for each eighth of a voxel, or in cells of many voxels for each voxel. Points of a row share their place along
 //! y and z, so that a row of the lattice is interpolated across once, and then along x.
 
+use super::cells::Cells;
+use super::shares::{Block, Point};
+use super::slots::{Along, LANES, Slot};
 use crate::field::Field;
-use glam::{DVec3, DVec4, Mat3A, Vec3, Vec3A};
+use glam::{DVec3, DVec4, Mat3, Vec3};
 use rayon::prelude::*;
 
 /// The level sets in a cell that face one octant.
@@ -27,37 +30,8 @@ pub(super) struct Bin {
 
 /// The octant of a normal: a bit per negative coordinate.
 #[inline]
-pub(super) fn octant(n: Vec3A) -> u8 {
-    n.cmplt(Vec3A::ZERO).bitmask() as u8
-}
-
-/// Cells of whole voxels over a lattice: cell n along an axis holds the lattice's places from f n − ½ to f (n + 1) − ½.
-#[derive(Clone, Debug)]
-pub(super) struct Cells {
-    /// Lattice steps per cell along each axis.
-    pub factor: [usize; 3],
-    pub dims: [usize; 3],
-}
-
-impl Cells {
-    /// Cells of `factor` lattice steps each over `dims` samples.
-    pub(super) fn new(factor: [usize; 3], dims: [usize; 3]) -> Self {
-        Self { factor, dims: std::array::from_fn(|a| dims[a].div_ceil(factor[a])) }
-    }
-
-    /// Coordinates of the cells of a local position: cell n spans [n, n + 1].
-    #[inline]
-    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-    pub(super) fn place(&self, p: DVec3) -> Vec3 {
-        ((p + 0.5) / DVec3::from_array(self.factor.map(|f| f as f64))).as_vec3()
-    }
-
-    /// The cell of one such coordinate, or the nearest.
-    #[inline]
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the cells")]
-    pub(super) fn cell(&self, axis: usize, at: f32) -> usize {
-        (at as usize).min(self.dims[axis] - 1)
-    }
+pub(super) fn octant(n: Vec3) -> u8 {
+    n.cmplt(Vec3::ZERO).bitmask() as u8
 }
 
 /// The bins of all cells, in the cells' order, and the first bin of each cell, with one more entry than cells. `tau`: see
@@ -87,28 +61,16 @@ struct Points<'a> {
     tau: f64,
     /// Points per lattice step along each axis: cells of many voxels need fewer.
     fine: [usize; 3],
-    /// Along each axis, as many per cell as a cell has; `None` outside Ω.
-    slots: [Vec<Option<Slot>>; 3],
+    /// Along y and z, as many per cell as a cell has; `None` outside Ω.
+    across: [Vec<Option<Slot>>; 2],
+    /// Along x: below their nodes and above, or where one stands for both two ways to take turns.
+    along: [Along; 2],
     /// World volume of a voxel, per unit squared.
     volume: f64,
     /// From gradients in index space to the world.
-    to_world: Mat3A,
+    to_world: Mat3,
     /// What is known of each row of the lattice.
     rows: Vec<LatticeRow>,
-}
-
-/// What a point stands for along one axis.
-#[derive(Clone, Copy, Debug)]
-struct Slot {
-    /// The point's place, its cell of the lattice, and where in that.
-    at: f64,
-    cell: usize,
-    inside: f32,
-    /// The middle of what it stands for, and its width.
-    centre: f32,
-    width: f32,
-    /// The first and the last node of the cells that this lies in.
-    nodes: [usize; 2],
 }
 
 /// The samples of a row of the lattice.
@@ -120,20 +82,13 @@ struct LatticeRow {
     reach: [usize; 2],
 }
 
-/// What is known at a point, gradients by index.
-#[derive(Clone, Copy, Debug)]
-struct Point {
-    h: f32,
-    slope: Vec3A,
-    /// See [`Field::receiver_gradient`].
-    receiver: Vec3A,
-}
-
-/// Between nodes of a row of points.
+/// A row of points at work.
 #[derive(Default)]
 struct Row {
-    /// h, ∂h/∂y, ∂h/∂z, and the receiver gradient at the nodes along x.
+    /// h, ∂h/∂y, ∂h/∂z, and the receiver gradient at the nodes along x, behind a place that none has.
     nodes: [Vec<f32>; 6],
+    block: Block,
+    /// Of each cell, empty between rows of cells.
     parts: Vec<[Part; 8]>,
 }
 
@@ -149,54 +104,23 @@ impl LatticeRow {
     }
 }
 
-impl Slot {
-    /// Where points lie, in steps beside a node: two to a cell are exact for cubics, such as |∇h|² [Gauss]. At nodes gradients
-    /// are differences of single pairs of samples, which noise makes larger than they are between them.
-    const BESIDE: f64 = 0.211_324_865_405_187_1;
-
-    /// Slot `n` of an axis of `count` nodes with `fine` slots a node.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within the lattice")]
-    fn new(n: usize, fine: usize, count: usize) -> Option<Self> {
-        let (node, last) = (n / fine, count - 1);
-        let middle = node as f64;
-        // Halves of a voxel, or one by turns on either side of its node.
-        let (low, high, up) = match (fine, n % 2) {
-            (2, 0) => (middle - 0.5, middle, false),
-            (2, _) => (middle, middle + 0.5, true),
-            (_, odd) => (middle - 0.5, middle + 0.5, node == 0 || (odd == 0 && node != last)),
-        };
-        let (low, high) = (low.max(0.0), high.min(last as f64));
-        let at = middle + if up { Self::BESIDE } else { -Self::BESIDE };
-        let cell = at as usize;
-        (low < high).then(|| Self {
-            at,
-            cell,
-            inside: (at - cell as f64) as f32,
-            centre: (0.5 * (low + high)) as f32,
-            width: (high - low) as f32,
-            nodes: [low.floor() as usize, high.ceil() as usize],
-        })
-    }
-}
-
 impl<'a> Points<'a> {
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     fn new(field: &'a Field, cells: &'a Cells, tau: f64) -> Self {
         let lattice = field.lattice();
         let dims = lattice.dims();
         let fine = cells.factor.map(|f| if f < 3 { 2 } else { 1 });
-        let slots =
-            [0, 1, 2].map(|a| (0..fine[a] * dims[a]).map(|n| Slot::new(n, fine[a], dims[a])).collect::<Vec<_>>());
-        let world = |g: DVec3| lattice.gradient_to_world(g).as_vec3a();
+        let world = |g: DVec3| lattice.gradient_to_world(g).as_vec3();
         let rows = field.samples().par_chunks(dims[0]).with_min_len(64).map(LatticeRow::new).collect();
         Self {
             field,
             cells,
             tau,
             fine,
-            slots,
+            across: [1, 2].map(|a| Slot::all(fine[a], dims[a])),
+            along: [false, true].map(|side| Along::new(fine[0], side, cells, dims[0])),
             volume: lattice.cell_volume() / lattice.unit().powi(2),
-            to_world: Mat3A::from_cols(world(DVec3::X), world(DVec3::Y), world(DVec3::Z)),
+            to_world: Mat3::from_cols(world(DVec3::X), world(DVec3::Y), world(DVec3::Z)),
             rows,
         }
     }
@@ -204,31 +128,32 @@ impl<'a> Points<'a> {
     /// The bins of row (j, k) of the cells: the end of each cell's, and the bins.
     #[allow(clippy::cast_possible_truncation, reason = "2³² bins take 240 GB")]
     fn bins_of_row(&self, [j, k]: [usize; 2], row: &mut Row) -> (Vec<u32>, Vec<Bin>) {
-        let Row { nodes, parts } = row;
-        parts.clear();
-        parts.resize(self.cells.dims[0], Default::default());
+        let count = self.cells.dims[0];
+        row.parts.resize(count, Default::default());
         let slots = |axis: usize, cell: usize| {
             let count = self.cells.factor[axis] * self.fine[axis];
-            self.slots[axis].iter().skip(cell * count).take(count).flatten()
+            self.across[axis - 1].iter().skip(cell * count).take(count).flatten()
         };
-        let mut met = false;
+        // The cells that were met.
+        let (mut first, mut end) = (count, 0);
         for (y, z) in slots(2, k).flat_map(|z| slots(1, j).map(move |y| (y, z))) {
             let Some(range) = self.reach(y, z) else { continue };
-            met = true;
+            (first, end) =
+                (first.min(range[0] / self.cells.factor[0]), end.max(range[1].div_ceil(self.cells.factor[0])));
             if self.regular(y.cell, z.cell) {
-                self.read_nodes([y, z], range, nodes);
-                self.add([y, z], range, |x| Some(self.between(nodes, x)), parts);
+                self.add_row([y, z], range, row);
             } else {
-                self.add([y, z], range, |x| self.point(DVec3::new(x.at, y.at, z.at)), parts);
+                self.add_points([y, z], range, row);
             }
         }
-        let (mut ends, mut bins) = (vec![0; self.cells.dims[0]], Vec::new());
-        if met {
-            for (end, parts) in ends.iter_mut().zip(parts) {
-                bins.extend((0..).zip(parts).filter_map(|(octant, part)| part.bin(octant, self.cells, self.tau)));
-                *end = bins.len() as u32;
-            }
+        let (mut ends, mut bins) = (Vec::with_capacity(count), Vec::new());
+        ends.resize(first, 0);
+        for parts in row.parts.get_mut(first..end).unwrap_or_default() {
+            bins.extend((0..).zip(&*parts).filter_map(|(octant, part)| part.bin(octant, self.cells, self.tau)));
+            *parts = Default::default();
+            ends.push(bins.len() as u32);
         }
+        ends.resize(count, bins.len() as u32);
         (ends, bins)
     }
 
@@ -277,8 +202,8 @@ impl<'a> Points<'a> {
         };
         let across = [across(j, k), across(j + 1, k), across(j, k + 1), across(j + 1, k + 1)];
         let up = [up(j, k), up(j + 1, k), up(j, k + 1), up(j + 1, k + 1)];
-        nodes.iter_mut().for_each(|n| n.resize(nx, 0.0));
-        let [h, dy, dz, rx, ry, rz] = nodes.each_mut().map(|n| &mut n[from..to]);
+        nodes.iter_mut().for_each(|n| n.resize(nx + LANES + 1, 0.0));
+        let [h, dy, dz, rx, ry, rz] = nodes.each_mut().map(|n| &mut n[from + 1..=to]);
         // Known lengths, for the compiler.
         let (h, dy, dz, rx) = (&mut h[..len], &mut dy[..len], &mut dz[..len], &mut rx[..len]);
         let (r00, r10, r01, r11) = (&r00[..len], &r10[..len], &r01[..len], &r11[..len]);
@@ -305,74 +230,88 @@ impl<'a> Points<'a> {
         (rx[0], rx[len - 1]) = (h[1] - h[0], h[len - 1] - h[len - 2]);
     }
 
-    /// A point between the nodes of a row.
-    #[inline(always)]
-    fn between(&self, [h, dy, dz, rx, ry, rz]: &[Vec<f32>; 6], x: &Slot) -> Point {
-        let (i, u) = (x.cell, x.inside);
-        let at = |n: &[f32]| (1.0 - u) * n[i] + u * n[i + 1];
-        Point {
-            h: at(h),
-            slope: Vec3A::new(h[i + 1] - h[i], at(dy), at(dz)),
-            receiver: Vec3A::new(at(rx), at(ry), at(rz)),
-        }
-    }
-
     /// Any point in Ω; `None` if nothing is known there.
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     fn point(&self, p: DVec3) -> Option<Point> {
         let to_index = self.field.lattice().axes().transpose();
         let (h, slope) = self.field.value_and_gradient(p);
         let receiver = self.field.receiver_gradient(p);
-        let index = |g: DVec3| (to_index * g).as_vec3a();
+        let index = |g: DVec3| (to_index * g).as_vec3();
         h.is_finite().then(|| Point { h: h as f32, slope: index(slope), receiver: index(receiver) })
     }
 
-    /// Adds the points of the row at y and z between two nodes to the parts of their cells.
+    /// The slots along x of the row at y and z: all, or those that take turns with those of the rows beside.
+    fn along(&self, [y, z]: [&Slot; 2]) -> &[Along] {
+        match self.fine[0] {
+            1 => std::slice::from_ref(&self.along[usize::from(y.up != z.up)]),
+            _ => &self.along,
+        }
+    }
+
+    /// Adds the points of the row at y and z between two nodes to the parts of their cells, one by one.
+    fn add_points(&self, across: [&Slot; 2], [first, end]: [usize; 2], row: &mut Row) {
+        let (Row { block, parts, .. }, [y, z]) = (row, across);
+        for along in self.along(across) {
+            for x in along.slots[first..end].iter().flatten().filter(|x| x.cell >= first && x.cell + 1 < end) {
+                if let Some(point) = self.point(DVec3::new(x.at, y.at, z.at)) {
+                    block.push(&point, x, along.cell[x.node]);
+                }
+                if block.len == LANES {
+                    self.add(block, across, parts);
+                }
+            }
+        }
+        self.add(block, across, parts);
+    }
+
+    /// The same where all samples around are finite.
+    fn add_row(&self, across: [&Slot; 2], [first, end]: [usize; 2], Row { nodes, block, parts }: &mut Row) {
+        self.read_nodes(across, [first, end], nodes);
+        for along in self.along(across) {
+            let (first, end) =
+                (first + usize::from(along.up[first] == 0.0), end - usize::from(along.up[end - 1] > 0.0));
+            for n in (first..end).step_by(LANES) {
+                block.read(nodes, along, n, LANES.min(end - n));
+                self.add(block, across, parts);
+            }
+        }
+    }
+
+    /// Adds a block's points to the parts of their cells, and empties it.
     #[inline(always)]
-    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-    fn add(
-        &self,
-        [y, z]: [&Slot; 2],
-        [first, end]: [usize; 2],
-        point: impl Fn(&Slot) -> Option<Point>,
-        parts: &mut [[Part; 8]],
-    ) {
+    fn add(&self, block: &mut Block, across: [&Slot; 2], parts: &mut [[Part; 8]]) {
+        const BESIDE: [[f32; 2]; 4] = [[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]];
+        let [y, z] = across;
         let volume = self.volume * f64::from(y.width * z.width);
-        let per_cell = self.cells.factor[0] * self.fine[0];
-        for n in self.fine[0] * first..self.fine[0] * end {
-            let Some(x) = self.slots[0][n].as_ref().filter(|x| x.cell >= first && x.cell + 1 < end) else { continue };
-            let Some(Point { h, slope, receiver }) = point(x) else { continue };
-            // h in the middle of what the point stands for, and how far it goes there.
-            let centre = Vec3A::new(x.centre, y.centre, z.centre);
-            let h = h + slope.dot(centre - Vec3A::new(x.at as f32, y.at as f32, z.at as f32));
-            let width = Vec3A::new(x.width, y.width, z.width);
-            let rise = slope * width;
-            let spread = 0.5 * rise.abs().element_sum();
-            if !(h + spread >= 0.0 && h - spread <= 1.0) {
+        let shares = block.shares(across, &self.to_world);
+        for n in 0..block.len {
+            if shares.weight[n] <= 0.0 {
                 continue;
             }
-            // Squares of steep slopes are too large.
-            let (steep, most) = (slope.abs().max_element(), receiver.abs().max_element());
-            let w = volume * f64::from(x.width * steep * (self.to_world * (slope / steep)).length());
-            let Some(normal) = (self.to_world * -(receiver / most)).try_normalize() else { continue };
-            if !(w > 0.0 && w < f64::INFINITY) {
-                continue;
-            }
-            let part = &mut parts[n / per_cell][usize::from(octant(normal))];
+            let (h, spread) = (shares.h[n], shares.spread[n]);
+            let normal = Vec3::from_array(shares.normal.each_ref().map(|c| c[n]));
+            let centre = Vec3::new(block.centre[n], y.centre, z.centre);
+            let w = volume * f64::from(shares.weight[n]);
+            let part = &mut parts[block.cell[n]][usize::from(octant(normal))];
             if h - spread >= 0.0 && h + spread <= 1.0 {
                 part.add(w, h, normal, centre);
                 continue;
             }
-            // Where the sweep ends, eight points of the tangent.
-            for eighth in 0..8usize {
-                let at = |axis: usize| if eighth >> axis & 1 == 1 { 0.25 } else { -0.25 };
-                let offset = Vec3A::new(at(0), at(1), at(2));
-                let h = h + rise.dot(offset);
-                if (0.0..=1.0).contains(&h) {
-                    part.add(w / 8.0, h, normal, centre + offset * width);
+            // Where the sweep ends, points of the tangent, two to half a step and to the step across.
+            let width = Vec3::new(block.width[n], y.width, z.width);
+            let rise = Vec3::from_array(block.slope.each_ref().map(|s| s[n])) * width;
+            let steps: u8 = if width.x > 0.5 { 4 } else { 2 };
+            let w = w / f64::from(4 * steps);
+            for x in (0..steps).map(|n| (f32::from(n) + 0.5) / f32::from(steps) - 0.5) {
+                for offset in BESIDE.map(|[y, z]| Vec3::new(x, y, z)) {
+                    let h = h + rise.dot(offset);
+                    if (0.0..=1.0).contains(&h) {
+                        part.add(w, h, normal, centre + offset * width);
+                    }
                 }
             }
         }
+        block.len = 0;
     }
 }
 
@@ -395,7 +334,7 @@ impl Default for Part {
 
 impl Part {
     #[inline]
-    fn add(&mut self, w: f64, h: f32, normal: Vec3A, p: Vec3A) {
+    fn add(&mut self, w: f64, h: f32, normal: Vec3, p: Vec3) {
         self.normal += w * normal.extend(1.0).as_dvec4();
         self.place += w * p.extend(h).as_dvec4();
         (self.lowest, self.highest) = (self.lowest.min(h), self.highest.max(h));
@@ -418,6 +357,7 @@ impl Part {
 
 #[cfg(test)]
 mod tests {
+    use super::super::shares::Lanes;
     use super::*;
     use crate::field::Sweep;
     use crate::rng::{Rng, Stage};
@@ -442,19 +382,24 @@ mod tests {
         for factor in [1, 2, 3] {
             let cells = Cells::new([factor; 3], noise.lattice().dims());
             let points = Points::new(&noise, &cells, 0.1);
-            let slots = |axis: usize| points.slots[axis].iter().flatten();
-            let (mut nodes, mut compared) = (Default::default(), 0);
+            let slots = |axis: usize| points.across[axis - 1].iter().flatten();
+            let (mut nodes, mut block, mut compared) = (Default::default(), Block::default(), 0);
             for (y, z) in slots(2).flat_map(|z| slots(1).map(move |y| (y, z))) {
                 assert!(points.regular(y.cell, z.cell) && points.reach(y, z) == Some([0, 9]));
-                for (range, x) in [[0, 9], [2, 7]].into_iter().flat_map(|r| slots(0).map(move |x| (r, x))) {
+                let along = points.along([y, z]).iter().flat_map(|a| a.slots.iter().flatten().map(move |x| (a, x)));
+                for (range, (along, x)) in along.flat_map(|x| [[0, 9], [2, 7]].map(|r| (r, x))) {
                     if x.cell < range[0] || x.cell + 1 >= range[1] {
                         continue;
                     }
                     points.read_nodes([y, z], range, &mut nodes);
-                    let (fast, slow) = (points.between(&nodes, x), points.point(DVec3::new(x.at, y.at, z.at)).unwrap());
-                    let gradients = [(fast.slope, slow.slope), (fast.receiver, slow.receiver)];
+                    block.read(&nodes, along, x.node, 1);
+                    let slow = points.point(DVec3::new(x.at, y.at, z.at)).unwrap();
+                    let of_lane = |lanes: &[Lanes; 3]| Vec3::from_array(lanes.each_ref().map(|l| l[0]));
+                    let (slope, receiver) = (of_lane(&block.slope), of_lane(&block.receiver));
+                    let gradients = [(slope, slow.slope), (receiver, slow.receiver)];
                     let far = gradients.iter().map(|(a, b)| (*a - *b).abs().max_element()).fold(0.0, f32::max);
-                    assert!((fast.h - slow.h).abs().max(far) < 1e-5, "{factor}: {x:?} {y:?} {z:?}: {fast:?} {slow:?}");
+                    let far = (block.h[0] - slow.h).abs().max(far);
+                    assert!(far < 1e-5, "{factor}: {x:?} {y:?} {z:?}: {slope} {receiver} {slow:?}");
                     compared += 1;
                 }
             }
@@ -513,13 +458,13 @@ mod tests {
             let cells = Cells::new(factor, dims);
             let points = Points::new(&ball, &cells, 0.1);
             let (_, found) = bins(&ball, &cells, 0.1);
-            let mut all = vec![[Part::default(); 8]; cells.dims[0]];
-            let slots = |axis: usize| points.slots[axis].iter().flatten();
+            let mut row = Row { parts: vec![[Part::default(); 8]; cells.dims[0]], ..Row::default() };
+            let slots = |axis: usize| points.across[axis - 1].iter().flatten();
             for (y, z) in slots(2).flat_map(|z| slots(1).map(move |y| (y, z))) {
-                points.add([y, z], [0, dims[0]], |x| points.point(DVec3::new(x.at, y.at, z.at)), &mut all);
+                points.add_points([y, z], [0, dims[0]], &mut row);
             }
             for n in 0..8 {
-                let expected: f64 = all.iter().map(|parts| parts[n].normal.w).sum();
+                let expected: f64 = row.parts.iter().map(|parts| parts[n].normal.w).sum();
                 let measure: f64 =
                     found.iter().filter(|b| usize::from(b.octant) == n).map(|b| f64::from(b.measure)).sum();
                 assert!(expected > 0.0);
