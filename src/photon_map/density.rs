@@ -132,19 +132,14 @@ impl<'a> PhotonDensity<'a> {
             .map(|photons| photons.iter().filter(|p| keep(p)).filter_map(landing).collect())
             .collect();
         let mut tallies = vec![Tally::default(); self.bins.len()];
-        // Every thread looks at all photons, for bins of its own: photon after photon on any number of threads.
-        let length = tallies.len().div_ceil(rayon::current_num_threads()).max(1);
-        tallies.par_chunks_mut(length).enumerate().for_each(|(n, tallies)| {
-            for (bin, power) in landings.iter().flatten() {
-                if let Some(tally) = (*bin as usize).checked_sub(n * length).and_then(|bin| tallies.get_mut(bin)) {
-                    tally.power += *power;
-                    tally.squares += luminance(power.as_dvec3()).powi(2) as f32;
-                }
-            }
-            for tally in tallies {
-                tally.luminance = luminance(tally.power.as_dvec3()) as f32;
-            }
-        });
+        for (bin, power) in landings.into_iter().flatten() {
+            let tally = &mut tallies[bin as usize];
+            tally.power += power;
+            tally.squares += luminance(power.as_dvec3()).powi(2) as f32;
+        }
+        for tally in &mut tallies {
+            tally.luminance = luminance(tally.power.as_dvec3()) as f32;
+        }
         tallies
     }
 
@@ -166,11 +161,11 @@ impl<'a> PhotonDensity<'a> {
         }
         let normal = normal();
         let octant = octant(normal);
-        let alike = |n: usize| {
+        let likeness = |n: usize| {
             let bin = &self.bins[n];
             if bin.octant == octant { 2.0 } else { bin.normal.dot(normal) }
         };
-        bins.map(|n| (alike(n), n)).max_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, n)| n)
+        bins.map(|n| (likeness(n), n)).max_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, n)| n)
     }
 
     /// Whether light at `isovalue` and `normal` is `bin`'s.
@@ -247,8 +242,10 @@ impl<'a> PhotonDensity<'a> {
             fit.add(self.bins[n].measure, tallies[n].power, kernel(neighbour.d2), neighbour.d * scale);
         }
         let Some((value, slope, weights)) = fit.solve() else { return Light { radius, ..Light::default() } };
+        // Σ l² σ² of what is linear in the photons' power. \[Loader99\]
         let variance = near.iter().map(|neighbour| {
-            let weight = weights.dot((neighbour.d * scale).extend(1.0)) * kernel(neighbour.d2);
+            let d = neighbour.d * scale;
+            let weight = kernel(neighbour.d2) * weights.dot(Vec4::new(1.0, d.x, d.y, d.z));
             weight * weight * tallies[neighbour.number as usize].squares
         });
         Light { value, slope: slope.map(|s| s * scale), variance: variance.sum(), radius }
@@ -317,8 +314,8 @@ impl Fit {
         self.power[3] += p * d.z;
     }
 
-    /// The value at d = 0, its slope, and what (d, 1) K P is multiplied with to give the value's part of a place, if there is
-    /// any. A channel that the slope would drive below 0 falls back to the mean.
+    /// The value at d = 0, its slope, and what to multiply K P (1, d) with for a place's part of the value; `None` without measure.
+    /// A channel that the slope would drive below 0 falls back to the mean.
     fn solve(&self) -> Option<(Vec3, [Vec3; 3], Vec4)> {
         let weight = self.measure.weight();
         if weight <= 0.0 {
@@ -330,12 +327,7 @@ impl Fit {
         let value = of(inverse.x_axis);
         let lit = value.cmpge(Vec3::ZERO);
         let slope = [inverse.y_axis, inverse.z_axis, inverse.w_axis].map(|g| Vec3::select(lit, of(g), Vec3::ZERO));
-        let weights = inverse.x_axis.as_vec4();
-        Some((
-            Vec3::select(lit, value, self.power[0] / weight),
-            slope,
-            Vec4::new(weights.y, weights.z, weights.w, weights.x),
-        ))
+        Some((Vec3::select(lit, value, self.power[0] / weight), slope, inverse.x_axis.as_vec4()))
     }
 }
 

@@ -63,8 +63,8 @@ struct Points<'a> {
     fine: [usize; 3],
     /// Along y and z, as many per cell as a cell has; `None` outside Ω.
     across: [Vec<Option<Slot>>; 2],
-    /// Along x: below their nodes and above, or where one stands for both two ways to take turns.
-    along: [Along; 2],
+    /// Along x: below their nodes and above them, or where one stands for both by turns.
+    along: Vec<Along>,
     /// World volume of a voxel, per unit squared.
     volume: f64,
     /// From gradients in index space to the world.
@@ -118,7 +118,7 @@ impl<'a> Points<'a> {
             tau,
             fine,
             across: [1, 2].map(|a| Slot::all(fine[a], dims[a])),
-            along: [false, true].map(|side| Along::new(fine[0], side, cells, dims[0])),
+            along: Along::all(fine[0], cells, dims[0]),
             volume: lattice.cell_volume() / lattice.unit().powi(2),
             to_world: Mat3::from_cols(world(DVec3::X), world(DVec3::Y), world(DVec3::Z)),
             rows,
@@ -240,18 +240,10 @@ impl<'a> Points<'a> {
         h.is_finite().then(|| Point { h: h as f32, slope: index(slope), receiver: index(receiver) })
     }
 
-    /// The slots along x of the row at y and z: all, or those that take turns with those of the rows beside.
-    fn along(&self, [y, z]: [&Slot; 2]) -> &[Along] {
-        match self.fine[0] {
-            1 => std::slice::from_ref(&self.along[usize::from(y.up != z.up)]),
-            _ => &self.along,
-        }
-    }
-
     /// Adds the points of the row at y and z between two nodes to the parts of their cells, one by one.
     fn add_points(&self, across: [&Slot; 2], [first, end]: [usize; 2], row: &mut Row) {
         let (Row { block, parts, .. }, [y, z]) = (row, across);
-        for along in self.along(across) {
+        for along in &self.along {
             for x in along.slots[first..end].iter().flatten().filter(|x| x.cell >= first && x.cell + 1 < end) {
                 if let Some(point) = self.point(DVec3::new(x.at, y.at, z.at)) {
                     block.push(&point, x, along.cell[x.node]);
@@ -267,7 +259,7 @@ impl<'a> Points<'a> {
     /// The same where all samples around are finite.
     fn add_row(&self, across: [&Slot; 2], [first, end]: [usize; 2], Row { nodes, block, parts }: &mut Row) {
         self.read_nodes(across, [first, end], nodes);
-        for along in self.along(across) {
+        for along in &self.along {
             let (first, end) =
                 (first + usize::from(along.up[first] == 0.0), end - usize::from(along.up[end - 1] > 0.0));
             for n in (first..end).step_by(LANES) {
@@ -280,7 +272,6 @@ impl<'a> Points<'a> {
     /// Adds a block's points to the parts of their cells, and empties it.
     #[inline(always)]
     fn add(&self, block: &mut Block, across: [&Slot; 2], parts: &mut [[Part; 8]]) {
-        const BESIDE: [[f32; 2]; 4] = [[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]];
         let [y, z] = across;
         let volume = self.volume * f64::from(y.width * z.width);
         let shares = block.shares(across, &self.to_world);
@@ -297,17 +288,15 @@ impl<'a> Points<'a> {
                 part.add(w, h, normal, centre);
                 continue;
             }
-            // Where the sweep ends, points of the tangent, two to half a step and to the step across.
+            // Where the sweep ends, eight points of the tangent.
             let width = Vec3::new(block.width[n], y.width, z.width);
             let rise = Vec3::from_array(block.slope.each_ref().map(|s| s[n])) * width;
-            let steps: u8 = if width.x > 0.5 { 4 } else { 2 };
-            let w = w / f64::from(4 * steps);
-            for x in (0..steps).map(|n| (f32::from(n) + 0.5) / f32::from(steps) - 0.5) {
-                for offset in BESIDE.map(|[y, z]| Vec3::new(x, y, z)) {
-                    let h = h + rise.dot(offset);
-                    if (0.0..=1.0).contains(&h) {
-                        part.add(w, h, normal, centre + offset * width);
-                    }
+            for eighth in 0..8usize {
+                let at = |axis: usize| if eighth >> axis & 1 == 1 { 0.25 } else { -0.25 };
+                let offset = Vec3::new(at(0), at(1), at(2));
+                let h = h + rise.dot(offset);
+                if (0.0..=1.0).contains(&h) {
+                    part.add(w / 8.0, h, normal, centre + offset * width);
                 }
             }
         }
@@ -357,7 +346,6 @@ impl Part {
 
 #[cfg(test)]
 mod tests {
-    use super::super::shares::Lanes;
     use super::*;
     use crate::field::Sweep;
     use crate::rng::{Rng, Stage};
@@ -386,7 +374,7 @@ mod tests {
             let (mut nodes, mut block, mut compared) = (Default::default(), Block::default(), 0);
             for (y, z) in slots(2).flat_map(|z| slots(1).map(move |y| (y, z))) {
                 assert!(points.regular(y.cell, z.cell) && points.reach(y, z) == Some([0, 9]));
-                let along = points.along([y, z]).iter().flat_map(|a| a.slots.iter().flatten().map(move |x| (a, x)));
+                let along = points.along.iter().flat_map(|a| a.slots.iter().flatten().map(move |x| (a, x)));
                 for (range, (along, x)) in along.flat_map(|x| [[0, 9], [2, 7]].map(|r| (r, x))) {
                     if x.cell < range[0] || x.cell + 1 >= range[1] {
                         continue;
@@ -394,8 +382,7 @@ mod tests {
                     points.read_nodes([y, z], range, &mut nodes);
                     block.read(&nodes, along, x.node, 1);
                     let slow = points.point(DVec3::new(x.at, y.at, z.at)).unwrap();
-                    let of_lane = |lanes: &[Lanes; 3]| Vec3::from_array(lanes.each_ref().map(|l| l[0]));
-                    let (slope, receiver) = (of_lane(&block.slope), of_lane(&block.receiver));
+                    let [slope, receiver] = [block.slope, block.receiver].map(|lanes| Vec3::from(lanes.map(|l| l[0])));
                     let gradients = [(slope, slow.slope), (receiver, slow.receiver)];
                     let far = gradients.iter().map(|(a, b)| (*a - *b).abs().max_element()).fold(0.0, f32::max);
                     let far = (block.h[0] - slow.h).abs().max(far);

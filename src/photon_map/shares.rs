@@ -49,7 +49,8 @@ impl Block {
         self.len += 1;
     }
 
-    /// Becomes the points beside `len` nodes from `first` on, of a row's [`Row::nodes`].
+    /// Becomes the points beside `len` nodes from `first` on. `nodes`: h, ∂h/∂y, ∂h/∂z and the receiver gradient there, each behind
+    /// a place that no node has and with [`LANES`] more.
     #[inline(always)]
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     pub(super) fn read(&mut self, nodes: &[Vec<f32>; 6], along: &Along, first: usize, len: usize) {
@@ -75,6 +76,7 @@ impl Block {
         self.cell.copy_from_slice(&along.cell[first..][..LANES]);
     }
 
+    /// What its points have, across from them slots y and z; `to_world`: of gradients by index.
     #[inline(always)]
     pub(super) fn shares(&self, [y, z]: [&Slot; 2], to_world: &Mat3) -> Shares {
         let mut shares =

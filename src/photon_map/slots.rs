@@ -23,7 +23,7 @@ pub(super) struct Slot {
     pub nodes: [usize; 2],
 }
 
-/// Slots along x, by node; the lists with a block's length more.
+/// Slots along x, one to a node at most; the lists of what points stand for are [`LANES`] longer.
 pub(super) struct Along {
     pub slots: Vec<Option<Slot>>,
     /// 1 for points above their nodes.
@@ -32,7 +32,7 @@ pub(super) struct Along {
     pub centre: Vec<f32>,
     /// 0 where there is no point.
     pub width: Vec<f32>,
-    /// Of the grid.
+    /// Of the grid of bins.
     pub cell: Vec<usize>,
 }
 
@@ -43,7 +43,7 @@ impl Slot {
 
     /// What a point beside a node stands for from `low` to `high` steps beside it.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within the lattice")]
-    pub(super) fn new(node: usize, up: bool, [low, high]: [f64; 2], count: usize) -> Option<Self> {
+    fn new(node: usize, up: bool, [low, high]: [f64; 2], count: usize) -> Option<Self> {
         let middle = node as f64;
         let (low, high) = ((middle + low).max(0.0), (middle + high).min((count - 1) as f64));
         let at = middle + if up { Self::BESIDE } else { -Self::BESIDE };
@@ -61,20 +61,21 @@ impl Slot {
         })
     }
 
-    /// Half a step of an axis of `count` nodes.
-    pub(super) fn half(node: usize, up: bool, count: usize) -> Option<Self> {
+    /// Half a step below a node, or above it.
+    fn half(node: usize, up: bool, count: usize) -> Option<Self> {
         Self::new(node, up, if up { [0.0, 0.5] } else { [-0.5, 0.0] }, count)
     }
 
-    /// A step of an axis of `count` nodes; its point lies within.
-    pub(super) fn whole(node: usize, up: bool, count: usize) -> Option<Self> {
-        Self::new(node, node == 0 || (up && node + 1 < count), [-0.5, 0.5], count)
+    /// The step around a node; points lie on either side by turns, and within the axis.
+    fn whole(node: usize, count: usize) -> Option<Self> {
+        let up = node == 0 || (node.is_multiple_of(2) && node + 1 < count);
+        Self::new(node, up, [-0.5, 0.5], count)
     }
 
-    /// All of an axis of `count` nodes.
+    /// All of an axis of `count` nodes, `fine` a step.
     pub(super) fn all(fine: usize, count: usize) -> Vec<Option<Self>> {
         let slot = |n: usize| match fine {
-            1 => Self::whole(n, n.is_multiple_of(2), count),
+            1 => Self::whole(n, count),
             _ => Self::half(n / 2, n % 2 == 1, count),
         };
         (0..fine * count).map(slot).collect()
@@ -82,21 +83,18 @@ impl Slot {
 }
 
 impl Along {
-    /// Of an axis of `count` nodes: a `side` of all of them, or one or the other by turns.
-    pub(super) fn new(fine: usize, side: bool, cells: &Cells, count: usize) -> Self {
-        let slot = |n: usize| match fine {
-            1 => Slot::whole(n, n.is_multiple_of(2) != side, count),
-            _ => Slot::half(n, side, count),
-        };
-        let none = || vec![0.0; count + LANES];
-        let mut along = Self {
-            slots: (0..count).map(slot).collect(),
-            up: none(),
-            offset: none(),
-            centre: none(),
-            width: none(),
-            cell: (0..count + LANES).map(|n| n / cells.factor[0]).collect(),
-        };
+    /// As [`Slot::all`]: one for every slot that nodes have.
+    pub(super) fn all(fine: usize, cells: &Cells, count: usize) -> Vec<Self> {
+        let slots = Slot::all(fine, count);
+        (0..fine).map(|n| Self::new(slots.iter().skip(n).step_by(fine).copied().collect(), cells)).collect()
+    }
+
+    /// `slots`: by node.
+    fn new(slots: Vec<Option<Slot>>, cells: &Cells) -> Self {
+        let length = slots.len() + LANES;
+        let none = || vec![0.0; length];
+        let cell = (0..length).map(|n| n / cells.factor[0]).collect();
+        let mut along = Self { up: none(), offset: none(), centre: none(), width: none(), cell, slots };
         for slot in along.slots.iter().flatten() {
             let n = slot.node;
             (along.offset[n], along.centre[n], along.width[n]) = (slot.offset, slot.centre, slot.width);
