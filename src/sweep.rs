@@ -52,6 +52,7 @@ use planes::Spare;
 use points::Points;
 use rayon::prelude::*;
 use reflect::Mirror;
+pub(crate) use replicate::bright;
 use slits::Slits;
 use state::State;
 

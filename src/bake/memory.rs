@@ -61,6 +61,8 @@ const SUMMED_SIDE: u64 = 9;
 /// and of the sums' bytes those of the spread.
 const SETTLING_SIDE: u64 = 14;
 const SPREAD_SIDE: u64 = 3;
+/// The same where the level of light may be corrected: what few directions lack, here and in a checkpoint.
+const LEVEL_SIDE: u64 = 12;
 
 /// Bytes per point and side that its checkpoint holds while a replicate is under way, besides the sums; and per stored side,
 /// when all are done.
@@ -218,7 +220,8 @@ impl Parts {
         let levels = Levels::new(members.iter().zip(&all_masks).map(|(m, masks)| (&*m.field, &masks[..])));
         let texels = flat::texels(scene, settings.wall_resolution, settings.wall_isovalues) as u64;
         let sides = sweep::swept_sides(scene).len() as u64;
-        let summed = (2 * stored * SUMMED_SIDE).max(sides * SETTLING_SIDE + 2 * stored * SPREAD_SIDE);
+        let settling = SETTLING_SIDE + if sweep::bright(scene) { LEVEL_SIDE } else { 0 };
+        let summed = (2 * stored * SUMMED_SIDE).max(sides * settling + 2 * stored * SPREAD_SIDE);
         let swept = points * (SWEPT + sides * (SWEPT_SIDE + KEPT_SIDE) + summed);
         let ([landings, lower, higher], gather) = match settings.engine {
             Engine::Photon => (landings(scene, settings, device)?, settings.gather_rays > 0),

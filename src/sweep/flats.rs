@@ -27,6 +27,8 @@ pub(super) struct Texture {
     pub radiance: Vec<f32>,
     /// While light settles: B of the pass before the last.
     pub before: Vec<f32>,
+    /// While light settles again: what many directions brought more than few. Empty otherwise.
+    pub defect: Vec<f32>,
     /// Where the texture starts in [`Flats::packed`].
     start: usize,
     /// ∫cos dω as the pass has seen it, per texel and isovalue: π where no part of it is inside the solid.
@@ -153,6 +155,7 @@ impl Flats {
                     indirect: vec![0.0; n],
                     radiance: vec![0.0; n],
                     before: Vec::new(),
+                    defect: Vec::new(),
                     start: next - texels * isovalues,
                     weight: vec![0.0; texels * isovalues],
                 })
@@ -228,11 +231,15 @@ impl Flats {
         self.reflect(false);
     }
 
-    /// As [`Flats::reflect`] while light settles: goes ω times as far from what was before the pass's light, which is kept for the next
-    /// one. \[GV61\]
+    /// As [`Flats::reflect`] while light settles, the defect included: goes ω times as far from what was before the pass's light, which is
+    /// kept for the next one. \[GV61\]
     pub(super) fn settle(&mut self, omega: [f32; 3]) {
         let light: Vec<Option<Vec<f32>>> =
             self.textures.iter().map(|t| t.as_ref().map(|t| t.radiance.clone())).collect();
+        for t in self.textures.iter_mut().flatten() {
+            let light = t.indirect.iter_mut().zip(&t.direct).zip(&t.defect);
+            light.for_each(|((e, d), x)| *e = (*e + x).max(-d));
+        }
         self.reflect(true);
         for (t, light) in self.textures.iter_mut().zip(light) {
             let (Some(t), Some(light)) = (t, light) else { continue };
@@ -243,6 +250,24 @@ impl Flats {
                 y.iter_mut().zip(before).for_each(|(y, x)| *y = (x + omega[c % 3] * (*y - x)).max(0.0));
             }
         }
+    }
+
+    /// Indirect irradiance of the last pass.
+    pub(super) fn indirect(&self) -> Vec<Vec<f32>> {
+        self.textures.iter().flatten().map(|t| t.indirect.clone()).collect()
+    }
+
+    /// Keeps what the last pass brought more than `few` directions: while light settles it is added to what a pass brings.
+    pub(super) fn correct(&mut self, few: Vec<Vec<f32>>) {
+        for (t, mut defect) in self.textures.iter_mut().flatten().zip(few) {
+            defect.iter_mut().zip(&t.indirect).for_each(|(x, y)| *x = y - *x);
+            t.defect = defect;
+        }
+    }
+
+    /// Forgets it.
+    pub(super) fn no_defect(&mut self) {
+        self.textures.iter_mut().flatten().for_each(|t| t.defect = Vec::new());
     }
 
     /// Empty sums for a pass.

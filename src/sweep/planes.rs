@@ -1,11 +1,15 @@
 //! Planes of light, a number per node each: memory for them, their kept form in half precision, and transposition.
 
 use super::half::{decode, encode, scale};
+use ::half::bf16;
 use rayon::prelude::*;
 use std::sync::Mutex;
 
 /// Red, green and blue, a plane each, so that neighbouring lines load neighbouring numbers.
 pub(super) type Planes = [Vec<f32>; 3];
+
+/// The same of numbers that may be negative, to 2⁻⁹ of each: the bits of [`bf16`].
+pub(super) type SignedPlanes = [Vec<u16>; 3];
 
 /// Nodes that a thread takes at a time.
 const CHUNK: usize = 1 << 14;
@@ -90,6 +94,16 @@ impl HalfPlanes {
         decode(self.planes[c][node]) / self.unit
     }
 
+    /// `light` less this, in its memory.
+    pub(super) fn short_of(self, light: &Planes) -> SignedPlanes {
+        let mut planes = self.planes;
+        for (half, light) in planes.iter_mut().zip(light) {
+            let both = half.par_iter_mut().zip(light).with_min_len(CHUNK);
+            both.for_each(|(h, x)| *h = bf16::from_f32(x - decode(*h) / self.unit).to_bits());
+        }
+        planes
+    }
+
     /// The greatest number of a channel.
     fn greatest(&self, c: usize) -> f32 {
         let most = self.planes[c].par_chunks(CHUNK).map(|x| x.iter().fold(0, |m, x| m.max(*x))).max();
@@ -97,11 +111,18 @@ impl HalfPlanes {
     }
 }
 
+/// A number of [`SignedPlanes`].
+#[inline(always)]
+fn signed(x: u16) -> f32 {
+    f32::from_bits(u32::from(x) << 16)
+}
+
 /// Light of every node of the sides, as it is gathered or as it is kept.
 #[derive(Clone, Copy)]
 pub(super) enum NodeLight<'a> {
     Full(&'a [Planes]),
     Half(&'a [HalfPlanes]),
+    Signed(&'a [SignedPlanes]),
 }
 
 impl NodeLight<'_> {
@@ -110,6 +131,7 @@ impl NodeLight<'_> {
         match self {
             Self::Full(sides) => sides.len(),
             Self::Half(sides) => sides.len(),
+            Self::Signed(sides) => sides.len(),
         }
     }
 
@@ -118,6 +140,10 @@ impl NodeLight<'_> {
         match self {
             Self::Full(sides) => greatest(&sides[side][c]),
             Self::Half(sides) => sides[side].greatest(c),
+            Self::Signed(sides) => {
+                let most = |x: &[u16]| x.iter().fold(0.0, |m, x| signed(*x).max(m));
+                sides[side][c].par_chunks(CHUNK).map(most).reduce(|| 0.0, f32::max)
+            }
         }
     }
 
@@ -133,6 +159,10 @@ impl NodeLight<'_> {
                 let from = &sides[side].planes[c][first..][..to.len()];
                 let factor = factor / sides[side].unit;
                 to.iter_mut().zip(from).for_each(|(t, x)| *t += factor * decode(*x));
+            }
+            Self::Signed(sides) => {
+                let from = &sides[side][c][first..][..to.len()];
+                to.iter_mut().zip(from).for_each(|(t, x)| *t += factor * signed(*x));
             }
         }
     }
@@ -210,6 +240,26 @@ mod tests {
             }
             assert!((f64::from(back[i]) - 1.0 - 2.0 * sum[1]).abs() < 1e-2 * (1.0 + sum[1]));
         }
+    }
+
+    /// What is short of a light makes it up.
+    #[test]
+    fn what_is_short_adds_up() {
+        let n = CHUNK + 5;
+        let (few, all) = (random(n, 2.0, 1), random(n, 3.0, 2));
+        let kept = HalfPlanes::new(&few, 1.0, None);
+        let short = [kept.clone().short_of(&all)];
+        let mut sum = vec![0.0; n];
+        NodeLight::Half(&[kept]).add((0, 2), 1.0, 0, &mut sum);
+        NodeLight::Signed(&short).add((0, 2), 1.0, 0, &mut sum);
+        let mut most = 0f32;
+        for ((sum, all), few) in sum.iter().zip(&all[2]).zip(&few[2]) {
+            let rounding = (all - few).abs() / 256.0 + few / 2048.0;
+            assert!((sum - all).abs() <= rounding, "{sum} {all}");
+            most = most.max(all - few);
+        }
+        let said = NodeLight::Signed(&short).greatest(0, 2);
+        assert!((said / most - 1.0).abs() < 0.01 && most > 2.9, "{said} {most}");
     }
 
     #[test]

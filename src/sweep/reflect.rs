@@ -341,7 +341,7 @@ mod tests {
         }
     }
 
-    /// Rows of random light, some of it not shown, with and without memory, ω and an albedo of every node's own.
+    /// Rows of random light, some of it not shown or negative, with and without memory, ω and an albedo of every node's own.
     #[test]
     fn every_instruction_set_reflects_the_same_bits() {
         let (nx, rows) = (61, 5);
@@ -349,6 +349,8 @@ mod tests {
         let mut random = |n: usize| -> Vec<f32> { (0..n).map(|_| (rng.unit() * 1.3 - 0.3).max(0.0) as f32).collect() };
         let planes: Vec<[Vec<f32>; 3]> = vec![std::array::from_fn(|_| random(nx * rows))];
         let half = vec![HalfPlanes::new(&planes[0], 0.7, None)];
+        // Of either sign.
+        let short = vec![half[0].clone().short_of(&std::array::from_fn(|_| random(nx * rows)))];
         let shown: Cross = std::array::from_fn(|_| random(nx).iter().map(|x| f32::from(*x > 0.1)).collect());
         let albedo: Vec<[f32; 3]> = random(nx * rows).iter().map(|x| [*x, 0.5 * x, 0.3]).collect();
         let packed = |x: Vec<f32>| x.iter().map(|x| [half::encode(*x), half::encode(0.3 * x), 0, 0]).collect();
@@ -356,7 +358,11 @@ mod tests {
         let before: Vec<Half4> = packed(random(nx));
         for (by_node, omega) in [(None, None), (None, Some([1.2, 1.1, 1.0])), (Some(&albedo[..]), Some([1.0; 3]))] {
             let job = Job {
-                light: &[(NodeLight::Full(&planes), 1.0), (NodeLight::Half(&half), 0.5)],
+                light: &[
+                    (NodeLight::Full(&planes), 1.0),
+                    (NodeLight::Half(&half), 0.5),
+                    (NodeLight::Signed(&short), 1.0),
+                ],
                 emission: [0.1, 0.0, 0.2],
                 over_pi: [0.4, 0.6, 0.2],
                 by_node,

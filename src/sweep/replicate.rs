@@ -1,12 +1,20 @@
 //! The passes of one replicate: few directions until light has settled, then more.
+//!
+//! In bright closed rooms that is not enough. What few directions bring too much, by a share δ, each bounce brings again: the level of
+//! the light is off by δ / (1 − r), of which r² are left after two later passes. There the defect of few directions is corrected
+//! \[Stetter78\]: x₁ being the light, it settles again as x = D + (T − T₁) x₁ + T₁ x, where T₁ is a pass with few directions and T one with
+//! all that the replicates' last passes have together. What is off then is of second order: (1 − T₁)⁻¹ (T − T₁) (x₁ − x).
 
+use super::directions::{self, Shear};
 use super::flats::Flats;
 use super::gather::Pass;
-use super::planes::{NodeLight, Planes};
+use super::planes::{HalfPlanes, NodeLight, Planes};
 use super::reflect::Reflected;
 use super::settling::Settling;
 use super::state::{Passes, State};
-use super::{Run, SweepSettings, directions};
+use super::{Run, SweepSettings};
+use crate::flat;
+use crate::scene::Scene;
 use std::sync::Mutex;
 
 /// Passes with few directions take this share of the full number.
@@ -18,6 +26,29 @@ const LEAST: usize = 16;
 const LATE: usize = 2;
 /// Coarse passes until light has settled, as a rule; only estimates of time rely on it.
 const SETTLING: usize = 8;
+/// The level of light is corrected where r is greater, and some albedo.
+const BRIGHT: f64 = 0.78;
+
+/// What a pass is for.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Kind {
+    /// One of a number of bounces that is given.
+    Given,
+    /// Few directions, until light has settled.
+    Coarse,
+    /// Few directions and all, whose difference corrects the level.
+    Level,
+    /// More directions, after light has settled.
+    Late,
+}
+
+/// Whether anything reflects so much that the level of light is corrected, should light settle as slowly.
+pub(crate) fn bright(scene: &Scene) -> bool {
+    let flats = (0..flat::count(scene)).filter_map(|number| flat::flat(scene, number));
+    let flats = flats.map(|flat| flat.albedo.greatest().max_element());
+    flats.fold(scene.surface.albedo.greatest().max_element(), f64::max) > BRIGHT
+}
+
 impl SweepSettings {
     /// Directions of all passes together, if light settles as fast as it does as a rule.
     pub(crate) fn expected_directions(&self) -> usize {
@@ -50,7 +81,15 @@ impl Run<'_> {
             flats.reflect_direct();
             self.mirror.reflect(flats, &[direct], Reflected::default(), None)
         };
-        Passes { light, before: Reflected::default(), settling: Settling::new(sums.light), late, bounce: 0 }
+        Passes {
+            light,
+            before: Reflected::default(),
+            settling: Settling::new(sums.light),
+            corrected: false,
+            defect: Vec::new(),
+            late,
+            bounce: 0,
+        }
     }
 
     /// Whether a replicate starts from the light of those before instead of from luminaires alone: then its last pass is all
@@ -58,6 +97,41 @@ impl Run<'_> {
     /// sphere.
     fn warm(&self, state: &State) -> bool {
         state.done > 0 && self.settings.settles() && state.total.sides().len() == self.sides.len()
+    }
+
+    /// What the next pass is for.
+    fn kind(&self, now: &Passes) -> Kind {
+        let s = self.settings;
+        if !s.settles() {
+            return Kind::Given;
+        }
+        let level = !now.corrected && now.settling.slowest() > BRIGHT && bright(self.scene);
+        if level && now.late == 1 && now.bounce + 2 * LATE < s.max_bounces {
+            return Kind::Level;
+        }
+        // Light goes on to settle after the level, to which half of the bounces are left.
+        let most = if level { s.max_bounces / 2 } else { s.max_bounces };
+        let more = if now.corrected { 1 } else { LATE };
+        let settled = now.settling.missing(more).is_some_and(|m| m < s.target);
+        if now.late > 0 || settled || now.bounce + LATE >= most { Kind::Late } else { Kind::Coarse }
+    }
+
+    /// The lines of the next pass, of replicate `number`.
+    fn lines(&self, kind: Kind, now: &Passes, number: usize) -> Vec<Shear> {
+        let s = self.settings;
+        let replicates = s.replicates.max(1);
+        let clamped = |directions: usize| directions.max(LEAST).min(s.directions);
+        // Coarse passes share their directions: then nothing but bounces changes the mean from one to the next. What
+        // counts are parts of one set, a part per replicate.
+        let (index, directions, part) = match kind {
+            Kind::Given => (now.bounce as u64 + 1, s.directions, (number, replicates)),
+            Kind::Coarse => (1 << 32 | number as u64, clamped(s.directions / COARSE), (0, 1)),
+            Kind::Level => (1, s.directions * replicates, (0, 1)),
+            Kind::Late => {
+                ((LATE - now.late) as u64, clamped(s.directions >> (LATE - 1 - now.late)), (number, replicates))
+            }
+        };
+        directions::lines(self.scene.lattice(), (s.seed, index), directions, part)
     }
 
     /// Bounces: coarse passes until what is missing is known and small, then finer ones. Goes on behind the passes of `from`, whose
@@ -70,7 +144,6 @@ impl Run<'_> {
         progress: &dyn Fn(f64) -> bool,
     ) -> (Vec<Planes>, bool) {
         let s = self.settings;
-        let number = state.done as u64;
         if from.is_none() && self.saved.due() {
             self.saved.save(0, || state.bytes(None, flats));
         }
@@ -88,67 +161,72 @@ impl Run<'_> {
             spare: self.spare,
             workspaces: Mutex::default(),
         };
-        let fixed = !self.settings.settles();
         while now.bounce < s.max_bounces {
             if self.saved.due() {
                 self.saved.save(0, || state.bytes(Some(&now), flats));
             }
-            let settled = now.late > 0 || now.settling.missing(LATE).is_some_and(|m| m < s.target);
+            let kind = self.kind(&now);
+            if kind == Kind::Late && now.corrected {
+                now.late = LATE - 1;
+                now.defect = Vec::new();
+                flats.no_defect();
+            }
+            let lines = self.lines(kind, &now, state.done);
+            let few = if kind == Kind::Level { self.lines(Kind::Coarse, &now, state.done) } else { Vec::new() };
+            let more = if kind == Kind::Late && now.late + 1 == LATE { 0.0 } else { 3.0 };
+            let total = (few.len() + lines.len()) * self.sides.len();
             let bounce = now.bounce + 1;
-            let late = settled || bounce + LATE > s.max_bounces;
-            let directions = match () {
-                () if fixed => s.directions,
-                () if late => s.directions >> (LATE - 1 - now.late),
-                () => (s.directions / COARSE).max(LEAST),
-            };
-            let directions = directions.max(LEAST).min(s.directions);
-            // Coarse passes share their directions: then nothing but bounces changes the mean from one to the next. What
-            // counts are parts of one set, a part per replicate.
-            let (set, part) = match () {
-                () if fixed => (bounce as u64, (state.done, s.replicates.max(1))),
-                () if late => ((LATE - now.late) as u64, (state.done, s.replicates.max(1))),
-                () => (1 << 32 | number, (0, 1)),
-            };
-            let lines = directions::lines(self.scene.lattice(), (s.seed, set), directions, part);
-            let mut incoming = flats.open();
             let mut family = 0;
-            let more = if now.late + 1 == LATE { 0.0 } else { 3.0 };
-            let total = lines.len() * self.sides.len();
             let mut ask = || {
                 family += 1;
                 let passes = bounce as f64 - 1.0 + f64::from(family) / total as f64;
                 progress(passes / (bounce as f64 + more))
             };
-            let mut stopped = false;
-            for (&side, b) in self.sides.iter().zip(&now.light.b) {
-                let (e, complete) = pass.gather(side, &lines, b, now.light.unit, flats, &mut incoming, &mut ask);
-                stopped |= !complete;
-                indirect.push(e);
+            let mut by_few = None;
+            let mut complete = true;
+            for lines in [few, lines].iter().filter(|lines| !lines.is_empty()) {
+                if !indirect.is_empty() {
+                    let nodes: Vec<_> = indirect.iter().map(|e| HalfPlanes::new(e, 1.0, None)).collect();
+                    by_few = Some((nodes, flats.indirect()));
+                    self.spare.keep(indirect.drain(..).flatten());
+                }
+                let mut incoming = flats.open();
+                for (&side, b) in self.sides.iter().zip(&now.light.b) {
+                    let (e, all) = pass.gather(side, lines, b, now.light.unit, flats, &mut incoming, &mut ask);
+                    complete &= all;
+                    indirect.push(e);
+                }
+                if !complete {
+                    // Half a pass is not kept, and may be as large as what is.
+                    self.spare.keep(indirect.drain(..).flatten());
+                    self.saved.save(0, || state.bytes(Some(&now), flats));
+                    state.see(&now);
+                    return (Vec::new(), false);
+                }
+                flats.close(&incoming);
             }
-            if stopped {
-                // Half a pass is not kept, and may be as large as what is.
-                self.spare.keep(indirect.drain(..).flatten());
-                self.saved.save(0, || state.bytes(Some(&now), flats));
-                state.see(&now);
-                return (Vec::new(), false);
-            }
-            flats.close(&incoming);
             now.bounce = bounce;
             state.counts.families += total as u64;
             state.counts.gather_rays += state.counts.valid * total as u64;
-            now.late += usize::from(late && !fixed);
-            let settles = !fixed && !late;
+            let settles = matches!(kind, Kind::Coarse | Kind::Level);
+            if kind == Kind::Level {
+                now.settling.again();
+            }
             let omega = now.settling.omega();
             if settles {
                 flats.settle(omega);
             } else {
+                now.late += usize::from(kind == Kind::Late);
                 now.settling.since += 1;
                 flats.reflect(true);
             }
             if now.late == LATE || bounce == s.max_bounces {
                 break;
             }
-            let light = [(NodeLight::Half(&state.total.direct), 1.0), (NodeLight::Full(&indirect), 1.0)];
+            let mut light = vec![(NodeLight::Half(&state.total.direct), 1.0), (NodeLight::Full(&indirect), 1.0)];
+            if !now.defect.is_empty() {
+                light.push((NodeLight::Signed(&now.defect), 1.0));
+            }
             if settles {
                 let memory = std::mem::take(&mut now.before);
                 let (reflected, sums) = self.mirror.reflect(flats, &light, memory, Some((&now.light, omega)));
@@ -158,6 +236,11 @@ impl Run<'_> {
                 now.before = Reflected::default();
                 let memory = std::mem::take(&mut now.light);
                 now.light = self.mirror.reflect(flats, &light, memory, None).0;
+            }
+            if let Some((nodes, flats_by_few)) = by_few {
+                now.defect = nodes.into_iter().zip(&indirect).map(|(few, all)| few.short_of(all)).collect();
+                flats.correct(flats_by_few);
+                (now.corrected, now.late) = (true, 0);
             }
             self.spare.keep(indirect.drain(..).flatten());
         }

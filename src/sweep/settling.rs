@@ -29,8 +29,12 @@ const KNOWN: usize = 3;
 /// The greatest r that is believed, of the slowest light and of all other.
 const MOST: f64 = 0.98;
 const OTHERS: f64 = 0.93;
+/// The greatest r that ω is for.
+const RELAXED: f64 = 0.95;
 /// Changes this much greater than the least tell that ω drives light apart.
 const APART: f64 = 10.0;
+/// Smaller changes, as a share of light, say nothing of r: light is kept to 2⁻¹² of each number.
+const ROUNDING: f64 = 1.0 / 4096.0;
 
 /// Sums over nodes that show light of their own and over sides, per channel.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -77,6 +81,17 @@ impl Settling {
         [first, a, b, c, least, share, drift, radius, d, e, f, g]
     }
 
+    /// Begins again at the light there is, with what is known of r.
+    pub(super) fn again(&mut self) {
+        let Self { passes, since, first, radius, .. } = *self;
+        *self = Self { passes, since, radius, ..Self::new(first) };
+    }
+
+    /// The greatest r of any channel; 0 until it is known.
+    pub(super) fn slowest(&self) -> f64 {
+        self.radius.into_iter().fold(0.0, f64::max)
+    }
+
     /// ω of the pass to come.
     #[allow(clippy::cast_possible_truncation, reason = "a number in [1, 2]")]
     pub(super) fn omega(&self) -> [f32; 3] {
@@ -95,18 +110,21 @@ impl Settling {
             self.share[c] = sums.change[c] / indirect;
             self.drift[c] = sums.drift[c].abs() / indirect;
             let [old, _, new] = self.changes.map(|change| change[c]);
-            if self.passes < KNOWN || !(old > 0.0 && new > 0.0) {
+            let known = old > 0.0 || self.radius[c] > 0.0;
+            if self.passes < KNOWN || !(known && new > 0.0) {
                 continue;
             }
-            // Of a change an eigenvalue λ leaves q in a pass, where ω λ q = q² + ω − 1 [GV61];
-            // ω is that of the x which the changes are measured from.
-            let (q, omega) = ((new / old).sqrt(), 0.5 * (self.omega[0][c] + self.omega[1][c]));
-            let begins = self.radius[c] == 0.0;
-            if q * q > omega - 1.0 {
-                self.radius[c] = self.radius[c].max(((q + (omega - 1.0) / q) / omega).min(MOST));
+            let begins = self.least[c] == f64::INFINITY;
+            if old > 0.0 && new > ROUNDING * sums.light[c] {
+                // Of a change an eigenvalue λ leaves q in a pass, where ω λ q = q² + ω − 1 [GV61];
+                // ω is that of the x which the changes are measured from.
+                let (q, omega) = ((new / old).sqrt(), 0.5 * (self.omega[0][c] + self.omega[1][c]));
+                if q * q > omega - 1.0 {
+                    self.radius[c] = self.radius[c].max(((q + (omega - 1.0) / q) / omega).min(MOST));
+                }
             }
             self.least[c] = self.least[c].min(new);
-            let r2 = self.radius[c].powi(2);
+            let r2 = self.radius[c].min(RELAXED).powi(2);
             let omega = &mut self.omega[3][c];
             *omega = match *omega {
                 // ω₂ and its successors. [GV61]

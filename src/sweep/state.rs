@@ -3,7 +3,7 @@
 use super::SweepCounts;
 use super::flats::Flats;
 use super::half::Half4;
-use super::planes::{HalfPlanes, Planes};
+use super::planes::{HalfPlanes, Planes, SignedPlanes};
 use super::reflect::Reflected;
 use super::settling::Settling;
 use super::totals::{Totals, stride};
@@ -32,6 +32,10 @@ pub(super) struct Passes {
     /// While light settles: what the last pass read.
     pub before: Reflected,
     pub settling: Settling,
+    /// Whether the level of the light has been corrected.
+    pub corrected: bool,
+    /// While light settles after that: what many directions brought more than few, per side.
+    pub defect: Vec<SignedPlanes>,
     /// Passes since the light has settled.
     pub late: usize,
     /// Passes behind us.
@@ -85,7 +89,7 @@ impl State {
         let Totals { lighting, direct, light, spread, parts, .. } = &self.total;
         // If all nodes are lit.
         let numbers = 12 * lighting.len() + 6 * (direct.len() + light.len()) + 3 * spread.len();
-        let under_way = passes.map_or(0, |p| 6 * (p.light.b.len() + p.before.b.len()));
+        let under_way = passes.map_or(0, |p| 6 * (p.light.b.len() + p.before.b.len() + p.defect.len()));
         // The flats are small beside it.
         let mut out = Writer { bytes: Vec::with_capacity(self.total.nodes() * (numbers + under_way) + (1 << 16)) };
         out.count(self.done);
@@ -123,10 +127,15 @@ impl State {
             out.count(p.settling.passes);
             out.count(p.settling.since);
             p.settling.clone().reals().into_iter().flatten().for_each(|x| out.real(*x));
+            out.count(usize::from(p.corrected));
+            out.count(p.defect.len());
+            p.defect.iter().flatten().for_each(|plane| out.halves(plane.iter().copied()));
             for t in flats.textures.iter().flatten() {
                 out.numbers(&t.radiance);
-                out.count(t.before.len());
-                out.numbers(&t.before);
+                for some in [&t.before, &t.defect] {
+                    out.count(some.len());
+                    out.numbers(some);
+                }
             }
         }
         out.bytes
@@ -143,8 +152,8 @@ impl State {
         (self.done, self.flats) = (state.done, state.flats);
         (self.bounces, self.residual, self.counts) = (state.bounces, state.residual, state.counts);
         let (passes, light) = passes?;
-        for (texture, [radiance, before]) in flats.textures.iter_mut().flatten().zip(light) {
-            [texture.radiance, texture.before] = [radiance, before];
+        for (texture, light) in flats.textures.iter_mut().flatten().zip(light) {
+            [texture.radiance, texture.before, texture.defect] = light;
         }
         Some(passes)
     }
@@ -210,13 +219,19 @@ impl State {
             for three in settling.reals() {
                 *three = from.three()?;
             }
+            let (corrected, defects) = (from.count()? == 1, from.count()?.min(sides));
+            let mut three = || Some([from.halves(nodes)?, from.halves(nodes)?, from.halves(nodes)?]);
+            let defect = (0..defects).map(|_| three()).collect::<Option<_>>()?;
             let mut textures = Vec::new();
             for t in flats.textures.iter().flatten() {
                 let radiance = from.numbers(t.radiance.len())?;
-                let before = from.count()?.min(radiance.len());
-                textures.push([radiance, from.numbers(before)?]);
+                let mut some = || {
+                    let count = from.count()?.min(t.radiance.len());
+                    from.numbers(count)
+                };
+                textures.push([radiance, some()?, some()?]);
             }
-            passes = Some((Passes { light, before, settling, late, bounce }, textures));
+            passes = Some((Passes { light, before, settling, corrected, defect, late, bounce }, textures));
         }
         from.bytes.is_empty().then_some(Parsed { state, direct, passes })
     }
@@ -227,8 +242,8 @@ struct Parsed {
     state: State,
     /// Direct light of the flats that reflect.
     direct: Vec<Vec<f32>>,
-    /// Passes under way, and these flats' radiance after the last pass and before it.
-    passes: Option<(Passes, Vec<[Vec<f32>; 2]>)>,
+    /// Passes under way, and these flats' radiance after the last pass and before it, and their defect.
+    passes: Option<(Passes, Vec<[Vec<f32>; 3]>)>,
 }
 
 /// Numbers that are left out together if all are 0.

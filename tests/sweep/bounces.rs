@@ -1,11 +1,16 @@
 //! How bounces end: what they leave out, and what replicates share.
 
-use super::{bumps, rms, run};
+use super::{bumps, nodes, rms, run};
 use glam::DVec3;
+use isolume::embree::{Device, GraphTracer};
+use isolume::flattened::Side;
 use isolume::polygon::Polygon;
+use isolume::reference::{PathTracer, receiver};
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
 use isolume::sweep::SweepSettings;
 use isolume::volume::Lattice;
+use rayon::prelude::*;
+use std::f64::consts::PI;
 
 /// What bounces leave out is known where they converged, replicates that start warm among them, and is not 0 where they were cut.
 #[test]
@@ -24,7 +29,7 @@ fn the_residual_of_cut_bounces_is_not_known() {
 }
 
 /// The default box with a front, of one albedo.
-fn closed_box(lattice: &Lattice, albedo: DVec3) -> Vec<Polygon> {
+pub(super) fn closed_box(lattice: &Lattice, albedo: DVec3) -> Vec<Polygon> {
     let mut walls = cornell_box(lattice, 0.0).unwrap();
     let corner = |(x, z): (f64, f64)| lattice.to_world(DVec3::new(x, 0.0, z) * lattice.far());
     let front = [(0.0, 0.0), (0.0, 1.0), (1.0, 1.0), (1.0, 0.0)].map(corner).to_vec();
@@ -41,10 +46,11 @@ fn settled_light_misses_what_it_says() {
     let f = bumps(41);
     let default = cornell_box(f.lattice(), 0.0).unwrap();
     let colour = DVec3::new(0.9, 0.6, 0.3);
-    let red = (colour, default.clone(), [7, 10]);
-    let room = |x, most| (DVec3::splat(x), closed_box(f.lattice(), DVec3::splat(x)), most);
-    let open = (DVec3::splat(0.75), default, [6, 9]);
-    for (albedo, walls, most) in [open, red, room(0.9, [12, 26]), room(0.97, [25, 28])] {
+    let red = (colour, default.clone(), [7, 10], 0.05);
+    // Light that settles again, after its level was corrected, is nearer than what is said: noise fades sooner than levels do.
+    let room = |x, most| (DVec3::splat(x), closed_box(f.lattice(), DVec3::splat(x)), most, 0.01);
+    let open = (DVec3::splat(0.75), default, [6, 9], 0.05);
+    for (albedo, walls, most, least) in [open, red, room(0.9, [28, 46]), room(0.97, [39, 55])] {
         let surface = Surface { albedo: albedo.into(), ..Surface::default() };
         let scene = Scene::new(f.clone(), surface, Boundary::Open, walls).unwrap();
         let light = |max_bounces, target| {
@@ -72,10 +78,40 @@ fn settled_light_misses_what_it_says() {
                 "{albedo}, target {target}: {missing:.5} is missing after {} passes, said {:.5}",
                 got.bounces, got.residual
             );
-            assert!(missing < got.residual && got.residual < target && missing > 0.05 * got.residual);
+            assert!(missing < got.residual && got.residual < target && missing > least * got.residual);
             assert!(got.bounces < whole.bounces && got.bounces <= most);
         }
     }
+}
+
+/// What the few directions along which light spreads bring too much makes the whole of a bright room too bright: against path tracing,
+/// seed by seed, 3.4 % RMS where the level is not corrected.
+#[test]
+fn bright_rooms_are_as_bright_as_they_should_be() {
+    let f = bumps(25);
+    let albedo = DVec3::splat(0.95);
+    let surface = Surface { albedo: albedo.into(), ..Surface::default() };
+    let walls = closed_box(f.lattice(), albedo);
+    let scene = Scene::new(f, surface, Boundary::Open, walls).unwrap();
+    let device = Device::new(1).unwrap();
+    let tracer = GraphTracer::new(&device, &scene).unwrap();
+    let some: Vec<usize> = nodes(&scene, 2).into_iter().step_by(31).collect();
+    let paths = |o: usize| {
+        let place = DVec3::from_array(scene.lattice().ijk(o).map(|x| x as f64));
+        let receiver = receiver(&scene, place, scene.field.samples()[o], Side::Lower).unwrap();
+        PathTracer::new(&scene, &tracer).outgoing(&receiver, 1024, (5, o as u64)).y
+    };
+    let exact: f64 = some.par_iter().map(|&o| paths(o)).collect::<Vec<_>>().iter().sum();
+    let levels: Vec<f64> = (1..=6)
+        .map(|seed| {
+            let got = run(&scene, SweepSettings { directions: 128, seed, ..SweepSettings::default() });
+            let light: f64 = some.iter().map(|&o| f64::from(got.sides[0].irradiance[o][1])).sum();
+            light * albedo.y / PI / exact - 1.0
+        })
+        .collect();
+    let off = rms(levels.iter().copied());
+    println!("{} nodes, off by {levels:.4?}, RMS {off:.4}", some.len());
+    assert!(off < 0.008, "{levels:?}");
 }
 
 /// The light that replicates share while it spreads is that of all their luminaire points, not of the first one's few: with two each,

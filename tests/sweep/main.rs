@@ -502,11 +502,16 @@ fn an_interrupted_sweep_goes_on_with_the_same_bits() {
         flat_resolution: (6, 6),
         ..SweepSettings::default()
     };
-    // One side in the box; both, coupled around the rims by a margin.
-    for margin in [0.0, 0.2] {
+    // One side in the box; both, coupled around the rims by a margin; a bright room, whose level is corrected.
+    for (margin, albedo) in [(0.0, 0.75), (0.2, 0.75), (0.0, 0.97)] {
         let field = bumps(13);
-        let walls = cornell_box(field.lattice(), margin).unwrap();
-        let surface = Surface { both_sides: margin > 0.0, ..Surface::default() };
+        let bright = albedo > 0.9;
+        let settings = SweepSettings { max_bounces: if bright { 48 } else { settings.max_bounces }, ..settings };
+        let walls = match bright {
+            true => bounces::closed_box(field.lattice(), DVec3::splat(albedo)),
+            false => cornell_box(field.lattice(), margin).unwrap(),
+        };
+        let surface = Surface { both_sides: margin > 0.0, albedo: DVec3::splat(albedo).into(), ..Surface::default() };
         let scene = Scene::new(field, surface, Boundary::Open, walls).unwrap();
         let bits = |result: &SweepResult| -> Vec<u32> {
             let nodes = result.sides.iter().flat_map(|s| {
@@ -517,7 +522,7 @@ fn an_interrupted_sweep_goes_on_with_the_same_bits() {
         };
         let ticks = AtomicU64::new(0);
         let whole = sweep(&scene, &settings, &|_| ticks.fetch_add(1, Relaxed) < u64::MAX).unwrap();
-        assert!(!whole.stopped && whole.bounces > 4);
+        assert!(!whole.stopped && whole.bounces > if bright { 30 } else { 4 });
         let all = ticks.load(Relaxed);
         let folder = tempfile::tempdir().unwrap();
         let (path, kept) = (folder.path().join("a.checkpoint"), folder.path().join("kept"));
@@ -546,7 +551,7 @@ fn an_interrupted_sweep_goes_on_with_the_same_bits() {
                 (runs, done) = (runs + 1, done + ticks.load(Relaxed));
                 assert!(runs < 60, "no progress");
                 if !result.stopped {
-                    assert_eq!(bits(&result), bits(&whole), "margin {margin}, killed {killed}");
+                    assert_eq!(bits(&result), bits(&whole), "margin {margin}, albedo {albedo}, killed {killed}");
                     assert_eq!((result.counts, result.bounces), (whole.counts, whole.bounces));
                     assert_eq!(result.residual.to_bits(), whole.residual.to_bits());
                     // What is finished is not done again.
@@ -567,7 +572,7 @@ fn an_interrupted_sweep_goes_on_with_the_same_bits() {
             (done, runs) = (0, if killed { runs } else { 0 });
         }
         let share = repeated as f64 / (2 * all) as f64;
-        println!("margin {margin}: {runs} runs, {share:.2} of the work");
+        println!("margin {margin}, albedo {albedo}: {runs} runs, {share:.2} of the work");
         assert!((1.0..2.0).contains(&share), "{share}");
     }
 }
