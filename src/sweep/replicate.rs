@@ -28,6 +28,8 @@ const LATE: usize = 2;
 const SETTLING: usize = 8;
 /// The level of light is corrected where r is greater, and some albedo.
 const BRIGHT: f64 = 0.78;
+/// Bounces that must be allowed for it.
+const ROOM: usize = 32;
 
 /// What a pass is for.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -105,7 +107,8 @@ impl Run<'_> {
         if !s.settles() {
             return Kind::Given;
         }
-        let level = !now.corrected && now.settling.slowest() > BRIGHT && bright(self.scene);
+        let slow = s.max_bounces >= ROOM && now.settling.slowest() > BRIGHT;
+        let level = !now.corrected && slow && bright(self.scene);
         if level && now.late == 1 && now.bounce + 2 * LATE < s.max_bounces {
             return Kind::Level;
         }

@@ -114,6 +114,22 @@ fn bright_rooms_are_as_bright_as_they_should_be() {
     assert!(off < 0.008, "{levels:?}");
 }
 
+/// Where few bounces are allowed, all of them are made in a bright room, too.
+#[test]
+fn bright_rooms_have_all_their_bounces() {
+    let f = bumps(17);
+    let albedo = DVec3::splat(0.95);
+    let surface = Surface { albedo: albedo.into(), ..Surface::default() };
+    let walls = closed_box(f.lattice(), albedo);
+    let scene = Scene::new(f, surface, Boundary::Open, walls).unwrap();
+    for max_bounces in [3, 8, 16, 31] {
+        let settings =
+            SweepSettings { directions: 32, light_points: 4, replicates: 1, max_bounces, ..SweepSettings::default() };
+        let got = run(&scene, SweepSettings { target: 1e-6, ..settings });
+        assert_eq!(got.bounces, max_bounces);
+    }
+}
+
 /// The light that replicates share while it spreads is that of all their luminaire points, not of the first one's few: with two each,
 /// the mean indirect light errs less than the mean direct light does (0.5 times as much; 1.4 times where the first one spread its own).
 #[test]
