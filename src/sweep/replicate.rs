@@ -28,6 +28,8 @@ const LATE: usize = 2;
 const SETTLING: usize = 8;
 /// The level of light is corrected where r is greater, and some albedo.
 const BRIGHT: f64 = 0.78;
+/// So many times the target may be missing before.
+const EARLY: f64 = 8.0;
 /// Bounces that must be allowed for it.
 const ROOM: usize = 32;
 
@@ -112,10 +114,10 @@ impl Run<'_> {
         if level && now.late == 1 && now.bounce + 2 * LATE < s.max_bounces {
             return Kind::Level;
         }
-        // Light goes on to settle after the level, to which half of the bounces are left.
-        let most = if level { s.max_bounces / 2 } else { s.max_bounces };
+        // Light goes on to settle after the level: half of the bounces are left to that, and what is missing before hardly matters.
+        let (most, target) = if level { (s.max_bounces / 2, EARLY * s.target) } else { (s.max_bounces, s.target) };
         let more = if now.corrected { 1 } else { LATE };
-        let settled = now.settling.missing(more).is_some_and(|m| m < s.target);
+        let settled = now.settling.missing(more).is_some_and(|m| m < target);
         if now.late > 0 || settled || now.bounce + LATE >= most { Kind::Late } else { Kind::Coarse }
     }
 
