@@ -98,8 +98,12 @@ impl HalfPlanes {
     pub(super) fn short_of(self, light: &Planes) -> SignedPlanes {
         let mut planes = self.planes;
         for (half, light) in planes.iter_mut().zip(light) {
-            let both = half.par_iter_mut().zip(light).with_min_len(CHUNK);
-            both.for_each(|(h, x)| *h = bf16::from_f32(x - decode(*h) / self.unit).to_bits());
+            half.par_chunks_mut(CHUNK).zip(light.par_chunks(CHUNK)).for_each(|(half, light)| {
+                if light.iter().any(|x| *x != 0.0) || half.iter().any(|h| *h != 0) {
+                    let short = |h: u16, x: f32| bf16::from_f32(x - decode(h) / self.unit).to_bits();
+                    half.iter_mut().zip(light).for_each(|(h, x)| *h = short(*h, *x));
+                }
+            });
         }
         planes
     }

@@ -243,6 +243,7 @@ impl Run<'_> {
                 now.light = self.mirror.reflect(flats, &light, memory, None).0;
             }
             if let Some((nodes, flats_by_few)) = by_few {
+                // (T − T₁) x₁. [Stetter78]
                 now.defect = nodes.into_iter().zip(&indirect).map(|(few, all)| few.short_of(all)).collect();
                 flats.correct(flats_by_few);
                 (now.corrected, now.late) = (true, 0);
