@@ -270,6 +270,9 @@ impl Field {
             return coarse.receiver_gradient(self.to_coarse(coarse, p));
         }
         let (cell, u) = self.locate(p);
+        if u == DVec3::ZERO {
+            return self.node_gradient(cell);
+        }
         let dims = self.lattice.dims();
         let interior = (0..3).all(|a| cell[a] > 0 && cell[a] + 2 < dims[a]);
         if interior {
@@ -404,7 +407,8 @@ mod tests {
                 })
                 .sum::<DVec3>()
         };
-        for p in [DVec3::new(1.5, 1.25, 2.75), DVec3::new(2.999, 1.001, 1.5)] {
+        let nodes = [DVec3::new(2.0, 1.0, 3.0), DVec3::new(0.0, 2.0, 4.0), DVec3::new(4.0, 3.0, 5.0)];
+        for p in [DVec3::new(1.5, 1.25, 2.75), DVec3::new(2.999, 1.001, 1.5)].into_iter().chain(nodes) {
             assert!((f.receiver_gradient(p) - slow(p)).length() < 1e-12, "{p}");
         }
         let (a, b) = (DVec3::new(2.0 - 1e-9, 1.5, 2.5), DVec3::new(2.0 + 1e-9, 1.5, 2.5));

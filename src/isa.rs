@@ -1,5 +1,9 @@
 //! Instruction sets that vector kernels are compiled for: what this machine has, and which of it is used.
 
+mod simd;
+
+pub(crate) use simd::Work;
+
 use crate::error::{Error, Result};
 use std::sync::atomic::{AtomicU8, Ordering};
 

@@ -251,30 +251,42 @@ impl<'a> PhotonDensity<'a> {
         Light { value, slope: slope.map(|s| s * scale), variance: variance.sum(), radius }
     }
 
+    /// The two cells that a place lies between along an axis, and its part of each: 0 of one that is not there.
+    #[inline(always)]
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "cells are small")]
+    fn beside(&self, axis: usize, at: f32) -> [(usize, f32); 2] {
+        let (count, above) = (self.cells.dims[axis], at + 0.5);
+        let upper = above as usize;
+        let high = above - upper as f32;
+        let [low, high] = [if upper > 0 { 1.0 - high } else { 0.0 }, if upper < count { high } else { 0.0 }];
+        [(upper.saturating_sub(1), low), (upper, high)]
+    }
+
     /// See [`super::PhotonMap::irradiance`]: the light of the bins around that are alike, by their part of the place.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "storage is f32; cells are clamped")]
     pub(super) fn irradiance(&self, position: DVec3, isovalue: f64) -> Irradiance {
         let normal = self.field.falling_normal(position).unwrap_or_default().as_vec3();
         let place = self.cells.place(position);
-        let low = (place - 0.5).floor();
-        let high = place - 0.5 - low;
         let (mut mean, mut variance, mut radius, mut weight) = (Vec3::ZERO, 0.0, 0.0, 0.0);
-        for corner in 0..8 {
-            let step = Vec3::new((corner & 1) as f32, (corner >> 1 & 1) as f32, (corner >> 2) as f32);
-            let cell = low + step;
-            let part = (1.0 - (high - step).abs()).element_product();
-            if part <= 0.0 || (0..3).any(|a| cell[a] < 0.0 || cell[a] as usize >= self.cells.dims[a]) {
-                continue;
-            }
-            let [i, j, k] = cell.to_array().map(|x| x as usize);
-            for n in self.row(i, i, j, k) {
-                let bin = &self.bins[n];
-                if self.accepts(bin, isovalue as f32, normal) {
-                    let (light, d, w) = (&self.light[n], place - bin.centroid, part * bin.measure);
-                    mean += w * (light.value + d.x * light.slope[0] + d.y * light.slope[1] + d.z * light.slope[2]);
-                    variance += w * light.variance;
-                    radius += w * light.radius;
-                    weight += w;
+        let [across, rows, layers] = [self.beside(0, place.x), self.beside(1, place.y), self.beside(2, place.z)];
+        for (k, z) in layers {
+            for (j, y) in rows {
+                for (i, x) in across {
+                    let part = x * y * z;
+                    if part <= 0.0 {
+                        continue;
+                    }
+                    for n in self.row(i, i, j, k) {
+                        let bin = &self.bins[n];
+                        if self.accepts(bin, isovalue as f32, normal) {
+                            let (light, d, w) = (&self.light[n], place - bin.centroid, part * bin.measure);
+                            let slope = d.x * light.slope[0] + d.y * light.slope[1] + d.z * light.slope[2];
+                            mean += w * (light.value + slope);
+                            variance += w * light.variance;
+                            radius += w * light.radius;
+                            weight += w;
+                        }
+                    }
                 }
             }
         }
@@ -341,35 +353,73 @@ mod tests {
     use crate::scene::{Boundary, Surface};
     use crate::volume::{Lattice, Samples, Volume};
 
+    /// A ramp along x over `steps` steps of each axis.
+    fn ramp(steps: usize) -> Scene {
+        let lattice = Lattice::aligned([steps + 1; 3], DVec3::ZERO, DVec3::splat(0.5)).unwrap();
+        let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[0] as f64 / steps as f64).collect();
+        let volume = Volume::new("ramp", lattice, Samples::F64(samples)).unwrap();
+        let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+        Scene::new(field, Surface::default(), Boundary::Open, Vec::new()).unwrap()
+    }
+
+    /// `count` photons of equal power anywhere in a ramp, a quarter as many where it is not `bright`.
+    fn landed(seed: u64, steps: usize, count: usize, bright: impl Fn(DVec3) -> bool) -> Vec<SurfacePhoton> {
+        let (mut rng, far) = (Rng::stream(seed, Stage::Test, 0), steps as f64);
+        let mut landed = Vec::new();
+        while landed.len() < count {
+            let position = DVec3::from_array(std::array::from_fn(|_| far * rng.unit()));
+            if bright(position) || rng.unit() < 0.25 {
+                landed.push(SurfacePhoton {
+                    position: position.as_vec3(),
+                    isovalue: (position.x / far) as f32,
+                    power: Vec3::ONE,
+                    foreshortening: 1.0,
+                    field: 0,
+                    bounces: 1,
+                    side: Side::Lower,
+                });
+            }
+        }
+        landed
+    }
+
+    fn splat(photons: usize) -> EstimateSettings {
+        EstimateSettings { estimator: Estimator::Splat, photons, tau: 1.0, ..EstimateSettings::default() }
+    }
+
+    /// Behind the last cell of a row of bins comes the first of the next, where it is bright.
+    #[test]
+    fn light_at_a_border_is_its_own() {
+        // Two samples to a bin: places at the border are nearer to where a next bin would be than to the middle of the last.
+        let (scene, mut rng) = (ramp(41), Rng::stream(5, Stage::Test, 0));
+        let mut sums = [0.0; 2];
+        for seed in 1..=8 {
+            let landed = landed(seed, 41, 70_000, |p| p.x < 20.5);
+            let density = PhotonDensity::new(&scene, &landed, |_| true, splat(64));
+            assert_eq!(density.cells.factor, [2; 3]);
+            for (sum, [from, to]) in sums.iter_mut().zip([[0.0, 0.5], [40.5, 41.0]]) {
+                for _ in 0..1000 {
+                    let p = DVec3::new(from, 4.0, 4.0)
+                        + DVec3::new(to - from, 33.0, 33.0) * DVec3::from_array(std::array::from_fn(|_| rng.unit()));
+                    *sum += luminance(density.irradiance(p, p.x / 41.0).mean) / 8000.0;
+                }
+            }
+        }
+        for (sum, share) in sums.into_iter().zip([0.8, 0.2]) {
+            // Power per isovalue, of which there is half, on all of a level set.
+            let off = sum / (70_000.0 * share / 0.5 / 20.5f64.powi(2)) - 1.0;
+            assert!(off.abs() < 0.08, "{share}: {off}");
+        }
+    }
+
     /// Photons of equal power anywhere in a ramp, fewer in half of it: as noisy as that many photons are, on either side.
     #[test]
     fn estimates_are_as_noisy_as_the_photons_asked_for() {
-        let lattice = Lattice::aligned([41; 3], DVec3::ZERO, DVec3::splat(0.5)).unwrap();
-        let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[0] as f64 / 40.0).collect();
-        let volume = Volume::new("ramp", lattice, Samples::F64(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
-        let scene = Scene::new(field, Surface::default(), Boundary::Open, Vec::new()).unwrap();
+        let scene = ramp(40);
         let bright = |p: DVec3| p.y < 20.0;
         for (seed, photons, count) in [(1, 32, 60_000), (2, 32, 300_000), (3, 128, 60_000), (4, 128, 300_000)] {
-            let mut rng = Rng::stream(seed, Stage::Test, 0);
-            let mut landed = Vec::new();
-            while landed.len() < count {
-                let position = DVec3::from_array(std::array::from_fn(|_| 40.0 * rng.unit()));
-                if bright(position) || rng.unit() < 0.25 {
-                    landed.push(SurfacePhoton {
-                        position: position.as_vec3(),
-                        isovalue: position.x as f32 / 40.0,
-                        power: Vec3::ONE,
-                        foreshortening: 1.0,
-                        field: 0,
-                        bounces: 1,
-                        side: Side::Lower,
-                    });
-                }
-            }
-            let settings =
-                EstimateSettings { estimator: Estimator::Splat, photons, tau: 1.0, ..EstimateSettings::default() };
-            let density = PhotonDensity::new(&scene, &landed, |_| true, settings);
+            let (mut rng, landed) = (Rng::stream(seed, Stage::Test, 1), landed(seed, 40, count, bright));
+            let density = PhotonDensity::new(&scene, &landed, |_| true, splat(photons));
             for side in [true, false] {
                 // Power to a level set's area, of which either half has 200.
                 let expected = count as f64 * if side { 0.8 } else { 0.2 } / 200.0;

@@ -7,6 +7,7 @@ use super::cells::Cells;
 use super::shares::{Block, Point};
 use super::slots::{Along, LANES, Slot};
 use crate::field::Field;
+use crate::isa::{Isa, Work};
 use glam::{DVec3, DVec4, Mat3, Vec3};
 use rayon::prelude::*;
 
@@ -38,12 +39,12 @@ pub(super) fn octant(n: Vec3) -> u8 {
 /// [`Bin::reach`].
 #[allow(clippy::cast_possible_truncation, reason = "2³² bins take 240 GB")]
 pub(super) fn bins(field: &Field, cells: &Cells, tau: f64) -> (Vec<u32>, Vec<Bin>) {
-    let points = Points::new(field, cells, tau);
+    let (points, isa) = (Points::new(field, cells, tau), Isa::current());
     let [_, ny, nz] = cells.dims;
     let rows: Vec<(Vec<u32>, Vec<Bin>)> = (0..ny * nz)
         .into_par_iter()
         .with_max_len(16)
-        .map_init(Row::default, |row, n| points.bins_of_row([n % ny, n / ny], row))
+        .map_init(Row::default, |row, n| isa.run(RowOfBins { points: &points, place: [n % ny, n / ny], row }))
         .collect();
     let (mut starts, mut bins) = (vec![0], Vec::with_capacity(rows.iter().map(|(_, bins)| bins.len()).sum()));
     for (ends, more) in rows {
@@ -52,6 +53,22 @@ pub(super) fn bins(field: &Field, cells: &Cells, tau: f64) -> (Vec<u32>, Vec<Bin
         bins.extend(more);
     }
     (starts, bins)
+}
+
+/// A row of the cells to be done.
+struct RowOfBins<'a> {
+    points: &'a Points<'a>,
+    place: [usize; 2],
+    row: &'a mut Row,
+}
+
+impl Work for RowOfBins<'_> {
+    type Output = (Vec<u32>, Vec<Bin>);
+
+    #[inline(always)]
+    fn work(self) -> Self::Output {
+        self.points.bins_of_row(self.place, self.row)
+    }
 }
 
 /// The points of a lattice that stand for its volume.
@@ -127,6 +144,7 @@ impl<'a> Points<'a> {
 
     /// The bins of row (j, k) of the cells: the end of each cell's, and the bins.
     #[allow(clippy::cast_possible_truncation, reason = "2³² bins take 240 GB")]
+    #[inline(always)]
     fn bins_of_row(&self, [j, k]: [usize; 2], row: &mut Row) -> (Vec<u32>, Vec<Bin>) {
         let count = self.cells.dims[0];
         row.parts.resize(count, Default::default());
@@ -179,6 +197,7 @@ impl<'a> Points<'a> {
     }
 
     /// [`Row::nodes`] at y and z over a range of x.
+    #[inline(always)]
     fn read_nodes(&self, [y, z]: [&Slot; 2], range: [usize; 2], nodes: &mut [Vec<f32>; 6]) {
         let [nx, ny, nz] = self.field.lattice().dims();
         let ((j, v), (k, w)) = ((y.cell, y.inside), (z.cell, z.inside));
@@ -257,11 +276,11 @@ impl<'a> Points<'a> {
     }
 
     /// The same where all samples around are finite.
+    #[inline(always)]
     fn add_row(&self, across: [&Slot; 2], [first, end]: [usize; 2], Row { nodes, block, parts }: &mut Row) {
         self.read_nodes(across, [first, end], nodes);
         for along in &self.along {
-            let (first, end) =
-                (first + usize::from(along.up[first] == 0.0), end - usize::from(along.up[end - 1] > 0.0));
+            let (first, end) = (first + usize::from(!along.up[first]), end - usize::from(along.up[end - 1]));
             for n in (first..end).step_by(LANES) {
                 block.read(nodes, along, n, LANES.min(end - n));
                 self.add(block, across, parts);
@@ -424,6 +443,29 @@ mod tests {
                 let place = mean / measure * factor as f64 - 0.5;
                 let within = if factor < 3 { 0.13 } else { 0.26 };
                 assert!((place - begin - 2.55).abs() < within, "axis {axis}, factor {factor}, from {begin}: {place}");
+            }
+        }
+    }
+
+    #[test]
+    fn every_instruction_set_finds_the_same_bins() {
+        let dims = [37, 7, 8];
+        let mut rng = Rng::stream(6, Stage::Test, 0);
+        let noise = field(oblique(dims), |_| 1.4 * rng.unit() - 0.2);
+        for factor in [1, 2, 3] {
+            let cells = Cells::new([factor; 3], dims);
+            let points = Points::new(&noise, &cells, 0.1);
+            let rows = |isa: Isa| -> Vec<(Vec<u32>, Vec<Bin>)> {
+                let row = &mut Row::default();
+                let mut bins =
+                    |n| isa.run(RowOfBins { points: &points, place: [n % cells.dims[1], n / cells.dims[1]], row });
+                (0..cells.dims[1] * cells.dims[2]).map(&mut bins).collect()
+            };
+            let expected = rows(Isa::PLAIN);
+            assert!(expected.iter().map(|(_, bins)| bins.len()).sum::<usize>() > 60);
+            for isa in Isa::found() {
+                // Numbers are written so that no two are alike.
+                assert_eq!(format!("{:?}", rows(isa)), format!("{expected:?}"), "{}", isa.name());
             }
         }
     }

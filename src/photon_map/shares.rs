@@ -37,6 +37,12 @@ pub(super) struct Shares {
     pub normal: [Lanes; 3],
 }
 
+/// As many of a list from `first` on.
+#[inline(always)]
+fn lanes<T>(of: &[T], first: usize) -> &[T; LANES] {
+    of[first..].first_chunk().expect("lists are longer than rows of nodes")
+}
+
 impl Block {
     /// Adds a point of a cell of the grid.
     pub(super) fn push(&mut self, point: &Point, x: &Slot, cell: usize) {
@@ -56,24 +62,39 @@ impl Block {
     pub(super) fn read(&mut self, nodes: &[Vec<f32>; 6], along: &Along, first: usize, len: usize) {
         const NEXT: f32 = Slot::BESIDE as f32;
         self.len = len;
-        let up = &along.up[first..][..LANES];
+        // What lies on the other side of each point from its node, of what lies before and after that. Mostly all are alike.
+        let beyond = |before: &Lanes, after: &Lanes| match along.all_up {
+            Some(true) => *after,
+            Some(false) => *before,
+            None => {
+                let mut beyond = *before;
+                for n in (0..LANES).filter(|&n| along.up[first + n]) {
+                    beyond[n] = after[n];
+                }
+                beyond
+            }
+        };
         let [sx, sy, sz] = &mut self.slope;
         let [rx, ry, rz] = &mut self.receiver;
         for (to, of) in [&mut self.h, sy, sz, rx, ry, rz].into_iter().zip(nodes) {
-            let [before, near, after] = [0, 1, 2].map(|n| &of[first + n..][..LANES]);
+            let (near, next) = (lanes(of, first + 1), beyond(lanes(of, first), lanes(of, first + 2)));
+            let mut between = [0.0; LANES];
             for n in 0..LANES {
-                let next = if up[n] > 0.0 { after[n] } else { before[n] };
-                to[n] = (1.0 - NEXT) * near[n] + NEXT * next;
+                between[n] = (1.0 - NEXT) * near[n] + NEXT * next[n];
             }
+            *to = between;
         }
-        let [before, near, after] = [0, 1, 2].map(|n| &nodes[0][first + n..][..LANES]);
+        let h = &nodes[0];
+        let (before, near, after) = (lanes(h, first), lanes(h, first + 1), lanes(h, first + 2));
+        let (mut falls, mut rises) = ([0.0; LANES], [0.0; LANES]);
         for n in 0..LANES {
-            sx[n] = if up[n] > 0.0 { after[n] - near[n] } else { near[n] - before[n] };
+            (falls[n], rises[n]) = (near[n] - before[n], after[n] - near[n]);
         }
-        self.offset.copy_from_slice(&along.offset[first..][..LANES]);
-        self.centre.copy_from_slice(&along.centre[first..][..LANES]);
-        self.width.copy_from_slice(&along.width[first..][..LANES]);
-        self.cell.copy_from_slice(&along.cell[first..][..LANES]);
+        *sx = beyond(&falls, &rises);
+        self.offset = *lanes(&along.offset, first);
+        self.centre = *lanes(&along.centre, first);
+        self.width = *lanes(&along.width, first);
+        self.cell = *lanes(&along.cell, first);
     }
 
     /// What its points have, across from them slots y and z; `to_world`: of gradients by index.

@@ -26,8 +26,10 @@ pub(super) struct Slot {
 /// Slots along x, one to a node at most; the lists of what points stand for are [`LANES`] longer.
 pub(super) struct Along {
     pub slots: Vec<Option<Slot>>,
-    /// 1 for points above their nodes.
-    pub up: Vec<f32>,
+    /// Whether points lie above their nodes.
+    pub up: Vec<bool>,
+    /// The same of all of them, if they are alike.
+    pub all_up: Option<bool>,
     pub offset: Vec<f32>,
     pub centre: Vec<f32>,
     /// 0 where there is no point.
@@ -94,12 +96,16 @@ impl Along {
         let length = slots.len() + LANES;
         let none = || vec![0.0; length];
         let cell = (0..length).map(|n| n / cells.factor[0]).collect();
-        let mut along = Self { up: none(), offset: none(), centre: none(), width: none(), cell, slots };
+        let (up, all_up) = (vec![false; length], None);
+        let mut along = Self { up, all_up, offset: none(), centre: none(), width: none(), cell, slots };
         for slot in along.slots.iter().flatten() {
             let n = slot.node;
             (along.offset[n], along.centre[n], along.width[n]) = (slot.offset, slot.centre, slot.width);
-            along.up[n] = f32::from(u8::from(slot.up));
+            along.up[n] = slot.up;
         }
+        let mut sides = along.slots.iter().flatten().map(|slot| slot.up);
+        let first = sides.next();
+        along.all_up = first.filter(|&up| sides.all(|other| other == up));
         along
     }
 }

@@ -1,5 +1,4 @@
-//! The children of a node in sixteen lanes of AVX-512 or eight of AVX2, whichever the processor has. The only `unsafe`
-//! outside `embree`, but for the kernels of sweeps.
+//! The children of a node in sixteen lanes of AVX-512 or eight of AVX2, whichever the processor has.
 
 #![allow(unsafe_code, reason = "SIMD intrinsics, behind run-time detection")]
 
