@@ -10,7 +10,8 @@ use super::Kind;
 pub(crate) trait Work {
     type Output;
 
-    /// Does it: a function that is always inlined, as all that it calls for long should be.
+    /// Does it. What is always inlined into this, as this must be itself, is compiled for the set, what it only calls is not:
+    /// closures that the library calls (`map`, `from_fn`) are either.
     fn work(self) -> Self::Output;
 }
 

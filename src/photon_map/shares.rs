@@ -62,7 +62,7 @@ impl Block {
     pub(super) fn read(&mut self, nodes: &[Vec<f32>; 6], along: &Along, first: usize, len: usize) {
         const NEXT: f32 = Slot::BESIDE as f32;
         self.len = len;
-        // What lies on the other side of each point from its node, of what lies before and after that. Mostly all are alike.
+        // A point lies between its node and the one before or after that: this one's. Mostly all lie on the same side.
         let beyond = |before: &Lanes, after: &Lanes| match along.all_up {
             Some(true) => *after,
             Some(false) => *before,
@@ -78,6 +78,7 @@ impl Block {
         let [rx, ry, rz] = &mut self.receiver;
         for (to, of) in [&mut self.h, sy, sz, rx, ry, rz].into_iter().zip(nodes) {
             let (near, next) = (lanes(of, first + 1), beyond(lanes(of, first), lanes(of, first + 2)));
+            // An array of its own, which nothing else can be: else no vectors.
             let mut between = [0.0; LANES];
             for n in 0..LANES {
                 between[n] = (1.0 - NEXT) * near[n] + NEXT * next[n];
