@@ -270,6 +270,7 @@ impl Field {
             return coarse.receiver_gradient(self.to_coarse(coarse, p));
         }
         let (cell, u) = self.locate(p);
+        // Of a cell's nodes only this one counts: bakes ask at grid points.
         if u == DVec3::ZERO {
             return self.node_gradient(cell);
         }

@@ -263,7 +263,7 @@ impl<'a> PhotonDensity<'a> {
     }
 
     /// See [`super::PhotonMap::irradiance`]: the light of the bins around that are alike, by their part of the place.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "storage is f32; cells are clamped")]
+    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     pub(super) fn irradiance(&self, position: DVec3, isovalue: f64) -> Irradiance {
         let normal = self.field.falling_normal(position).unwrap_or_default().as_vec3();
         let place = self.cells.place(position);
@@ -277,15 +277,15 @@ impl<'a> PhotonDensity<'a> {
                         continue;
                     }
                     for n in self.row(i, i, j, k) {
-                        let bin = &self.bins[n];
-                        if self.accepts(bin, isovalue as f32, normal) {
-                            let (light, d, w) = (&self.light[n], place - bin.centroid, part * bin.measure);
-                            let slope = d.x * light.slope[0] + d.y * light.slope[1] + d.z * light.slope[2];
-                            mean += w * (light.value + slope);
-                            variance += w * light.variance;
-                            radius += w * light.radius;
-                            weight += w;
+                        let (bin, light) = (&self.bins[n], &self.light[n]);
+                        if !self.accepts(bin, isovalue as f32, normal) {
+                            continue;
                         }
+                        let (d, w) = (place - bin.centroid, part * bin.measure);
+                        mean += w * (light.value + d.x * light.slope[0] + d.y * light.slope[1] + d.z * light.slope[2]);
+                        variance += w * light.variance;
+                        radius += w * light.radius;
+                        weight += w;
                     }
                 }
             }
