@@ -9,6 +9,7 @@ use super::pack::{LANES, OUTSIDE, Pack, Plan};
 use crate::flattened::Side;
 use crate::rng::{Rng, Stage};
 use glam::DVec3;
+use std::ops::RangeInclusive;
 
 /// Lines per texel edge that report to walls. Each reports to four texels, so that one reaches every texel from every
 /// direction; half of one showed as a weave on the walls.
@@ -86,27 +87,28 @@ impl<'a> Walls<'a> {
         }
     }
 
-    fn reports(&self, p: isize, q: isize) -> bool {
-        self.stride > 0
-            && (p - self.phase[0]).rem_euclid(self.stride) == 0
-            && (q - self.phase[1]).rem_euclid(self.stride) == 0
+    /// The lines of row `q` with p in `range` that report.
+    fn reporting(&self, range: RangeInclusive<isize>, q: isize) -> impl Iterator<Item = isize> {
+        let reports = self.stride > 0 && (q - self.phase[1]).rem_euclid(self.stride) == 0;
+        let (first, last) = range.into_inner();
+        let stride = self.stride.max(1);
+        let start = first + (self.phase[0] - first).rem_euclid(stride);
+        (start..=if reports { last } else { start - 1 }).step_by(stride.unsigned_abs())
     }
 
     /// Reports of lines (first + lane, q), whose samples are in `pack`.
     pub(super) fn through(&self, pack: &Pack, b: &[Half4], first: isize, q: isize, out: &mut Arrivals) {
-        for lane in 0..LANES {
-            let p = first + lane as isize;
-            if self.reports(p, q) {
-                let span = self.plan.span(p as f64, q as f64);
-                // Lines through a corner of Ω that no slice cuts have no samples.
-                if span[0].ceil() <= span[1].floor() {
-                    self.line(Some((pack, b, lane, span)), p, q, out);
-                    if self.capped && self.plan.sign > 0.0 {
-                        self.caps(pack, lane, span, (p, q), out);
-                    }
-                } else if self.margin {
-                    self.line(None, p, q, out);
+        for p in self.reporting(first..=first + LANES as isize - 1, q) {
+            let lane = (p - first).unsigned_abs();
+            let span = self.plan.span(p as f64, q as f64);
+            // Lines through a corner of Ω that no slice cuts have no samples.
+            if span[0].ceil() <= span[1].floor() {
+                self.line(Some((pack, b, lane, span)), p, q, out);
+                if self.capped && self.plan.sign > 0.0 {
+                    self.caps(pack, lane, span, (p, q), out);
                 }
+            } else if self.margin {
+                self.line(None, p, q, out);
             }
         }
     }
@@ -117,10 +119,8 @@ impl<'a> Walls<'a> {
             return;
         }
         let packs = self.plan.first[0]..self.plan.first[0] + self.plan.width as isize;
-        for p in self.columns.0..=self.columns.1 {
-            if self.reports(p, q) && !(within && packs.contains(&p)) {
-                self.line(None, p, q, out);
-            }
+        for p in self.reporting(self.columns.0..=self.columns.1, q).filter(|p| !(within && packs.contains(p))) {
+            self.line(None, p, q, out);
         }
     }
 

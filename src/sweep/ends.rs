@@ -173,9 +173,21 @@ impl Ends {
                 which[l] = if ok { number as u32 } else { which[l] };
             }
         }
-        for l in 0..LANES {
-            let stop = self.met.get(which[l] as usize).map(|m| m.stop(first + l as f64, q, best[l], forward));
-            places[l] = flats.place(stop, random[l]);
+        *places = [0; LANES];
+        for (number, m) in self.met.iter().enumerate() {
+            if m.front_plus != forward || !m.reflects || !which.contains(&(number as u32)) {
+                continue;
+            }
+            let mut uv = [[0f32; LANES]; 2];
+            for a in 0..2 {
+                for l in 0..LANES {
+                    uv[a][l] = at(&m.uv[a], first + l as f64, q).clamp(0.0, 1.0) as f32;
+                }
+            }
+            let there = flats.places(m.number, &uv, random);
+            for l in 0..LANES {
+                places[l] = if which[l] == number as u32 { there[l] } else { places[l] };
+            }
         }
     }
 
@@ -245,4 +257,67 @@ pub(super) fn inside(scene: &Scene) -> Vec<bool> {
             points.len() >= 3
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::{Field, Sweep};
+    use crate::rng::{Rng, Stage};
+    use crate::scene::{Boundary, Surface, cornell_box};
+    use crate::sweep::pack::Plan;
+    use crate::volume::generate::Generator;
+
+    /// Sixteen lines at a time against one, from outside Ω and from inside; and what they read of four texels against
+    /// their mean.
+    #[test]
+    fn lines_together_end_where_each_does() {
+        let volume = Generator::from_name("bumps").and_then(|g| g.sample([12; 3])).unwrap();
+        let field = Field::new(&volume, Sweep::new(3.6, 95.0).unwrap()).unwrap();
+        let mut walls = cornell_box(field.lattice(), 0.1).unwrap();
+        // Some whose backs stop lines, too.
+        walls.iter_mut().step_by(2).for_each(|w| w.opaque_back = true);
+        let scene = crate::scene::Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap();
+        let mut flats = Flats::new(&scene, 8, 5);
+        let mut rng = Rng::stream(5, Stage::Test, 0);
+        for t in flats.textures.iter_mut().flatten() {
+            t.radiance.iter_mut().for_each(|b| *b = rng.unit() as f32);
+        }
+        flats.pack(1.0);
+        let standing = vec![Standing { place: Place::Outside, covers: None }; scene.polygons().len()];
+        let (mut black, mut lit, mut worst) = (0, 0, 0f64);
+        for _ in 0..40 {
+            let omega = crate::warp::sphere(rng.unit2());
+            let plan = Plan::new(Shear::new(scene.lattice(), omega, rng.unit2()), 1.0);
+            let ends = Ends::new(&scene, &flats, &plan.shear, &standing);
+            let (first, q) = ((rng.unit() * 12.0).floor() - 8.0, (rng.unit() * 12.0).floor());
+            let random: [f32; LANES] = std::array::from_fn(|_| rng.unit() as f32);
+            for forward in [true, false] {
+                let from: [f64; LANES] = std::array::from_fn(|_| 14.0 * rng.unit() - 1.0);
+                let mut places = [7; LANES];
+                ends.stops(&flats, (first, q), &from, forward, &random, &mut places);
+                for l in 0..LANES {
+                    let stop = ends.stop(first + l as f64, q, from[l], forward, None);
+                    assert_eq!(places[l], flats.place(stop, random[l]), "{omega} {first} + {l}, {q}: {stop:?}");
+                    let Some(stop) = stop.filter(|s| s.flat.is_some()) else {
+                        assert_eq!(places[l], 0);
+                        black += 1;
+                        continue;
+                    };
+                    lit += 1;
+                    let mut column = [0f32; 15];
+                    flats.textures[stop.flat.unwrap() as usize].as_ref().unwrap().column(stop.uv, &mut column);
+                    let draws = 2000;
+                    let red = (0..draws).map(|i| {
+                        let place = flats.place(Some(stop), (i as f32 + 0.5) / draws as f32);
+                        f64::from(crate::sweep::half::decode(flats.packed[place as usize + 2][0]))
+                    });
+                    worst = worst.max((red.sum::<f64>() / f64::from(draws) - f64::from(column[2])).abs());
+                }
+            }
+        }
+        println!("{lit} lines end on walls, {black} on nothing; the mean of texels is off by at most {worst:.1e}");
+        // Steps of 1 / draws, and halves.
+        assert!(black > 20 && lit > 200 && worst < 2e-3);
+    }
 }

@@ -57,6 +57,7 @@ impl Texture {
 }
 
 /// The four texels around (u, v) and their weights, clamped at the borders.
+#[inline(always)]
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the texture")]
 fn around(dims: [usize; 3], uv: [f32; 2]) -> [(usize, f32); 4] {
     let mut base = [0usize; 2];
@@ -199,23 +200,30 @@ impl Flats {
         }
     }
 
-    /// Where in [`Flats::packed`] the B of a stop over isovalues starts: that of one of the four texels around it, each as
-    /// likely (over `random` ∈ [0, 1)) as bilinear interpolation weighs it.
+    /// Where in [`Flats::packed`] the B of a stop over isovalues starts, as [`Flats::places`] has it; black of nothing.
+    pub(super) fn place(&self, stop: Option<Stop>, random: f32) -> u32 {
+        let flat = stop.and_then(|s| Some((s.flat?, s.uv)));
+        flat.map_or(0, |(flat, uv)| self.places(flat, &uv.map(|x| [x]), &[random])[0])
+    }
+
+    /// Where in [`Flats::packed`] the B over isovalues starts at points of a flat: that of one of the four texels around
+    /// each, as likely (over `random` ∈ [0, 1)) as bilinear interpolation weighs it.
     #[inline(always)]
     #[allow(clippy::cast_possible_truncation, reason = "textures hold fewer than 2³² numbers")]
-    pub(super) fn place(&self, stop: Option<Stop>, random: f32) -> u32 {
-        let texture = stop.and_then(|s| Some((self.textures[s.flat? as usize].as_ref()?, s.uv)));
-        let Some((texture, uv)) = texture else { return 0 };
-        let mut left = random;
-        let mut texel = 0;
-        for (t, w) in around(texture.dims, uv) {
-            texel = t;
-            left -= w;
-            if left < 0.0 {
-                break;
-            }
+    pub(super) fn places<const N: usize>(&self, flat: u32, uv: &[[f32; N]; 2], random: &[f32; N]) -> [u32; N] {
+        let mut places = [0; N];
+        let Some(texture) = &self.textures[flat as usize] else { return places };
+        for l in 0..N {
+            let [a, b, c, d] = around(texture.dims, [uv[0][l], uv[1][l]]);
+            let left = [random[l] - a.1, random[l] - a.1 - b.1, random[l] - a.1 - b.1 - c.1];
+            // From the last to the first and not the other way round: choices, where branches would be foretold badly.
+            let mut texel = d.0;
+            texel = if left[2] < 0.0 { c.0 } else { texel };
+            texel = if left[1] < 0.0 { b.0 } else { texel };
+            texel = if left[0] < 0.0 { a.0 } else { texel };
+            places[l] = (texture.start + texel * self.isovalues) as u32;
         }
-        (texture.start + texel * self.isovalues) as u32
+        places
     }
 
     /// Makes sums of direct light over so many replicates their mean.

@@ -16,7 +16,7 @@ use crate::isa::Isa;
 use crate::scene::Scene;
 use glam::DVec3;
 use rayon::prelude::*;
-use std::sync::Mutex;
+use std::sync::{Mutex, MutexGuard};
 
 /// What every pass of one bake shares.
 pub(super) struct Pass<'a> {
@@ -226,11 +226,11 @@ impl Pass<'_> {
             let mut arrivals = arrivals[n].lock().expect("no thread panics");
             self.row_of_lines(family, q, &mut work, n % 2, Some(&mut arrivals));
             let light = [&work.light[n % 2], &work.light[1 - n % 2]];
+            let mut coming = nodes.first().map(|&at| self.ask(family, rows, at));
             for (i, &at) in nodes.iter().enumerate() {
-                if let Some(&next) = nodes.get(i + 1) {
-                    self.prefetch(family, rows, next);
-                }
-                self.accumulate(family, light, rows, at);
+                let next = nodes.get(i + 1).map(|&at| self.ask(family, rows, at));
+                let row = std::mem::replace(&mut coming, next);
+                self.accumulate(family, light, &mut row.expect("asked for before"), at);
             }
             work.nodes = nodes;
             walked = Some(n);
@@ -270,17 +270,22 @@ impl Pass<'_> {
         }
     }
 
-    /// Brings what [`Self::accumulate`] reads and adds to into the cache.
-    fn prefetch(&self, family: &Family, rows: &Rows, [k, j]: [usize; 2]) {
+    /// A row of nodes, which memory is asked for with what else [`Self::accumulate`] reads.
+    fn ask<'r, 'e>(&self, family: &Family, rows: &'r Rows<'e>, [k, j]: [usize; 2]) -> MutexGuard<'r, Row<'e>> {
         let layout = &family.plan.shear.layout;
         let at = k * layout.stride[1] + j * layout.stride[0];
-        rows[at / layout.dims[0]].lock().expect("no thread panics").iter().for_each(|e| prefetch(e));
-        prefetch(&family.normals[at..][..layout.dims[0]]);
+        let nu = layout.dims[0];
+        let row = rows[at / nu].lock().expect("no thread panics");
+        if let Some((a, b)) = self.geometry.lit_blocks(layout).span(at / nu, nu) {
+            row.iter().for_each(|e| prefetch(&e[a..b]));
+            prefetch(&family.normals[at + a..at + b]);
+        }
+        row
     }
 
     /// Adds what a row of lines and the one before it brought to a row of nodes: each node takes its four nearest lines by
     /// bilinear weights, which go on linearly on Ω's faces ([`inwards`]), times the cosine of its own normal.
-    fn accumulate(&self, family: &Family, light: [&RowLight; 2], rows: &Rows, [k, j]: [usize; 2]) {
+    fn accumulate(&self, family: &Family, light: [&RowLight; 2], row: &mut Row, [k, j]: [usize; 2]) {
         let plan = family.plan;
         let layout = &plan.shear.layout;
         let [nu, nv, _] = layout.dims;
@@ -294,8 +299,7 @@ impl Pass<'_> {
         let at = k * layout.stride[1] + j * layout.stride[0];
         let n = &family.normals[at..][..nu];
         let lit = self.geometry.lit_blocks(layout);
-        let mut row = rows[at / nu].lock().expect("no thread panics");
-        let [e0, e1, e2] = &mut *row;
+        let [e0, e1, e2] = row;
         let mut bits = lit.rows[at / nu];
         while bits != 0 {
             // Runs of lit blocks.

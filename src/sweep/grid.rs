@@ -32,11 +32,17 @@ pub(super) struct Geometry<'a> {
 pub(super) struct Blocks {
     /// Nodes in a block.
     pub size: usize,
+    /// ⌈2³² / size⌉: products instead of divisions, the same for fewer than 2³² / size nodes.
+    reciprocal: usize,
     /// A bit per block of a row.
     pub rows: Vec<u64>,
 }
 
 impl Blocks {
+    fn new(size: usize, rows: Vec<u64>) -> Self {
+        Self { size, reciprocal: (1usize << 32).div_ceil(size), rows }
+    }
+
     /// The blocks of nodes that `is` holds, in rows of `nu`; those of neighbours along the row, up to `reach`, count too.
     fn along(nu: usize, rows: usize, (size, reach): (usize, usize), is: impl Fn(usize) -> bool + Sync) -> Self {
         let holds = |row: usize, block: usize| {
@@ -45,7 +51,7 @@ impl Blocks {
             (a..b).fold(false, |any, i| any | is(row * nu + i))
         };
         let bits = |row| (0..nu.div_ceil(size)).fold(0, |bits, block| bits | u64::from(holds(row, block)) << block);
-        Self { size, rows: (0..rows).into_par_iter().with_min_len(64).map(bits).collect() }
+        Self::new(size, (0..rows).into_par_iter().with_min_len(64).map(bits).collect())
     }
 
     /// The same in y, z, x order of nodes in x, y, z order.
@@ -63,7 +69,7 @@ impl Blocks {
             rows
         };
         let slices: Vec<Vec<u64>> = (0..nz).into_par_iter().with_max_len(4).map(slice).collect();
-        Self { size, rows: (0..nx).flat_map(|x| slices.iter().map(move |slice| slice[x])).collect() }
+        Self::new(size, (0..nx).flat_map(|x| slices.iter().map(move |slice| slice[x])).collect())
     }
 
     /// Joins every row with its neighbours along both other axes, the faster of which has `inner` rows.
@@ -81,22 +87,32 @@ impl Blocks {
                 bits
             })
             .collect();
-        Self { size: self.size, rows }
+        Self { rows, ..self }
     }
 
     /// The least range of nodes that holds the blocks of a row and the one `step` rows on; `None` if there are none.
     #[inline]
     pub(super) fn extent(&self, row: usize, step: usize, nu: usize) -> Option<(usize, usize)> {
-        let bits = self.rows[row] | self.rows[row + step];
-        let (a, b) = (bits.trailing_zeros() as usize, 64 - bits.leading_zeros() as usize);
+        let (a, b) = self.nodes(self.rows[row] | self.rows[row + step], nu)?;
         // A line beyond a block's last node still meets its cell.
-        (bits != 0).then(|| ((a * self.size).saturating_sub(1), (b * self.size + 1).min(nu)))
+        Some((a.saturating_sub(1), (b + 1).min(nu)))
+    }
+
+    /// The least range of nodes that holds the blocks of a row; `None` if there are none.
+    #[inline]
+    pub(super) fn span(&self, row: usize, nu: usize) -> Option<(usize, usize)> {
+        self.nodes(self.rows[row], nu)
+    }
+
+    fn nodes(&self, bits: u64, nu: usize) -> Option<(usize, usize)> {
+        let (a, b) = (bits.trailing_zeros() as usize, 64 - bits.leading_zeros() as usize);
+        (bits != 0).then(|| (a * self.size, (b * self.size).min(nu)))
     }
 
     /// Whether a block of `bits` meets nodes from..to.
     #[inline(always)]
     fn meets(&self, bits: u64, from: usize, to: usize) -> bool {
-        let (a, b) = (from / self.size, (to - 1) / self.size);
+        let (a, b) = ((from * self.reciprocal) >> 32, ((to - 1) * self.reciprocal) >> 32);
         bits & (u64::MAX << a) & (u64::MAX >> (63 - b)) != 0
     }
 }
@@ -375,6 +391,24 @@ mod tests {
             assert_eq!((along.rows.len(), across.rows.len()), (ny * nz, nx * nz));
             check(&along, nx, &|row, x| lattice.offset(x, row % ny, row / ny));
             check(&across, ny, &|row, y| lattice.offset(row / nz, y, row % nz));
+        }
+    }
+
+    #[test]
+    fn blocks_meet_what_shares_a_node_with_them() {
+        for size in (1..80).chain([255, 256, 1000, 8191]) {
+            let nodes = 64 * size;
+            let blocks = Blocks::new(size, Vec::new());
+            for block in [0, 1, 30, 62, 63] {
+                let (a, b) = (block * size, (block + 1) * size);
+                for from in [a.saturating_sub(2), a.saturating_sub(1), a, b - 1, b, b + 1] {
+                    for to in [from + 1, from + 2, from + 17, from + size, from + 2 * size] {
+                        if to <= nodes {
+                            assert_eq!(blocks.meets(1 << block, from, to), from < b && to > a, "{size}: {from}..{to}");
+                        }
+                    }
+                }
+            }
         }
     }
 

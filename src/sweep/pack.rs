@@ -81,19 +81,27 @@ impl Plan {
 
     /// τ at which line (p, q) enters and leaves Ω; empty if it misses.
     pub(super) fn span(&self, p: f64, q: f64) -> [f64; 2] {
+        self.spans::<1>(p, q).map(|[tau]| tau)
+    }
+
+    /// [`Plan::span`] of lines (p + 0 … N − 1, q).
+    #[inline(always)]
+    fn spans<const N: usize>(&self, p: f64, q: f64) -> [[f64; N]; 2] {
         let [nu, nv, na] = self.shear.layout.dims;
-        let (mut from, mut to) = (0.0, na as f64 - 1.0);
-        for (a, (number, n)) in [(p, nu), (q, nv)].into_iter().enumerate() {
-            let (x, s, far) = (number + self.shear.offset[a], self.shear.slope[a], n as f64 - 1.0);
-            if s == 0.0 {
-                if !(x >= 0.0 && x <= far) {
-                    return [1.0, 0.0];
+        let (mut from, mut to) = ([0f64; N], [na as f64 - 1.0; N]);
+        for (a, (number, step, n)) in [(p, 1.0, nu), (q, 0.0, nv)].into_iter().enumerate() {
+            let (offset, s, far) = (self.shear.offset[a], self.shear.slope[a], n as f64 - 1.0);
+            for l in 0..N {
+                let x = number + l as f64 * step + offset;
+                // Parallel to this pair of sides.
+                if s == 0.0 {
+                    (from[l], to[l]) = if x >= 0.0 && x <= far { (from[l], to[l]) } else { (1.0, 0.0) };
+                    continue;
                 }
-                continue;
+                let (t0, t1) = (-x / s, (far - x) / s);
+                from[l] = from[l].max(t0.min(t1));
+                to[l] = to[l].min(t0.max(t1));
             }
-            let (t0, t1) = (-x / s, (far - x) / s);
-            from = f64::max(from, t0.min(t1));
-            to = f64::min(to, t0.max(t1));
         }
         [from, to]
     }
@@ -176,6 +184,8 @@ pub(super) struct Pack {
     is_awake: Vec<bool>,
     /// The slices where nodes beside the row of lines reach the sweep, and their blocks.
     stripe: Vec<(usize, u64)>,
+    /// [`Plan::span`] of the lines.
+    span: [[f64; LANES]; 2],
     pub cuts: Vec<Cut>,
     /// Where in [`Flats::packed`] the ends of lines are, per direction (+, −).
     pub lasts: [[u32; LANES]; 2],
@@ -203,6 +213,7 @@ impl Pack {
             awake: Vec::new(),
             is_awake: vec![false; rows],
             stripe: Vec::new(),
+            span: [[0.0; LANES]; 2],
             cuts: Vec::new(),
             lasts: [[0; LANES]; 2],
             scratch: Vec::new(),
@@ -274,6 +285,7 @@ impl Pack {
             self.is_awake[k + 1] = true;
             inside &= hi - lo == LANES && self.beside(plan, k, (first, q)) == [(0, LANES); 2];
         }
+        self.span = plan.spans(first as f64, q as f64);
         // Lines that enter through a side between two slices get that point in the row before, those that leave in the
         // row behind.
         if !inside {
@@ -295,6 +307,7 @@ impl Pack {
     }
 
     /// Adds the points where lines meet Ω's sides beside slices that were read.
+    #[inline(always)]
     fn sides(&mut self, plan: &Plan, source: &Source, (first, q): (isize, isize)) {
         for n in 0..self.stripe.len() {
             let k = self.stripe[n].0;
@@ -365,12 +378,9 @@ impl Pack {
         let [u, v, last] = node;
         let last = last as i32;
         let [w0, w1, w2, _] = *weight;
-        let at = match () {
-            () if random < w0 => first,
-            () if random < w0 + w1 => first + u as isize,
-            () if random < w0 + w1 + w2 => first + v as isize,
-            () => first + (u + v) as isize,
-        } as i32;
+        // Which it is nobody can foretell: counted, not searched for.
+        let number = [w0, w0 + w1, w0 + w1 + w2].iter().map(|w| usize::from(random >= *w)).sum::<usize>();
+        let at = (first + (number % 2 * u + number / 2 * v) as isize) as i32;
         let u = u as i32;
         for l in 0..LANES {
             // Lanes outside Ω name any node.
@@ -379,13 +389,13 @@ impl Pack {
     }
 
     /// Adds the point where a line whose first or last slice is `k` meets Ω's side.
+    #[inline(always)]
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
     fn side(&mut self, plan: &Plan, source: &Source, pq: (isize, isize), lane: usize, k: usize, leaves: bool) {
         let [nu, nv, na] = plan.shear.layout.dims;
         let [sv, sa] = plan.shear.layout.stride;
-        let span = plan.span(pq.0 as f64, pq.1 as f64);
         let near = k as f64 + if leaves { 1.0 } else { -1.0 };
-        let tau = (if leaves { span[1] } else { span[0] }).clamp(near.min(k as f64), near.max(k as f64));
+        let tau = self.span[usize::from(leaves)][lane].clamp(near.min(k as f64), near.max(k as f64));
         let [x, y] = [(pq.0, nu, 0), (pq.1, nv, 1)].map(|(number, n, a)| {
             (number as f64 + plan.shear.offset[a] + plan.shear.slope[a] * tau).clamp(0.0, n as f64 - 1.0)
         });
@@ -417,10 +427,9 @@ impl Pack {
         let mut random = [[0.0; LANES]; 2];
         let seed = plan.noise(first, q);
         for lane in 0..LANES {
-            let span = plan.span(p + lane as f64, q);
-            let hit = span[0] <= span[1];
+            let hit = self.span[0][lane] <= self.span[1][lane];
             for d in 0..2 {
-                from[d][lane] = if hit { span[1 - d] } else { 0.0 };
+                from[d][lane] = if hit { self.span[1 - d][lane] } else { 0.0 };
                 random[d][lane] = dither(seed, lane + d * LANES);
             }
         }
@@ -569,4 +578,50 @@ fn isovalue(n: usize, c: f32) -> (usize, f32) {
     let x = (c * n as f32 - 0.5).max(0.0).min((n - 1) as f32);
     let i = (x as usize).min(n - 2);
     (i, x - i as f32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::volume::Lattice;
+    use glam::DVec3;
+
+    /// Oblique lines, and such as are parallel to one or two pairs of sides, some of them outside.
+    #[test]
+    fn spans_are_where_lines_lie_in_omega() {
+        let dims = [6, 9, 7];
+        let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::ONE).unwrap();
+        let far = dims.map(|n| n as f64 - 1.0);
+        let (mut within, mut missed) = (0, 0);
+        for (i, omega) in [[0.4, -0.7, 1.0], [-0.9, 0.2, -1.0], [0.0, 0.6, 1.0], [0.3, 0.0, 1.0], [0.0, 0.0, 1.0]]
+            .into_iter()
+            .enumerate()
+        {
+            let shear = Shear::new(&lattice, DVec3::from_array(omega), [0.3, 0.11 * i as f64]);
+            let plan = Plan::new(shear, 1.0);
+            for q in -9..16 {
+                let spans = plan.spans::<LANES>(-5.0, f64::from(q));
+                for lane in 0..LANES {
+                    let (p, q) = (lane as f64 - 5.0, f64::from(q));
+                    let span = spans.map(|s| s[lane]);
+                    if span[0] <= span[1] {
+                        assert_eq!(plan.span(p, q), span);
+                    }
+                    for step in -20..160 {
+                        let tau = 0.05 * f64::from(step) + 1e-3;
+                        let x = [
+                            p + shear.offset[0] + shear.slope[0] * tau,
+                            q + shear.offset[1] + shear.slope[1] * tau,
+                            tau,
+                        ];
+                        let inside = x.iter().zip(far).all(|(x, far)| *x >= 0.0 && *x <= far);
+                        let count = if inside { &mut within } else { &mut missed };
+                        *count += 1;
+                        assert_eq!((span[0]..=span[1]).contains(&tau), inside, "{omega:?} {p} {q} {tau}: {span:?}");
+                    }
+                }
+            }
+        }
+        assert!(within > 1000 && missed > 1000);
+    }
 }
