@@ -5,6 +5,7 @@ use glam::{DMat3, DVec3};
 use isolume::embree::{Device, GraphTracer};
 use isolume::field::{Field, Sweep};
 use isolume::flattened::{Departure, Side, Target};
+use isolume::luminaire::unoccluded;
 use isolume::polygon::Polygon;
 use isolume::rng::{Rng, Sobol, Stage};
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
@@ -369,4 +370,40 @@ fn luminaires_add_up() {
     let scale = mean_rms(&all.iter().map(|&o| sum(o)).collect::<Vec<_>>()).1;
     println!("two luminaires: mean {:.5}, RMS {:.5} of {scale:.4}", mean / scale, rms / scale);
     assert!(mean.abs() < 0.005 * scale && rms < 0.03 * scale);
+}
+
+/// The floor of a solid x ≥ c: texels that it covers in part hold the light of the rest. (The lamp is in Ω's face; beyond that,
+/// light would reach the solid's inside, too.)
+#[test]
+fn texels_that_solids_cover_in_part_are_as_bright_as_the_rest() {
+    let polygon = |name: &str, v: [[f64; 3]; 4], albedo: f64, emission: f64| {
+        let v = v.map(DVec3::from_array).to_vec();
+        Polygon::new(name, v, DVec3::splat(albedo), DVec3::splat(emission)).unwrap()
+    };
+    let floor = [[0., 0., 0.], [1., 0., 0.], [1., 1., 0.], [0., 1., 0.]];
+    let lamp = [[0.02, 0.45, 1.0], [0.02, 0.55, 1.0], [0.08, 0.55, 1.0], [0.08, 0.45, 1.0]];
+    let polygons = vec![polygon("floor", floor, 0.5, 0.0), polygon("lamp", lamp, 0.0, 1.0)];
+    let f = field(cube(41, 0.0, 1.0), (0.0, 1.0), |x| x.x);
+    let scene = Scene::new(f, Surface::default(), Boundary::Open, polygons).unwrap();
+    let settings = SweepSettings { light_points: 256, max_bounces: 0, flat_resolution: (8, 64), ..ONE_BOUNCE };
+    let got = run(&scene, settings);
+    let lamp = scene.luminaires()[0] as usize;
+    let texture = got.flats[1 - lamp].as_ref().unwrap();
+    let [nu, nv, nc] = texture.dims;
+    let (mut straddled, mut worst) = (0, 0f64);
+    for (t, j, i) in (0..nc).flat_map(|t| (0..nv).flat_map(move |j| (0..nu).map(move |i| (t, j, i)))) {
+        let [x, y] = [(i, nu), (j, nv)].map(|(n, count)| (n as f64 + 0.5) / count as f64);
+        let at = DVec3::new(x, y, 0.0);
+        let open = ((t as f64 + 0.5) / nc as f64 - i as f64 / nu as f64) * nu as f64;
+        // The lamp's own place is beside the first texels.
+        if i == 0 || open < 0.1 {
+            continue;
+        }
+        straddled += usize::from(open < 0.9);
+        let expected = 0.5 / PI * unoccluded(&scene.polygons()[lamp], at, DVec3::Z);
+        let off = f64::from(texture.texels[(t * nv + j) * nu + i][1]) / expected - 1.0;
+        worst = worst.max(off.abs());
+    }
+    println!("{straddled} texels in part, off by {worst:.1e} at most");
+    assert!(straddled > 300 && worst < 1e-3, "{straddled}: {worst}");
 }
