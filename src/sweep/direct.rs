@@ -116,7 +116,7 @@ pub(super) fn direct(
         }
     }
     for (&number, open) in scene.luminaires().iter().zip(&shares) {
-        walls((scene, isa), flats, sides, number, (part, open));
+        walls((scene, geometry, isa), flats, sides, number, (part, open));
     }
     (planes, true)
 }
@@ -165,7 +165,7 @@ impl Staircases {
 /// luminaire point; it is lit at the isovalues above the greatest h there (and, inside solids, up to the least).
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the isovalues")]
 fn walls(
-    (scene, isa): (&Scene, Isa),
+    (scene, geometry, isa): (&Scene, &Geometry, Isa),
     flats: &mut Flats,
     sides: &[Side],
     number: u32,
@@ -181,6 +181,10 @@ fn walls(
     let [lower, higher] = [Side::Lower, Side::Higher].map(|s| sides.contains(&s));
     let higher = higher && !capped(scene);
     let far = lattice.far();
+    // Whatever is below the sweep hides as little from the lower side.
+    let h = |p: DVec3| {
+        if higher || geometry.reaches(p) { scene.field.value(p) as f32 } else { f32::NEG_INFINITY }
+    };
     for (id, texture) in flats.textures.iter_mut().enumerate() {
         let Some(texture) = texture else { continue };
         let flat = flat::flat(scene, id).expect("textured flats exist");
@@ -213,8 +217,7 @@ fn walls(
                     }
                     let (lx, ly) = (lattice.to_index(x), lattice.to_index(y));
                     let within = (0..3).all(|a| lx[a] >= -1e-6 && lx[a] <= far[a] + 1e-6);
-                    let here =
-                        if within && id < caps && !capped(scene) { below(scene.field.value(lx) as f32) } else { 0 };
+                    let here = if within && id < caps && !capped(scene) { below(h(lx)) } else { 0 };
                     all.add(g, here, here);
                     if blockers.block(number, receiver, ly, lx) {
                         continue;
@@ -223,7 +226,7 @@ fn walls(
                         lit.add(g, 0, 0);
                         continue;
                     }
-                    segments.set(lane, &scene.field, ly, lx);
+                    segments.set(lane, lattice, h, ly, lx);
                     seen[lane] = (g, here);
                 }
                 isa.extrema(scene.field.samples(), &mut segments);

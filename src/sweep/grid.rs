@@ -215,6 +215,15 @@ impl<'a> Geometry<'a> {
         &self.awake[side.index()][usize::from(layout.transposed)]
     }
 
+    /// Whether h may reach the sweep from below in the cell of a place in Ω.
+    #[inline]
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
+    pub(super) fn reaches(&self, place: DVec3) -> bool {
+        let [i, j, k] = [0, 1, 2].map(|a| (place[a] as usize).min(self.dims[a] - 1));
+        let blocks = &self.awake[Side::Lower.index()][0];
+        blocks.meets(blocks.rows[k * self.dims[1] + j], i, i + 1)
+    }
+
     /// Light of the lit nodes from y, z, x order back to x, y, z; the others are black.
     pub(super) fn untransposed(&self, planes: Planes, spare: &Spare) -> Planes {
         planes.map(|from| {
@@ -365,6 +374,7 @@ fn rings(dims: [usize; 3], lit: &[bool]) -> Vec<Vec<u32>> {
 mod tests {
     use super::*;
     use crate::field::Sweep;
+    use crate::rng::{Rng, Stage};
     use crate::volume::{Lattice, Samples, Volume};
 
     /// Blocks of every size, of nodes in either order, against all nodes one by one.
@@ -410,6 +420,39 @@ mod tests {
                 }
             }
         }
+    }
+
+    /// Every cell with a node that is not below the sweep, and of the others few: those of the same blocks and beside.
+    #[test]
+    fn what_reaches_the_sweep_is_found_in_its_cell() {
+        let dims = [140, 9, 11];
+        let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::ONE).unwrap();
+        let mut rng = Rng::stream(7, Stage::Test, 0);
+        let h = |_| if rng.unit() < 2e-3 { 2.0 * rng.unit() } else { -rng.unit() };
+        let mut samples: Vec<f64> = (0..lattice.len()).map(h).collect();
+        samples[77] = f64::NAN;
+        let volume = Volume::new("sparse", lattice.clone(), Samples::F64(samples)).unwrap();
+        let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+        let geometry = Geometry::new(&field);
+        let mut counts = [0; 3];
+        for _ in 0..20_000 {
+            let place = DVec3::new(rng.unit(), rng.unit(), rng.unit()) * lattice.far();
+            let cell = place.floor().as_ivec3();
+            // Whether a node from `before` to `behind` nodes beside that of the cell does.
+            let any = |before: i32, behind: i32| {
+                let axis = |a: usize| (cell[a] + before).max(0)..=(cell[a] + behind).min(dims[a] as i32 - 1);
+                axis(2).flat_map(|k| axis(1).flat_map(move |j| axis(0).map(move |i| [i, j, k]))).any(|ijk| {
+                    let [i, j, k] = ijk.map(|x| x as usize);
+                    !(geometry.h[lattice.offset(i, j, k)] < 0.0)
+                })
+            };
+            let reaches = geometry.reaches(place);
+            assert!(reaches || !any(0, 1), "{place}");
+            // Blocks hold three nodes of 140.
+            assert!(!reaches || any(-3, 3), "{place}");
+            counts[usize::from(reaches) + usize::from(any(0, 1))] += 1;
+        }
+        assert!(counts.iter().all(|n| *n > 300), "{counts:?}");
     }
 
     /// Lit nodes in a corner, across blocks of rows, and in a row of their own.

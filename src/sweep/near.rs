@@ -103,7 +103,9 @@ impl Looks<'_> {
             Side::Lower => [f32::NEG_INFINITY, look.h],
             Side::Higher => [look.h, f32::INFINITY],
         };
-        self.segments.set_before(self.taken, field, y, x, enough);
+        #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+        let h = |p: DVec3| field.value(p) as f32;
+        self.segments.set_before(self.taken, field.lattice(), h, [y, x], enough);
         self.looks[self.taken] = look;
         self.taken += 1;
         if self.taken == LANES {

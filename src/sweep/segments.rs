@@ -1,7 +1,7 @@
 //! Extrema of h along many segments at once: what stands between receivers and points of a luminaire.
 
 use super::pack::LANES;
-use crate::field::Field;
+use crate::volume::Lattice;
 use glam::DVec3;
 
 /// Up to sixteen segments; lanes that are not used find nothing.
@@ -42,14 +42,23 @@ impl Segments {
     };
 
     /// Takes the segment from local `a` to `b` into `lane`, clipped to Ω, with h at its ends; (∞, −∞) if it misses Ω.
-    pub(super) fn set(&mut self, lane: usize, field: &Field, a: DVec3, b: DVec3) {
-        self.place::<false>(lane, field, a, b);
+    #[inline]
+    pub(super) fn set(&mut self, lane: usize, lattice: &Lattice, h: impl Fn(DVec3) -> f32, a: DVec3, b: DVec3) {
+        self.place::<false>(lane, lattice, h, a, b);
     }
 
     /// As [`Segments::set`] to a node, without h at that node itself, from the node on until less than `enough`\[0\] or as much as
     /// `enough`\[1\] is found.
-    pub(super) fn set_before(&mut self, lane: usize, field: &Field, a: DVec3, node: DVec3, enough: [f32; 2]) {
-        self.place::<true>(lane, field, a, node);
+    #[inline]
+    pub(super) fn set_before(
+        &mut self,
+        lane: usize,
+        lattice: &Lattice,
+        h: impl Fn(DVec3) -> f32,
+        [a, node]: [DVec3; 2],
+        enough: [f32; 2],
+    ) {
+        self.place::<true>(lane, lattice, h, a, node);
         (self.enough[0][lane], self.enough[1][lane]) = enough.into();
     }
 
@@ -58,9 +67,16 @@ impl Segments {
         clippy::cast_possible_wrap,
         reason = "values are f32, places in the lattice"
     )]
-    fn place<const BEFORE: bool>(&mut self, lane: usize, field: &Field, a: DVec3, b: DVec3) {
+    fn place<const BEFORE: bool>(
+        &mut self,
+        lane: usize,
+        lattice: &Lattice,
+        h: impl Fn(DVec3) -> f32,
+        a: DVec3,
+        b: DVec3,
+    ) {
         (self.least[lane], self.most[lane], self.count[lane]) = (f32::INFINITY, f32::NEG_INFINITY, 0);
-        let far = field.lattice().far();
+        let far = lattice.far();
         let d = b - a;
         let (mut from, mut to) = (0f64, 1f64);
         for x in 0..3 {
@@ -78,7 +94,7 @@ impl Segments {
             return;
         }
         for t in &[from, to][..if BEFORE { 1 } else { 2 }] {
-            let h = field.value(a + t * d) as f32;
+            let h = h(a + t * d);
             self.least[lane] = self.least[lane].min(h);
             self.most[lane] = self.most[lane].max(h);
         }
@@ -87,7 +103,7 @@ impl Segments {
         if d[axis] == 0.0 {
             return;
         }
-        let dims = field.lattice().dims();
+        let dims = lattice.dims();
         let strides = [1, dims[0], dims[0] * dims[1]];
         let across = [(axis + 1) % 3, (axis + 2) % 3];
         for (i, &x) in across.iter().enumerate() {
@@ -139,9 +155,9 @@ impl Segments {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::Sweep;
+    use crate::field::{Field, Sweep};
     use crate::rng::{Rng, Stage};
-    use crate::volume::{Lattice, Samples, Volume};
+    use crate::volume::{Samples, Volume};
 
     fn field(dims: [usize; 3], h: impl FnMut(DVec3) -> f64) -> Field {
         let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::ONE).unwrap();
@@ -162,7 +178,9 @@ mod tests {
             let mut segments = Segments::NONE;
             let ends: [[DVec3; 2]; LANES] =
                 std::array::from_fn(|_| [0, 1].map(|_| DVec3::new(rng.unit(), rng.unit(), rng.unit()) * far));
-            ends.iter().enumerate().for_each(|(lane, e)| segments.set(lane, &noise, e[0], e[1]));
+            ends.iter()
+                .enumerate()
+                .for_each(|(lane, e)| segments.set(lane, noise.lattice(), |p| noise.value(p) as f32, e[0], e[1]));
             segments.march(noise.samples());
             for (lane, [a, b]) in ends.into_iter().enumerate() {
                 let d = b - a;
@@ -192,7 +210,10 @@ mod tests {
             let h = noise.value(node) as f32;
             let marched = |enough| {
                 let mut segments = Segments::NONE;
-                ends.iter().enumerate().for_each(|(lane, y)| segments.set_before(lane, &noise, *y, node, enough));
+                let h = |p: DVec3| noise.value(p) as f32;
+                let set =
+                    |(lane, y): (usize, &DVec3)| segments.set_before(lane, noise.lattice(), h, [*y, node], enough);
+                ends.iter().enumerate().for_each(set);
                 segments.march(noise.samples());
                 segments
             };
@@ -205,7 +226,8 @@ mod tests {
                 // In the slice next to the node, if not at the other end.
                 let slices = |count: i32| {
                     let mut first = Segments::NONE;
-                    first.set_before(0, &noise, end, node, [f32::NEG_INFINITY, f32::INFINITY]);
+                    let h = |p: DVec3| noise.value(p) as f32;
+                    first.set_before(0, noise.lattice(), h, [end, node], [f32::NEG_INFINITY, f32::INFINITY]);
                     first.count[0] = first.count[0].min(count);
                     first.march(noise.samples());
                     first.most[0]
@@ -226,8 +248,9 @@ mod tests {
     fn segments_are_clipped() {
         let ramp = field([11; 3], |x| x.x / 10.0);
         let mut segments = Segments::NONE;
-        segments.set(0, &ramp, DVec3::new(-5.0, 2.0, 3.0), DVec3::new(7.5, 4.0, 3.0));
-        segments.set(1, &ramp, DVec3::new(-5.0, 2.0, 3.0), DVec3::new(-1.0, 9.0, 9.0));
+        let h = |p: DVec3| ramp.value(p) as f32;
+        segments.set(0, ramp.lattice(), h, DVec3::new(-5.0, 2.0, 3.0), DVec3::new(7.5, 4.0, 3.0));
+        segments.set(1, ramp.lattice(), h, DVec3::new(-5.0, 2.0, 3.0), DVec3::new(-1.0, 9.0, 9.0));
         segments.march(ramp.samples());
         assert!((segments.least[0]).abs() < 1e-6 && (segments.most[0] - 0.75).abs() < 1e-6);
         for lane in 1..LANES {

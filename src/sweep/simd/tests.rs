@@ -104,11 +104,13 @@ fn every_instruction_set_finds_the_same_extrema() {
         let mut segments = Segments::NONE;
         // Partly outside, and from nodes until enough is found; the last lanes stay empty.
         let mut point = |size: f64| DVec3::new(rng.unit(), rng.unit(), rng.unit()) * size;
-        (0..7).for_each(|lane| segments.set(lane, &field, point(20.0) - 4.0, point(20.0) - 4.0));
+        let h = |p: DVec3| field.value(p) as f32;
+        (0..7).for_each(|lane| segments.set(lane, field.lattice(), h, point(20.0) - 4.0, point(20.0) - 4.0));
         for lane in 7..13 {
             let enough = point(1.0);
             let enough = [0.2 * enough.x as f32, 1.0 - 0.2 * enough.y as f32];
-            segments.set_before(lane, &field, point(20.0) - 4.0, point(8.0).round(), enough);
+            let ends = [point(20.0) - 4.0, point(8.0).round()];
+            segments.set_before(lane, field.lattice(), h, ends, enough);
         }
         let run = |isa: Isa| {
             let mut segments = segments.clone();
