@@ -270,7 +270,8 @@ impl Pass<'_> {
         }
     }
 
-    /// A row of nodes, which memory is asked for with what else [`Self::accumulate`] reads.
+    /// A row of nodes, which memory is asked for with what else [`Self::accumulate`] reads. It may be held beside the one before: no
+    /// other row of lines adds to either.
     fn ask<'r, 'e>(&self, family: &Family, rows: &'r Rows<'e>, [k, j]: [usize; 2]) -> MutexGuard<'r, Row<'e>> {
         let layout = &family.plan.shear.layout;
         let at = k * layout.stride[1] + j * layout.stride[0];
