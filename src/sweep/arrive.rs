@@ -100,7 +100,7 @@ impl<'a> Walls<'a> {
     pub(super) fn through(&self, pack: &Pack, b: &[Half4], first: isize, q: isize, out: &mut Arrivals) {
         for p in self.reporting(first..=first + LANES as isize - 1, q) {
             let lane = (p - first).unsigned_abs();
-            let span = self.plan.span(p as f64, q as f64);
+            let span = pack.spans.map(|tau| tau[lane]);
             // Lines through a corner of Ω that no slice cuts have no samples.
             if span[0].ceil() <= span[1].floor() {
                 self.line(Some((pack, b, lane, span)), p, q, out);

@@ -181,7 +181,7 @@ fn walls(
     let [lower, higher] = [Side::Lower, Side::Higher].map(|s| sides.contains(&s));
     let higher = higher && !capped(scene);
     let far = lattice.far();
-    // Whatever is below the sweep hides as little from the lower side.
+    // Below the sweep h hides nothing from the lower side, however far below.
     let h = |p: DVec3| {
         if higher || geometry.reaches(p) { scene.field.value(p) as f32 } else { f32::NEG_INFINITY }
     };

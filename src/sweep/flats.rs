@@ -216,7 +216,7 @@ impl Flats {
         for l in 0..N {
             let [a, b, c, d] = around(texture.dims, [uv[0][l], uv[1][l]]);
             let left = [random[l] - a.1, random[l] - a.1 - b.1, random[l] - a.1 - b.1 - c.1];
-            // From the last to the first and not the other way round: choices, where branches would be foretold badly.
+            // Selected from the last to the first: an end at the first that fits would be a branch that nobody can foretell.
             let mut texel = d.0;
             texel = if left[2] < 0.0 { c.0 } else { texel };
             texel = if left[1] < 0.0 { b.0 } else { texel };

@@ -2,6 +2,9 @@
 
 #![allow(clippy::needless_range_loop, reason = "a channel indexes several planes at once")]
 
+#[cfg(test)]
+mod tests;
+
 use super::directions::Shear;
 use super::ends::Ends;
 use super::flats::{Flats, Stop};
@@ -79,19 +82,14 @@ impl Plan {
         }
     }
 
-    /// τ at which line (p, q) enters and leaves Ω; empty if it misses.
-    pub(super) fn span(&self, p: f64, q: f64) -> [f64; 2] {
-        self.spans::<1>(p, q).map(|[tau]| tau)
-    }
-
-    /// [`Plan::span`] of lines (p + 0 … N − 1, q).
+    /// τ at which lines (p + lane, q) enter and leave Ω; nothing is between if they miss it.
     #[inline(always)]
-    fn spans<const N: usize>(&self, p: f64, q: f64) -> [[f64; N]; 2] {
+    fn spans(&self, p: f64, q: f64) -> [[f64; LANES]; 2] {
         let [nu, nv, na] = self.shear.layout.dims;
-        let (mut from, mut to) = ([0f64; N], [na as f64 - 1.0; N]);
+        let (mut from, mut to) = ([0f64; LANES], [na as f64 - 1.0; LANES]);
         for (a, (number, step, n)) in [(p, 1.0, nu), (q, 0.0, nv)].into_iter().enumerate() {
             let (offset, s, far) = (self.shear.offset[a], self.shear.slope[a], n as f64 - 1.0);
-            for l in 0..N {
+            for l in 0..LANES {
                 let x = number + l as f64 * step + offset;
                 // Parallel to this pair of sides.
                 if s == 0.0 {
@@ -184,8 +182,8 @@ pub(super) struct Pack {
     is_awake: Vec<bool>,
     /// The slices where nodes beside the row of lines reach the sweep, and their blocks.
     stripe: Vec<(usize, u64)>,
-    /// [`Plan::span`] of the lines.
-    span: [[f64; LANES]; 2],
+    /// [`Plan::spans`] of the lines.
+    pub spans: [[f64; LANES]; 2],
     pub cuts: Vec<Cut>,
     /// Where in [`Flats::packed`] the ends of lines are, per direction (+, −).
     pub lasts: [[u32; LANES]; 2],
@@ -213,7 +211,7 @@ impl Pack {
             awake: Vec::new(),
             is_awake: vec![false; rows],
             stripe: Vec::new(),
-            span: [[0.0; LANES]; 2],
+            spans: [[0.0; LANES]; 2],
             cuts: Vec::new(),
             lasts: [[0; LANES]; 2],
             scratch: Vec::new(),
@@ -285,7 +283,7 @@ impl Pack {
             self.is_awake[k + 1] = true;
             inside &= hi - lo == LANES && self.beside(plan, k, (first, q)) == [(0, LANES); 2];
         }
-        self.span = plan.spans(first as f64, q as f64);
+        self.spans = plan.spans(first as f64, q as f64);
         // Lines that enter through a side between two slices get that point in the row before, those that leave in the
         // row behind.
         if !inside {
@@ -395,7 +393,7 @@ impl Pack {
         let [nu, nv, na] = plan.shear.layout.dims;
         let [sv, sa] = plan.shear.layout.stride;
         let near = k as f64 + if leaves { 1.0 } else { -1.0 };
-        let tau = self.span[usize::from(leaves)][lane].clamp(near.min(k as f64), near.max(k as f64));
+        let tau = self.spans[usize::from(leaves)][lane].clamp(near.min(k as f64), near.max(k as f64));
         let [x, y] = [(pq.0, nu, 0), (pq.1, nv, 1)].map(|(number, n, a)| {
             (number as f64 + plan.shear.offset[a] + plan.shear.slope[a] * tau).clamp(0.0, n as f64 - 1.0)
         });
@@ -427,9 +425,9 @@ impl Pack {
         let mut random = [[0.0; LANES]; 2];
         let seed = plan.noise(first, q);
         for lane in 0..LANES {
-            let hit = self.span[0][lane] <= self.span[1][lane];
+            let hit = self.spans[0][lane] <= self.spans[1][lane];
             for d in 0..2 {
-                from[d][lane] = if hit { self.span[1 - d][lane] } else { 0.0 };
+                from[d][lane] = if hit { self.spans[1 - d][lane] } else { 0.0 };
                 random[d][lane] = dither(seed, lane + d * LANES);
             }
         }
@@ -578,50 +576,4 @@ fn isovalue(n: usize, c: f32) -> (usize, f32) {
     let x = (c * n as f32 - 0.5).max(0.0).min((n - 1) as f32);
     let i = (x as usize).min(n - 2);
     (i, x - i as f32)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::volume::Lattice;
-    use glam::DVec3;
-
-    /// Oblique lines, and such as are parallel to one or two pairs of sides, some of them outside.
-    #[test]
-    fn spans_are_where_lines_lie_in_omega() {
-        let dims = [6, 9, 7];
-        let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::ONE).unwrap();
-        let far = dims.map(|n| n as f64 - 1.0);
-        let (mut within, mut missed) = (0, 0);
-        for (i, omega) in [[0.4, -0.7, 1.0], [-0.9, 0.2, -1.0], [0.0, 0.6, 1.0], [0.3, 0.0, 1.0], [0.0, 0.0, 1.0]]
-            .into_iter()
-            .enumerate()
-        {
-            let shear = Shear::new(&lattice, DVec3::from_array(omega), [0.3, 0.11 * i as f64]);
-            let plan = Plan::new(shear, 1.0);
-            for q in -9..16 {
-                let spans = plan.spans::<LANES>(-5.0, f64::from(q));
-                for lane in 0..LANES {
-                    let (p, q) = (lane as f64 - 5.0, f64::from(q));
-                    let span = spans.map(|s| s[lane]);
-                    if span[0] <= span[1] {
-                        assert_eq!(plan.span(p, q), span);
-                    }
-                    for step in -20..160 {
-                        let tau = 0.05 * f64::from(step) + 1e-3;
-                        let x = [
-                            p + shear.offset[0] + shear.slope[0] * tau,
-                            q + shear.offset[1] + shear.slope[1] * tau,
-                            tau,
-                        ];
-                        let inside = x.iter().zip(far).all(|(x, far)| *x >= 0.0 && *x <= far);
-                        let count = if inside { &mut within } else { &mut missed };
-                        *count += 1;
-                        assert_eq!((span[0]..=span[1]).contains(&tau), inside, "{omega:?} {p} {q} {tau}: {span:?}");
-                    }
-                }
-            }
-        }
-        assert!(within > 1000 && missed > 1000);
-    }
 }
