@@ -14,6 +14,7 @@
 
 mod arrive;
 mod blockers;
+mod clearance;
 mod direct;
 mod directions;
 mod ends;
@@ -312,6 +313,7 @@ impl Run<'_> {
         let points = s.light_points.max(1);
         let lights = points * self.scene.luminaires().len();
         let mut complete = true;
+        let clearance = direct::clearance(self.scene, self.geometry, self.sides);
         let first = state.total.lit;
         while state.total.lit < replicates && complete {
             let number = state.total.lit;
@@ -323,7 +325,7 @@ impl Run<'_> {
                 step += 1;
                 tick(DIRECT_SHARE * step as f64 / (replicates * lights) as f64)
             };
-            let common = (self.geometry, self.isa, self.spare);
+            let common = (self.geometry, clearance.as_ref(), self.isa, self.spare);
             let part = Points { seed: s.seed, replicate: number, replicates, count: points };
             let (direct, all) = direct::direct(self.scene, common, flats, self.sides, part, &mut ask);
             complete = all;

@@ -2,6 +2,7 @@
 //! answers for every isovalue it meets: a sample is lit on its own level set iff it exceeds everything before it.
 
 use super::blockers::Blockers;
+use super::clearance::Clearance;
 use super::fans::Fans;
 use super::flats::{Flats, capped};
 use super::grid::Geometry;
@@ -20,12 +21,19 @@ use crate::scene::Scene;
 use glam::DVec3;
 use rayon::prelude::*;
 
+/// How far segments to flats may step: from the lower side what is below the sweep hides nothing, however far below. `None` where
+/// flats are seen from inside solids, too.
+pub(super) fn clearance(scene: &Scene, geometry: &Geometry, sides: &[Side]) -> Option<Clearance> {
+    let inside = sides.contains(&Side::Higher) && !capped(scene);
+    (!inside).then(|| Clearance::new(geometry))
+}
+
 /// Direct irradiance of every node, one set of planes per side in `sides`; that of the flats is added to theirs at the end.
 /// `tick` is asked before every point; false stops.
 #[allow(clippy::cast_possible_truncation, reason = "irradiance is f32")]
 pub(super) fn direct(
     scene: &Scene,
-    (geometry, isa, spare): (&Geometry, Isa, &Spare),
+    (geometry, clearance, isa, spare): (&Geometry, Option<&Clearance>, Isa, &Spare),
     flats: &mut Flats,
     sides: &[Side],
     part: Points,
@@ -116,7 +124,7 @@ pub(super) fn direct(
         }
     }
     for (&number, open) in scene.luminaires().iter().zip(&shares) {
-        walls((scene, geometry, isa), flats, sides, number, (part, open));
+        walls((scene, geometry, clearance, isa), flats, sides, number, (part, open));
     }
     (planes, true)
 }
@@ -165,7 +173,7 @@ impl Staircases {
 /// luminaire point; it is lit at the isovalues above the greatest h there (and, inside solids, up to the least).
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the isovalues")]
 fn walls(
-    (scene, geometry, isa): (&Scene, &Geometry, Isa),
+    (scene, geometry, clearance, isa): (&Scene, &Geometry, Option<&Clearance>, Isa),
     flats: &mut Flats,
     sides: &[Side],
     number: u32,
@@ -181,9 +189,8 @@ fn walls(
     let [lower, higher] = [Side::Lower, Side::Higher].map(|s| sides.contains(&s));
     let higher = higher && !capped(scene);
     let far = lattice.far();
-    // Below the sweep h hides nothing from the lower side, however far below.
     let h = |p: DVec3| {
-        if higher || geometry.reaches(p) { scene.field.value(p) as f32 } else { f32::NEG_INFINITY }
+        if clearance.is_none() || geometry.reaches(p) { scene.field.value(p) as f32 } else { f32::NEG_INFINITY }
     };
     for (id, texture) in flats.textures.iter_mut().enumerate() {
         let Some(texture) = texture else { continue };
@@ -229,7 +236,7 @@ fn walls(
                     segments.set(lane, lattice, h, ly, lx);
                     seen[lane] = (g, here);
                 }
-                isa.extrema(scene.field.samples(), &mut segments);
+                isa.extrema(scene.field.samples(), &mut segments, clearance);
                 for (lane, &(g, here)) in seen.iter().enumerate().filter(|(_, s)| s.0 != 0.0) {
                     let open = below(segments.most[lane]).max(here);
                     lit.add(g, open, below(segments.least[lane]).min(open));

@@ -104,6 +104,16 @@ impl Blocks {
         self.nodes(self.rows[row], nu)
     }
 
+    /// The nodes of every block of a row, from the first to behind the last.
+    #[inline(always)]
+    fn each(&self, row: usize, nu: usize) -> impl Iterator<Item = (usize, usize)> {
+        let size = self.size;
+        std::iter::successors(Some(self.rows[row]), |bits| Some(bits & bits.wrapping_sub(1)))
+            .take_while(|bits| *bits != 0)
+            .map(move |bits| bits.trailing_zeros() as usize * size)
+            .map(move |a| (a, (a + size).min(nu)))
+    }
+
     fn nodes(&self, bits: u64, nu: usize) -> Option<(usize, usize)> {
         let (a, b) = (bits.trailing_zeros() as usize, 64 - bits.leading_zeros() as usize);
         (bits != 0).then(|| (a * self.size, (b * self.size).min(nu)))
@@ -224,6 +234,11 @@ impl<'a> Geometry<'a> {
         blocks.meets(blocks.rows[k * self.dims[1] + j], i, i + 1)
     }
 
+    /// The nodes of row `row` along x within one of those that may reach the sweep from below, from first to behind last.
+    pub(super) fn reaching(&self, row: usize) -> impl Iterator<Item = (usize, usize)> {
+        self.awake[Side::Lower.index()][0].each(row, self.dims[0])
+    }
+
     /// Light of the lit nodes from y, z, x order back to x, y, z; the others are black.
     pub(super) fn untransposed(&self, planes: Planes, spare: &Spare) -> Planes {
         planes.map(|from| {
@@ -260,11 +275,7 @@ impl<'a> Geometry<'a> {
     pub(super) fn lit_nodes(&self, row: usize, mut visit: impl FnMut(usize)) {
         let blocks = &self.lit_blocks[0];
         let nx = self.dims[0];
-        let mut bits = blocks.rows[row];
-        while bits != 0 {
-            let a = bits.trailing_zeros() as usize * blocks.size;
-            bits &= bits - 1;
-            let b = (a + blocks.size).min(nx);
+        for (a, b) in blocks.each(row, nx) {
             let nodes = self.normals[row * nx + a..row * nx + b].iter().zip(a..b);
             nodes.filter(|(normal, _)| **normal != 0).for_each(|(_, i)| visit(i));
         }
@@ -322,7 +333,8 @@ impl<'a> Geometry<'a> {
     }
 }
 
-fn neighbours([nx, ny, nz]: [usize; 3], at: usize, mut visit: impl FnMut(usize)) {
+/// Visits a node and all that share a cell with it.
+pub(super) fn neighbours([nx, ny, nz]: [usize; 3], at: usize, mut visit: impl FnMut(usize)) {
     let (i, j, k) = (at % nx, at / nx % ny, at / (nx * ny));
     for z in k.saturating_sub(1)..(k + 2).min(nz) {
         for y in j.saturating_sub(1)..(j + 2).min(ny) {

@@ -115,7 +115,7 @@ impl Looks<'_> {
 
     /// Adds what those that were taken see.
     fn finish(&mut self) {
-        self.isa.extrema(self.h, &mut self.segments);
+        self.isa.extrema(self.h, &mut self.segments, None);
         let Segments { least, most, .. } = &self.segments;
         for (lane, look) in self.looks[..self.taken].iter().enumerate() {
             let open = match look.side {

@@ -1,5 +1,6 @@
 //! Extrema of h along many segments at once: what stands between receivers and points of a luminaire.
 
+use super::clearance::Clearance;
 use super::pack::LANES;
 use crate::volume::Lattice;
 use glam::DVec3;
@@ -15,6 +16,8 @@ pub(super) struct Segments {
     pub last: [[i32; LANES]; 2],
     /// Strides of the two other axes and the dominant one.
     pub stride: [[i32; LANES]; 3],
+    /// The same of blocks of [`Clearance`].
+    pub blocks: [[i32; LANES]; 3],
     /// First slice, number of slices, all inside Ω, and the way from one to the next: 1 or −1.
     pub first: [i32; LANES],
     pub count: [i32; LANES],
@@ -33,6 +36,7 @@ impl Segments {
         slope: [[0.0; LANES]; 2],
         last: [[0; LANES]; 2],
         stride: [[0; LANES]; 3],
+        blocks: [[0; LANES]; 3],
         first: [0; LANES],
         count: [0; LANES],
         way: [1; LANES],
@@ -104,16 +108,17 @@ impl Segments {
             return;
         }
         let dims = lattice.dims();
-        let strides = [1, dims[0], dims[0] * dims[1]];
+        let strides = |dims: [usize; 3]| [1, dims[0], dims[0] * dims[1]];
+        let (strides, blocks) = (strides(dims), strides(Clearance::blocks(dims)));
         let across = [(axis + 1) % 3, (axis + 2) % 3];
         for (i, &x) in across.iter().enumerate() {
             let slope = d[x] / d[axis];
             self.start[i][lane] = (a[x] - a[axis] * slope) as f32;
             self.slope[i][lane] = slope as f32;
             self.last[i][lane] = dims[x] as i32 - 2;
-            self.stride[i][lane] = strides[x] as i32;
+            (self.stride[i][lane], self.blocks[i][lane]) = (strides[x] as i32, blocks[x] as i32);
         }
-        self.stride[2][lane] = strides[axis] as i32;
+        (self.stride[2][lane], self.blocks[2][lane]) = (strides[axis] as i32, blocks[axis] as i32);
         let (p, q) = (a[axis] + from * d[axis], if BEFORE { b[axis] } else { a[axis] + to * d[axis] });
         let (mut first, mut end) =
             (p.min(q).ceil().max(0.0) as i32, (p.max(q).floor() as i32).min(dims[axis] as i32 - 1));
@@ -127,12 +132,13 @@ impl Segments {
     }
 
     /// Takes h of all slices into the extrema, bilinear in each, or of as many as a lane needs to find enough; NaN counts nothing.
-    /// `h`: the samples of the fields of [`Segments::set`].
+    /// `h`: the samples of the fields of [`Segments::set`]. With `clearance`, where h is below the sweep some slices are left out.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
-    pub(super) fn march(&mut self, h: &[f32]) {
+    pub(super) fn march(&mut self, h: &[f32], clearance: Option<&Clearance>) {
         for lane in 0..LANES {
-            let stride = self.stride.map(|s| s[lane] as usize);
-            for step in 0..self.count[lane] {
+            let [stride, blocks] = [self.stride, self.blocks].map(|all| all.map(|s| s[lane] as usize));
+            let mut step = 0;
+            while step < self.count[lane] {
                 if self.least[lane] < self.enough[0][lane] || self.most[lane] >= self.enough[1][lane] {
                     break;
                 }
@@ -140,13 +146,17 @@ impl Segments {
                 let x = [0, 1].map(|i| (self.start[i][lane] + k as f32 * self.slope[i][lane]).max(0.0));
                 let cell = [0, 1].map(|i| (x[i] as i32).min(self.last[i][lane]));
                 let [f, g] = [0, 1].map(|i| (x[i] - cell[i] as f32).min(1.0));
-                let at = k as usize * stride[2] + cell[0] as usize * stride[0] + cell[1] as usize * stride[1];
+                let [i, j, k] = [cell[0], cell[1], k].map(|x| x as usize);
+                let at = i * stride[0] + j * stride[1] + k * stride[2];
                 let line = |at: usize| h[at] + f * (h[at + stride[0]] - h[at]);
                 let (near, far) = (line(at), line(at + stride[1]));
                 let value = near + g * (far - near);
                 // f32::min and max pass over NaN.
                 self.least[lane] = self.least[lane].min(value);
                 self.most[lane] = self.most[lane].max(value);
+                let [bi, bj, bk] = [i, j, k].map(|x| x >> Clearance::SHIFT);
+                let block = bi * blocks[0] + bj * blocks[1] + bk * blocks[2];
+                step += clearance.map_or(1, |clearance| i32::from(clearance.slices[block]));
             }
         }
     }
@@ -181,7 +191,7 @@ mod tests {
             ends.iter()
                 .enumerate()
                 .for_each(|(lane, e)| segments.set(lane, noise.lattice(), |p| noise.value(p) as f32, e[0], e[1]));
-            segments.march(noise.samples());
+            segments.march(noise.samples(), None);
             for (lane, [a, b]) in ends.into_iter().enumerate() {
                 let d = b - a;
                 let axis = d.abs().to_array().iter().position(|x| *x == d.abs().max_element()).unwrap();
@@ -214,7 +224,7 @@ mod tests {
                 let set =
                     |(lane, y): (usize, &DVec3)| segments.set_before(lane, noise.lattice(), h, [*y, node], enough);
                 ends.iter().enumerate().for_each(set);
-                segments.march(noise.samples());
+                segments.march(noise.samples(), None);
                 segments
             };
             let all = marched([f32::NEG_INFINITY, f32::INFINITY]);
@@ -229,7 +239,7 @@ mod tests {
                     let h = |p: DVec3| noise.value(p) as f32;
                     first.set_before(0, noise.lattice(), h, [end, node], [f32::NEG_INFINITY, f32::INFINITY]);
                     first.count[0] = first.count[0].min(count);
-                    first.march(noise.samples());
+                    first.march(noise.samples(), None);
                     first.most[0]
                 };
                 let d = node - end;
@@ -251,7 +261,7 @@ mod tests {
         let h = |p: DVec3| ramp.value(p) as f32;
         segments.set(0, ramp.lattice(), h, DVec3::new(-5.0, 2.0, 3.0), DVec3::new(7.5, 4.0, 3.0));
         segments.set(1, ramp.lattice(), h, DVec3::new(-5.0, 2.0, 3.0), DVec3::new(-1.0, 9.0, 9.0));
-        segments.march(ramp.samples());
+        segments.march(ramp.samples(), None);
         assert!((segments.least[0]).abs() < 1e-6 && (segments.most[0] - 0.75).abs() < 1e-6);
         for lane in 1..LANES {
             assert_eq!((segments.least[lane], segments.most[lane]), (f32::INFINITY, f32::NEG_INFINITY));

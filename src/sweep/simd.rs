@@ -11,6 +11,7 @@ mod avx512;
 #[cfg(test)]
 mod tests;
 
+use super::clearance::Clearance;
 use super::ends::Ends;
 use super::fans::march_row;
 use super::flats::Flats;
@@ -98,15 +99,15 @@ impl Isa {
     }
 
     /// [`Segments::march`].
-    pub(super) fn extrema(self, h: &[f32], segments: &mut Segments) {
+    pub(super) fn extrema(self, h: &[f32], segments: &mut Segments, clearance: Option<&Clearance>) {
         match self.kind() {
             // SAFETY: an `Isa` of this kind exists, so the machine has the features that `extrema` enables.
             #[cfg(target_arch = "x86_64")]
-            Kind::Avx512 if signed(h.len()) => unsafe { avx512::extrema(h, segments) },
+            Kind::Avx512 if signed(h.len()) => unsafe { avx512::extrema(h, segments, clearance) },
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
-            Kind::Avx2 if signed(h.len()) => unsafe { avx2::extrema(h, segments) },
-            _ => segments.march(h),
+            Kind::Avx2 if signed(h.len()) => unsafe { avx2::extrema(h, segments, clearance) },
+            _ => segments.march(h, clearance),
         }
     }
 

@@ -2,6 +2,7 @@
 //! ones in a lane that is meant. Gathers cost as much as loads one by one here, or more, so that lines which lie close
 //! together are permuted out of what two loads bring.
 
+use crate::sweep::clearance::Clearance;
 use crate::sweep::fans::{HIGHER, LOWER, SAMPLED, march_row};
 use crate::sweep::half::Half4;
 use crate::sweep::pack::{LANES, Light, OUTSIDE, Pack, Way};
@@ -136,7 +137,7 @@ pub(super) fn march(row: &[f32], [u0, du]: [f32; 2], [most, least]: [&mut [f32];
 /// [`Segments::march`] for less than 2³¹ samples.
 #[target_feature(enable = "avx2,f16c")]
 #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, reason = "less than 2³¹ samples")]
-pub(super) fn extrema(h: &[f32], s: &mut Segments) {
+pub(super) fn extrema(h: &[f32], s: &mut Segments, clearance: Option<&Clearance>) {
     if h.is_empty() {
         return;
     }
@@ -149,14 +150,16 @@ pub(super) fn extrema(h: &[f32], s: &mut Segments) {
         let enough = s.enough.each_ref().map(|x| floats(x, half));
         let (mut least, mut most) = (floats(&s.least, half), floats(&s.most, half));
         let (zero, one) = (_mm256_setzero_ps(), _mm256_set1_ps(1.0));
-        let mut k = first;
-        for step in 0..s.count[half * HALF..][..HALF].iter().copied().max().unwrap_or(0) {
-            let step = _mm256_set1_epi32(step);
+        let blocks = s.blocks.each_ref().map(|x| ints(x, half));
+        let last_block = _mm256_set1_epi32(clearance.map_or(0, |c| c.slices.len() - 4) as i32);
+        let (mut k, mut left) = (first, count);
+        loop {
             let found = _mm256_or_ps(
                 _mm256_cmp_ps::<_CMP_LT_OQ>(least, enough[0]),
                 _mm256_cmp_ps::<_CMP_GE_OQ>(most, enough[1]),
             );
-            let wanted = _mm256_andnot_si256(_mm256_castps_si256(found), _mm256_cmpgt_epi32(count, step));
+            let wanted =
+                _mm256_andnot_si256(_mm256_castps_si256(found), _mm256_cmpgt_epi32(left, _mm256_setzero_si256()));
             if _mm256_testz_si256(wanted, wanted) == 1 {
                 break;
             }
@@ -188,7 +191,18 @@ pub(super) fn extrema(h: &[f32], s: &mut Segments) {
             // Of NaN and a number min and max return the second, the number.
             least = _mm256_blendv_ps(least, _mm256_min_ps(value, least), mask);
             most = _mm256_blendv_ps(most, _mm256_max_ps(value, most), mask);
-            k = _mm256_add_epi32(k, way);
+            let Some(clearance) = clearance else {
+                (k, left) = (_mm256_add_epi32(k, way), _mm256_sub_epi32(left, _mm256_set1_epi32(1)));
+                continue;
+            };
+            let [bi, bj, bk] = [i, j, k].map(|x| _mm256_srli_epi32::<{ Clearance::SHIFT as i32 }>(x));
+            let block = _mm256_add_epi32(_mm256_mullo_epi32(bi, blocks[0]), _mm256_mullo_epi32(bj, blocks[1]));
+            let block = _mm256_add_epi32(block, _mm256_mullo_epi32(bk, blocks[2]));
+            let block = _mm256_min_epu32(block, last_block);
+            // SAFETY: words of four bytes from places of at most four less than the length.
+            let slices = unsafe { _mm256_i32gather_epi32::<1>(clearance.slices.as_ptr().cast(), block) };
+            let slices = _mm256_and_si256(slices, _mm256_set1_epi32(0xff));
+            (k, left) = (_mm256_add_epi32(k, _mm256_mullo_epi32(way, slices)), _mm256_sub_epi32(left, slices));
         }
         // SAFETY: eight of sixteen numbers each.
         unsafe {

@@ -1,5 +1,6 @@
 //! AVX-512, sixteen lines in sixteen lanes: what the compiler does not find in the plain code.
 
+use crate::sweep::clearance::Clearance;
 use crate::sweep::fans::{HIGHER, LOWER, SAMPLED};
 use crate::sweep::half::Half4;
 use crate::sweep::pack::{LANES, Light, OUTSIDE, Pack, Way};
@@ -63,7 +64,7 @@ pub(super) fn march(row: &[f32], [u0, du]: [f32; 2], [most, least]: [&mut [f32];
 /// [`Segments::march`] for less than 2³¹ samples.
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
 #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, reason = "less than 2³¹ samples")]
-pub(super) fn extrema(h: &[f32], s: &mut Segments) {
+pub(super) fn extrema(h: &[f32], s: &mut Segments, clearance: Option<&Clearance>) {
     // SAFETY: sixteen numbers each.
     let floats = |x: &[f32; LANES]| unsafe { _mm512_loadu_ps(x.as_ptr()) };
     // SAFETY: as above.
@@ -75,10 +76,11 @@ pub(super) fn extrema(h: &[f32], s: &mut Segments) {
     let (mut least, mut most) = (floats(&s.least), floats(&s.most));
     let (zero, one) = (_mm512_setzero_ps(), _mm512_set1_ps(1.0));
     let end = _mm512_set1_epi32(h.len() as i32);
-    let mut k = first;
-    for step in 0..s.count.iter().copied().max().unwrap_or(0) {
-        let step = _mm512_set1_epi32(step);
-        let wanted = _mm512_cmp_epi32_mask::<_MM_CMPINT_LT>(step, count)
+    let blocks = s.blocks.each_ref().map(ints);
+    let last_block = _mm512_set1_epi32(clearance.map_or(0, |c| c.slices.len() - 4) as i32);
+    let (mut k, mut left) = (first, count);
+    loop {
+        let wanted = _mm512_cmp_epi32_mask::<_MM_CMPINT_NLE>(left, _mm512_setzero_si512())
             & !(_mm512_cmp_ps_mask::<_CMP_LT_OQ>(least, enough[0]) | _mm512_cmp_ps_mask::<_CMP_GE_OQ>(most, enough[1]));
         if wanted == 0 {
             break;
@@ -109,7 +111,18 @@ pub(super) fn extrema(h: &[f32], s: &mut Segments) {
         let higher = _mm512_mask_cmp_ps_mask::<_CMP_GT_OQ>(mask, value, most);
         least = _mm512_mask_mov_ps(least, lower, value);
         most = _mm512_mask_mov_ps(most, higher, value);
-        k = _mm512_add_epi32(k, way);
+        let Some(clearance) = clearance else {
+            (k, left) = (_mm512_add_epi32(k, way), _mm512_sub_epi32(left, _mm512_set1_epi32(1)));
+            continue;
+        };
+        let [bi, bj, bk] = [i, j, k].map(|x| _mm512_srli_epi32::<{ Clearance::SHIFT }>(x));
+        let block = _mm512_add_epi32(_mm512_mullo_epi32(bi, blocks[0]), _mm512_mullo_epi32(bj, blocks[1]));
+        let block = _mm512_add_epi32(block, _mm512_mullo_epi32(bk, blocks[2]));
+        let block = _mm512_min_epu32(block, last_block);
+        // SAFETY: words of four bytes from places of at most four less than the length.
+        let slices = unsafe { _mm512_i32gather_epi32::<1>(block, clearance.slices.as_ptr().cast()) };
+        let slices = _mm512_and_si512(slices, _mm512_set1_epi32(0xff));
+        (k, left) = (_mm512_add_epi32(k, _mm512_mullo_epi32(way, slices)), _mm512_sub_epi32(left, slices));
     }
     // SAFETY: sixteen numbers each.
     unsafe {

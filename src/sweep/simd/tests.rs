@@ -1,6 +1,8 @@
 use super::*;
 use crate::field::{Field, Sweep};
 use crate::rng::{Rng, Stage};
+use crate::sweep::clearance::tests::specks;
+use crate::sweep::grid::Geometry;
 use crate::sweep::half::Half4;
 use crate::sweep::half::{decode, encode};
 use crate::sweep::pack::{ASLEEP, LANES, OUTSIDE};
@@ -114,13 +116,51 @@ fn every_instruction_set_finds_the_same_extrema() {
         }
         let run = |isa: Isa| {
             let mut segments = segments.clone();
-            isa.extrema(field.samples(), &mut segments);
+            isa.extrema(field.samples(), &mut segments, None);
             [segments.least, segments.most].map(|x| x.map(f32::to_bits))
         };
         for isa in Isa::found() {
             assert_eq!(run(Isa::PLAIN), run(isa), "{isa:?}");
         }
     }
+}
+
+/// Through a few specks: with clearances segments find what they find without, of what reaches the sweep.
+#[test]
+fn segments_step_over_what_is_below_the_sweep() {
+    let mut rng = Rng::stream(7, Stage::Test, 0);
+    let (mut found, mut lanes) = (0, 0);
+    for (dims, share) in [([41, 30, 35], 5e-4), ([29, 33, 26], 5e-3), ([7, 40, 9], 0.1)] {
+        let field = specks(dims, 8, share);
+        let clearance = Clearance::new(&Geometry::new(&field));
+        let far = field.lattice().far();
+        for round in 0..200 {
+            let mut segments = Segments::NONE;
+            // Along diagonals, too, where places in slices are as far apart as slices.
+            let along = DVec3::from_array([0, 1, 2].map(|a| if round >> a & 1 == 0 { 1.0 } else { -1.0 }));
+            for lane in 0..LANES {
+                let mut point = || DVec3::new(rng.unit(), rng.unit(), rng.unit()) * (far + 8.0) - 4.0;
+                let (a, b) = (point(), point());
+                let b = if lane % 4 == 0 { a.round() + 40.0 * along } else { b };
+                let a = if lane % 4 == 0 { a.round() } else { a };
+                segments.set(lane, field.lattice(), |p| field.value(p) as f32, a, b);
+            }
+            let run = |isa: Isa, clearance: Option<&Clearance>| {
+                let mut segments = segments.clone();
+                isa.extrema(field.samples(), &mut segments, clearance);
+                segments.most
+            };
+            let all = run(Isa::PLAIN, None);
+            for isa in Isa::found() {
+                let stepping = run(isa, Some(&clearance));
+                assert_eq!(stepping.map(|h| h.max(0.0)), all.map(|h| h.max(0.0)), "{isa:?}, {dims:?}");
+                assert_eq!(stepping.map(f32::to_bits), run(Isa::PLAIN, Some(&clearance)).map(f32::to_bits), "{isa:?}");
+            }
+            found += all.iter().filter(|h| **h > 0.0).count();
+            lanes += LANES;
+        }
+    }
+    assert!(found > lanes / 20 && found < lanes / 2, "{found} of {lanes}");
 }
 
 #[test]
