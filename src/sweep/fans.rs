@@ -46,8 +46,19 @@ impl Fan {
         // The nearest slice strictly beyond the source.
         let k0 = if up { (source[2] + 1e-9).ceil().max(0.0) } else { (source[2] - 1e-9).floor().min(last) };
         let slices = (k0 as usize, (plane - k0).abs() as usize + 1);
-        let first = [0, 1].map(|x| (source[x] - depth.abs()).floor() as isize);
-        let count = [0, 1].map(|x| ((source[x] + depth.abs()).ceil() as isize - first[x] + 1).unsigned_abs());
+        // Where those meet the plane that meet Ω in a slice: of a source far away few of the pyramid's do.
+        let nearest = (k0 - source[2]) / depth;
+        let lines = [0, 1].map(|x| {
+            let [low, high] = [0.0, layout.dims[x] as f64 - 1.0].map(|side| side - source[x]);
+            let (low, high) = (low.min(low / nearest), high.max(high / nearest));
+            [low.max(-depth.abs()), high.min(depth.abs())].map(|line| source[x] + line)
+        });
+        if lines.iter().any(|[low, high]| low > high) {
+            return None;
+        }
+        let first = lines.map(|[low, _]| low.floor() as isize);
+        // Two at least, to interpolate between.
+        let count = [0, 1].map(|x| (lines[x][1].ceil() as isize - first[x]).max(1).unsigned_abs() + 1);
         Some(Self { layout, source, depth, slices, first, count, begin: 0 })
     }
 
@@ -250,6 +261,38 @@ mod tests {
         samples[dims[0] + 1] = f32::NAN;
         Field::new(&Volume::new("noise", lattice, Samples::F32(samples)).unwrap(), Sweep::new(0.0, 1.0).unwrap())
             .unwrap()
+    }
+
+    /// From sources far away, whose lines are as good as parallel: as many as slices have nodes.
+    #[test]
+    fn fans_of_far_points_are_no_larger_than_the_lattice() {
+        let field = noise([17, 12, 14], 8);
+        let (geometry, isa, sides) = (Geometry::new(&field), Isa::current(), [Side::Lower, Side::Higher]);
+        let middle = DVec3::new(8.0, 5.5, 6.5);
+        let (mut known, mut lit) = (0, 0);
+        for to in [DVec3::Z, DVec3::new(0.3, -0.2, 1.0), DVec3::new(-1.0, 0.9, 0.0), DVec3::new(1.0, 1.0, -1.0)] {
+            let fans = [1e5, 1e6, 1e7].map(|far| {
+                let mut fans = Fans::default();
+                fans.march((&geometry, isa, &sides), middle + far * to, f32::NEG_INFINITY);
+                // A lattice for each pyramid that it may lie in, sheared by no more than its depth.
+                assert!(fans.seen.len() < 6 * 32 * 32 * 32, "{to} {far}: {}", fans.seen.len());
+                fans
+            });
+            for at in (0..geometry.h.len()).filter(|&at| geometry.lit(at)) {
+                let x = field.lattice().ijk(at).map(|i| i as f64);
+                let [near, far, farther] = fans.each_ref().map(|fans| fans.visibility(x));
+                // Beside the sample that is no number lines know nothing.
+                let beside = x.iter().all(|x| *x < 3.0);
+                assert!(beside || near.is_some() && far.is_some(), "{to} {x:?}");
+                // As good as parallel.
+                let alike = |a: Option<[f32; 2]>, b: Option<[f32; 2]>| {
+                    a.zip(b).is_some_and(|(a, b)| (a[0] - b[0]).abs() + (a[1] - b[1]).abs() < 0.1)
+                };
+                known += 1;
+                lit += usize::from(alike(near, far) && alike(far, farther));
+            }
+        }
+        assert!(known > 3000 && lit * 20 > known * 19, "{lit} of {known}");
     }
 
     /// From sources within the lattice and outside, one after the other and whole rounds of turns apart.
