@@ -20,7 +20,7 @@ use crate::isa::Isa;
 use crate::progress::{self, Progress};
 use crate::render::{Camera, Rendered, Shading, render};
 use crate::scene::{Policy, Scene};
-use crate::scene_file::{RawOptions, SceneOptions, load};
+use crate::scene_file::{self, Inputs, RawOptions, SceneOptions, load};
 use crate::volume::statistics::VolumeStatistics;
 use clap::{Parser, Subcommand};
 use glam::DVec3;
@@ -224,6 +224,19 @@ fn writable(path: &Path) -> Result<()> {
     crate::atomic::AtomicFile::create(path).map(drop)
 }
 
+/// Fails now if one of `outputs` could not be written later, is another of them, or would take the place of one of `inputs`.
+fn outputs<'p>(outputs: impl IntoIterator<Item = &'p Path>, inputs: &Inputs) -> Result<()> {
+    let outputs: Vec<&Path> = outputs.into_iter().collect();
+    for (n, output) in outputs.iter().enumerate() {
+        inputs.spare(output)?;
+        if outputs[..n].iter().any(|other| scene_file::same(other, output)) {
+            return Err(Error::invalid(output, "is to be two outputs at once; give each a name of its own"));
+        }
+        writable(output)?;
+    }
+    Ok(())
+}
+
 /// Makes an output folder, and fails now if nothing could be written there.
 fn folder(path: &Path) -> Result<()> {
     std::fs::create_dir_all(path).map_err(|e| Error::io(path, e))?;
@@ -278,7 +291,7 @@ fn first_isovalue(scene: &Scene, name: &str, isovalue: f64) -> Result<f64> {
 impl Render {
     fn run(self, progress: Progress) -> Result<()> {
         expect_extension(&self.output, &["png", "exr"])?;
-        writable(&self.output)?;
+        outputs([&*self.output], &Inputs::of(&self.file, &self.scene)?)?;
         let begun = Instant::now();
         if !(1..=16384).contains(&self.height) || self.width.is_some_and(|w| !(1..=16384).contains(&w)) {
             return Err(Error::Invalid("--height, --width: 1 to 16384 pixels".into()));

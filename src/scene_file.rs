@@ -2,11 +2,14 @@
 
 mod fault;
 mod frames;
+mod inputs;
 mod several;
 mod surface;
 
 pub use fault::fault;
 pub use frames::load_series;
+pub use inputs::Inputs;
+pub(crate) use inputs::same;
 pub use several::{PolicyName, VolumeEntry, Volumes};
 use surface::surface;
 pub use surface::{Albedo, BoundaryName, ColourStop, OutsideName, Rgb, SidesName, SurfaceOptions};

@@ -41,8 +41,9 @@ impl Series {
     /// # Errors
     /// `Io` if the folder cannot be read, else as [`Series::new`].
     pub fn find(pattern: &Path, times: Option<Vec<f64>>) -> Result<Option<Self>> {
-        let name = pattern.file_name().and_then(|n| n.to_str()).unwrap_or_default();
-        let Some((head, digits, tail)) = split(name).filter(|_| !pattern.exists()) else { return Ok(None) };
+        if !is_pattern(pattern) {
+            return Ok(None);
+        }
         let folder = match pattern.parent() {
             Some(folder) if folder != Path::new("") => folder,
             _ => Path::new("."),
@@ -51,10 +52,7 @@ impl Series {
         for entry in std::fs::read_dir(folder).map_err(|e| Error::io(folder, e))? {
             let entry = entry.map_err(|e| Error::io(folder, e))?;
             let file = entry.file_name();
-            let number = file.to_str().and_then(|f| f.strip_prefix(head)?.strip_suffix(tail));
-            if let Some(number) = number.filter(|n| n.len() >= digits && n.bytes().all(|b| b.is_ascii_digit()))
-                && let Ok(number) = number.parse()
-            {
+            if let Some(number) = number(pattern, Path::new(&file)) {
                 found.push((number, pattern.with_file_name(file)));
             }
         }
@@ -115,6 +113,19 @@ impl Series {
         let extension = path.extension().unwrap_or_default().to_string_lossy();
         path.with_file_name(format!("{stem}_{n:04}.{extension}"))
     }
+}
+
+/// Whether files stand for a path that is no file itself: its name holds `%d`.
+pub(crate) fn is_pattern(path: &Path) -> bool {
+    path.file_name().and_then(|name| name.to_str()).is_some_and(|name| split(name).is_some()) && !path.exists()
+}
+
+/// The number of a file whose name is as `pattern` says.
+pub(crate) fn number(pattern: &Path, file: &Path) -> Option<u64> {
+    let (head, digits, tail) = split(pattern.file_name()?.to_str()?)?;
+    let number = file.file_name()?.to_str()?.strip_prefix(head)?.strip_suffix(tail)?;
+    let number = Some(number).filter(|n| n.len() >= digits && n.bytes().all(|b| b.is_ascii_digit()))?;
+    number.parse().ok()
 }
 
 /// What stands before `%d`, the least number of digits, and what stands behind.

@@ -306,6 +306,43 @@ fn a_second_bake_never_harms_the_first_unless_it_finishes() {
     assert!(VtiFile::read(&dir.join("keep.vti")).is_ok());
 }
 
+/// Whatever a verb reads is as it was, and nothing is written twice.
+#[test]
+fn no_output_takes_the_place_of_an_input() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
+    let mut bake = vec!["bake", "b.vti", "-o", "lit.vti", "--isovalues", "3.6", "95", "-q"];
+    bake.extend(QUICK);
+    ok(dir, &bake);
+    let reference = ["--isovalue", "47", "--samples", "2", "--batches", "2", "-q"];
+    ok(dir, &[&["reference", "b.vti", "--isovalues", "3.6", "95", "-o", "r.ply"], &reference[..]].concat());
+    fs::create_dir(dir.join("series")).unwrap();
+    for n in 0..3 {
+        fs::copy(dir.join("b.vti"), dir.join(format!("series/rho_{n:04}.vti"))).unwrap();
+    }
+    fs::write(dir.join("room.obj"), "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").unwrap();
+    let scene = "isovalues = [3.6, 95]\n[volume]\nfile = \"b.vti\"\n[[context]]\nfile = \"room.obj\"\n";
+    fs::write(dir.join("scene.toml"), scene).unwrap();
+    let all = || {
+        let files =
+            ["b.vti", "lit.vti", "r.ply", "room.obj", "scene.toml", "series/rho_0000.vti", "series/rho_0002.vti"];
+        files.map(|name| fs::read(dir.join(name)).unwrap())
+    };
+    let before = all();
+    let taken = |args: &[&str], words: &[&str]| refused(dir, args, words);
+    taken(&["bake", "b.vti", "-o", "b.vti"], &["b.vti", "is an input"]);
+    taken(&["bake", "scene.toml", "-o", "./b.vti"], &["b.vti", "is an input"]);
+    taken(&["bake", "b.vti", "-o", "new.vti", "--report", "b.vti"], &["b.vti", "is an input"]);
+    taken(&["bake", "b.vti", "-o", "new.vti", "--report", "new.vti"], &["new.vti", "two outputs"]);
+    taken(&["bake", "b.vti", "-o", "new.vti", "--checkpoint", "new.vti"], &["new.vti", "two outputs"]);
+    taken(&["bake", "series/rho_%04d.vti", "-o", "series/rho.vti"], &["rho_%04d.vti", "would be a frame"]);
+    taken(&["compare", "lit.vti", "r.ply", "-o", "r.ply"], &["r.ply", "is an input"]);
+    taken(&["export", "lit.vti", "-o", "lit.vti"], &["lit.vti", "is an input"]);
+    taken(&["extract", "scene.toml", "--isovalue", "47", "-o", "room.obj"], &["room.obj", "is an input"]);
+    assert!(all() == before && !dir.join("new.vti").exists());
+}
+
 #[test]
 fn the_same_bits_for_any_number_of_threads() {
     let dir = tempfile::tempdir().unwrap();

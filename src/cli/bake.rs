@@ -1,6 +1,6 @@
 //! `isolume bake`: from a volume or scene to the file that holds it with its light.
 
-use super::{device, expect_extension, writable};
+use super::{device, expect_extension, outputs};
 use crate::bake::{
     BakeOptions, BakeReport, BakeSettings, Engine, MemoryEstimate, TimeEstimate, bake_fields, digest, job, supported,
 };
@@ -11,12 +11,12 @@ use crate::field::Sweep;
 use crate::isa::Isa;
 use crate::progress::Progress;
 use crate::scene::{Policy, Scene};
-use crate::scene_file::{SceneOptions, load, load_series};
+use crate::scene_file::{Inputs, SceneOptions, load, load_series};
 use crate::series::{Series, write_collection};
 use crate::volume::Volume;
 use glam::DVec3;
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 #[derive(clap::Args, Clone, Debug)]
@@ -78,34 +78,44 @@ impl Bake {
             ));
         }
         expect_extension(&self.output, &["vti", "vtm"])?;
-        writable(&self.output)?;
-        if let Some(report) = &self.report {
-            writable(report)?;
-        }
+        let inputs = Inputs::of(&self.input, &self.scene)?;
         let series = if self.scene.time.is_none() { load_series(&self.input, &self.scene)? } else { None };
-        match series {
-            Some(series) => self.frames(&series, progress),
-            None => self.one(begun, progress).map(drop),
+        let Some(series) = series else {
+            outputs(self.outputs(), &inputs)?;
+            return self.one(begun, progress).map(drop);
+        };
+        let frames: Vec<Self> = (0..series.times().len()).map(|n| self.frame(n)).collect();
+        let collection = self.output.with_extension("pvd");
+        outputs(frames.iter().flat_map(Self::outputs).chain([&*collection]), &inputs)?;
+        self.frames(&series, frames, progress)
+    }
+
+    /// What it writes: with several volumes, their collection only.
+    fn outputs(&self) -> impl Iterator<Item = &Path> {
+        [Some(&self.output), self.report.as_ref(), self.checkpoint.as_ref()].into_iter().flatten().map(PathBuf::as_path)
+    }
+
+    /// The bake of frame `n` of a series.
+    fn frame(&self, n: usize) -> Self {
+        let numbered = |path: &PathBuf| Series::numbered(path, n);
+        Self {
+            output: numbered(&self.output),
+            report: self.report.as_ref().map(numbered),
+            checkpoint: self.checkpoint.as_ref().map(numbered),
+            ..self.clone()
         }
     }
 
     /// Every frame of a series, with the same sweep and seed, and the collection of those that are done.
-    fn frames(&self, series: &Series, progress: Progress) -> Result<()> {
+    fn frames(&self, series: &Series, frames: Vec<Self>, progress: Progress) -> Result<()> {
         let mut scene = self.scene.clone();
         let mut done = Vec::new();
-        for (n, &time) in series.times().iter().enumerate() {
+        for (n, (&time, frame)) in series.times().iter().zip(frames).enumerate() {
             if progress == Progress::Shown {
                 eprintln!("{:>14}  {} of {}, time {time}", "frame", n + 1, series.times().len());
             }
             scene.time = Some(time);
-            let numbered = |path: &PathBuf| Series::numbered(path, n);
-            let frame = Self {
-                output: numbered(&self.output),
-                report: self.report.as_ref().map(numbered),
-                checkpoint: self.checkpoint.as_ref().map(numbered),
-                scene: scene.clone(),
-                ..self.clone()
-            };
+            let frame = Self { scene: scene.clone(), ..frame };
             let sweep = frame.one(Instant::now(), progress)?;
             scene.isovalues = Some(vec![sweep.lo(), sweep.hi()]);
             if self.dry_run {

@@ -1,11 +1,12 @@
 //! `isolume compare`: a bake against one or two references of an isosurface.
 
-use super::{expect_extension, writable};
+use super::{expect_extension, outputs};
 use crate::accuracy::{Accuracy, ReferenceMesh, compare};
 use crate::error::Result;
 use crate::export::bake_file::BakedVolume;
 use crate::export::{Mesh, ply};
 use crate::progress::Progress;
+use crate::scene_file::Inputs;
 use crate::surface_mesh::texture;
 use std::path::PathBuf;
 
@@ -36,7 +37,7 @@ impl Compare {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
         if let Some(output) = &self.output {
             expect_extension(output, &["ply"])?;
-            writable(output)?;
+            outputs([&**output], &Inputs::files(self.references.iter().chain([&self.bake]).map(PathBuf::as_path)))?;
         }
         let references = self
             .references

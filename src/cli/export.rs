@@ -1,10 +1,10 @@
 //! `isolume export`: one array of a bake, or a volume, in another format.
 
-use super::{expect_extension, writable};
+use super::{expect_extension, outputs};
 use crate::error::{Error, Result};
 use crate::export::{bake_file, slices};
 use crate::progress::Progress;
-use crate::scene_file::RawOptions;
+use crate::scene_file::{Inputs, RawOptions};
 use crate::volume::vti::{VtiFile, VtiWriter};
 use crate::volume::{Lattice, Samples, Space, Volume, npy, nrrd};
 use std::path::{Path, PathBuf};
@@ -47,7 +47,7 @@ struct Array {
 impl Export {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
         expect_extension(&self.output, &["nrrd", "npy", "exr", "vti"])?;
-        writable(&self.output)?;
+        outputs([&*self.output], &Inputs::files([&*self.input]))?;
         let space = self.space.as_ref().map(|name| {
             let unknown = || Error::Invalid(format!("--space {name}: give lps, ras or las"));
             Space::from_name(name).ok_or_else(unknown)

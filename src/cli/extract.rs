@@ -1,12 +1,12 @@
 //! `isolume extract`: one isosurface as a mesh, with a bake's light on its vertices.
 
-use super::{expect_extension, writable};
+use super::{expect_extension, outputs};
 use crate::error::Result;
 use crate::export::Mesh;
 use crate::export::bake_file::BakedVolume;
 use crate::progress::Progress;
 use crate::scene::Scene;
-use crate::scene_file::{SceneOptions, load};
+use crate::scene_file::{Inputs, SceneOptions, load};
 use crate::surface_mesh::{SurfaceMesh, channel, display_colours, texture};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -45,7 +45,7 @@ pub(super) struct Extract {
 impl Extract {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
         expect_extension(&self.output, &["ply", "obj", "glb", "vtp"])?;
-        writable(&self.output)?;
+        outputs([&*self.output], &Inputs::of(&self.input, &self.scene)?)?;
         let begun = Instant::now();
         let (scene, baked) = open_scene(&self.input, &self.scene, self.field.as_deref())?;
         let mesh = SurfaceMesh::extract(&scene, scene.field.sweep().isovalue(self.isovalue), self.refine)?;

@@ -1,7 +1,7 @@
 //! `isolume reference`: one isosurface illuminated in ordinary 3D, per vertex with variance, or as a picture.
 
 use super::extract::open_scene;
-use super::{device, expect_extension, writable};
+use super::{device, expect_extension, outputs};
 use crate::embree::{Device, GraphTracer, SurfaceTracer};
 use crate::error::{Error, Result};
 use crate::export::picture::Picture;
@@ -9,7 +9,7 @@ use crate::progress::Progress;
 use crate::reference::{Integrator, Reference, ReferenceSettings, SurfaceMapSettings, path_picture, reference};
 use crate::render::Camera;
 use crate::scene::Scene;
-use crate::scene_file::SceneOptions;
+use crate::scene_file::{Inputs, SceneOptions};
 use crate::surface_mesh::{SurfaceMesh, unit_isovalue};
 use std::path::PathBuf;
 use std::time::Instant;
@@ -73,7 +73,7 @@ pub(super) struct ReferenceArgs {
 impl ReferenceArgs {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
         expect_extension(&self.output, &["ply"])?;
-        writable(&self.output)?;
+        outputs([&*self.output], &Inputs::of(&self.input, &self.scene)?)?;
         if !(1..=1 << 20).contains(&self.samples) || !(2..=1024).contains(&self.batches) {
             return Err(Error::Invalid("--samples: 1 to 1048576; --batches: 2 to 1024".into()));
         }

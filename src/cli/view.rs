@@ -1,9 +1,10 @@
 //! `isolume view`: a bake as a page for any browser.
 
-use super::{expect_extension, writable};
+use super::{expect_extension, outputs};
 use crate::error::Result;
 use crate::export::bake_file::BakedVolume;
 use crate::progress::Progress;
+use crate::scene_file::Inputs;
 use crate::view;
 use std::path::PathBuf;
 
@@ -30,7 +31,7 @@ pub(super) struct View {
 impl View {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
         expect_extension(&self.output, &["html", "htm"])?;
-        writable(&self.output)?;
+        outputs([&*self.output], &Inputs::files([&*self.file]))?;
         let baked = BakedVolume::read(&self.file)?;
         if view::leaves_out(&baked.scene) && progress == Progress::Shown {
             eprintln!(
