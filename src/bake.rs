@@ -85,7 +85,7 @@ pub struct BakeReport {
     pub filled: u64,
     /// Gather rays that landed where the cache held nothing: those of points just outside the sweep, far off what is in it.
     pub misses: u64,
-    /// Radiance values that were not finite, set to 0 and masked.
+    /// Grid points whose radiance or standard error was not finite, set to 0 and masked.
     pub non_finite: u64,
     /// Samples of the volume that are not finite.
     pub non_finite_voxels: u64,
@@ -268,12 +268,7 @@ fn finish(
                     .into(),
             ));
         }
-        let mut non_finite = 0;
-        for (_, grid) in &mut sides {
-            let points = grid.radiance.par_iter_mut().zip(&mut grid.mask);
-            let bad = points.filter(|(rgb, _)| !rgb.iter().all(|x| x.is_finite()));
-            non_finite += bad.map(|(rgb, mask)| (*rgb, *mask) = ([0.0; 3], Mask::Empty)).count() as u64;
-        }
+        let non_finite = sides.iter_mut().map(|(_, grid)| grid.clear_non_finite()).sum::<u64>();
         let count = |m: Mask| sides[0].1.mask.par_iter().filter(|&&x| x == m).count() as u64;
         let (empty, filled) = (count(Mask::Empty), count(Mask::Filled));
         let report = BakeReport {

@@ -107,6 +107,13 @@ impl IlluminationGrid {
         }
         if weight > 0.0 { sum / weight } else { DVec3::ZERO }
     }
+
+    /// Empties points whose radiance or standard error is not finite, and counts them.
+    pub(crate) fn clear_non_finite(&mut self) -> u64 {
+        let points = self.radiance.par_iter_mut().zip(&mut self.std_error).zip(&mut self.mask);
+        let bad = points.filter(|((rgb, e), _)| !(e.is_finite() && rgb.iter().all(|x| x.is_finite())));
+        bad.map(|((rgb, e), mask)| (*rgb, *e, *mask) = ([0.0; 3], 0.0, Mask::Empty)).count() as u64
+    }
 }
 
 /// Modified Shepard interpolation: the `neighbours` nearest samples, weighted ((R − d)/(R d))² with R the distance of
@@ -195,6 +202,21 @@ mod tests {
         let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[0] as f32).collect();
         let volume = Volume::new("x", lattice, Samples::F32(samples)).unwrap();
         Field::new(&volume, Sweep::new(0.0, 8.0).unwrap()).unwrap()
+    }
+
+    #[test]
+    fn what_is_not_finite_is_emptied_and_counted() {
+        let light = [[0.5, 1.0, 2.0], [0.5, f32::NAN, 2.0], [3.0; 3], [4.0; 3], [f32::INFINITY, 0.0, 0.0]];
+        let mut grid = IlluminationGrid {
+            radiance: light.to_vec(),
+            std_error: vec![0.1, 0.2, f32::NAN, f32::INFINITY, f32::NAN],
+            mask: vec![Mask::Valid, Mask::Valid, Mask::Valid, Mask::Filled, Mask::Empty],
+        };
+        assert_eq!(grid.clear_non_finite(), 4);
+        assert_eq!((grid.radiance[0], grid.std_error[0], grid.mask[0]), (light[0], 0.1, Mask::Valid));
+        for o in 1..5 {
+            assert_eq!((grid.radiance[o], grid.std_error[o], grid.mask[o]), ([0.0; 3], 0.0, Mask::Empty), "point {o}");
+        }
     }
 
     #[test]

@@ -6,6 +6,7 @@ use isolume::direct::Receiver;
 use isolume::embree::{Device, GraphTracer};
 use isolume::field::{Field, Sweep};
 use isolume::flattened::{Departure, Side};
+use isolume::mask::Mask;
 use isolume::progress::Progress;
 use isolume::reference::{PathTracer, receiver};
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
@@ -14,10 +15,15 @@ use rayon::prelude::*;
 
 /// Curved matter all over the default box, the luminaire 0.04 voxels below its ceiling in it.
 fn waves() -> Scene {
+    waves_but(|_, value| value)
+}
+
+/// The same with other samples where `changed` says so.
+fn waves_but(changed: impl Fn([usize; 3], f64) -> f64) -> Scene {
     let lattice = Lattice::aligned([41; 3], DVec3::ZERO, DVec3::splat(1.0 / 40.0)).unwrap();
     let samples = (0..lattice.len()).map(|o| {
         let x = 0.5 * lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|x| x as f64)));
-        (17.0 * x.x + 3.0 * x.y).sin() * (13.0 * x.y - 5.0 * x.z).cos() + (11.0 * x.z).sin()
+        changed(lattice.ijk(o), (17.0 * x.x + 3.0 * x.y).sin() * (13.0 * x.y - 5.0 * x.z).cos() + (11.0 * x.z).sin())
     });
     let volume = Volume::new("waves", lattice.clone(), Samples::F64(samples.collect())).unwrap();
     let field = Field::new(&volume, Sweep::new(-2.0, 2.0).unwrap()).unwrap();
@@ -174,5 +180,26 @@ fn it_is_dark_behind_a_luminaire() {
         let baked = bake(&scene, &settings, &Device::new(0).unwrap(), Progress::Quiet).unwrap();
         let lit: Vec<f32> = points.iter().map(|&o| baked.sides[0].1.radiance[o][1]).collect();
         assert!(lit.len() > 50 && lit.iter().all(|x| *x <= most), "{engine:?}: {lit:?}");
+    }
+}
+
+/// Where a sample that is not finite hides at which isovalue a point meets its wall, the point keeps the light that it had.
+#[test]
+fn contacts_beside_a_hole_keep_their_light() {
+    let hole = [1, 20, 32];
+    let whole = waves();
+    let broken = waves_but(|ijk, value| if ijk == hole { f64::NAN } else { value });
+    let [expected, found] = [&whole, &broken].map(|scene| baked(scene, Engine::Sweep));
+    assert_eq!((found.report.non_finite, found.report.non_finite_voxels), (0, 1));
+    let (expected, found) = (&expected.sides[0].1, &found.sides[0].1);
+    assert!(found.std_error.iter().all(|e| e.is_finite()));
+    assert!(found.radiance.iter().flatten().all(|x| x.is_finite()));
+    // Cells of the face that touch the hole and begin at these points.
+    for (j, k) in [(19, 31), (20, 31), (19, 32), (20, 32)] {
+        let o = whole.lattice().offset(0, j, k);
+        assert_eq!((found.mask[o], expected.mask[o]), (Mask::Valid, Mask::Valid), "(0, {j}, {k})");
+        let [found, expected] = [found, expected].map(|grid| grid.radiance[o].iter().sum::<f32>());
+        println!("(0, {j}, {k}): {found} beside a hole, {expected} without");
+        assert!(found > 0.1 * expected && expected > 0.0, "(0, {j}, {k}): {found}, {expected}");
     }
 }
