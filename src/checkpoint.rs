@@ -44,6 +44,8 @@ struct State {
     waiting_bytes: usize,
     /// The file, once it holds anything of this job.
     log: Option<Log>,
+    /// Whether the file holds what another run left.
+    resumed: bool,
     due: Instant,
     warned: bool,
 }
@@ -119,7 +121,7 @@ impl Checkpoint {
             }
         }
         let due = Instant::now() + every;
-        let state = State { waiting: BTreeMap::new(), waiting_bytes: 0, log: None, due, warned: false };
+        let state = State { waiting: BTreeMap::new(), waiting_bytes: 0, log: None, resumed: false, due, warned: false };
         Ok(Self { path: path.to_path_buf(), job, every, state: Mutex::new(state) })
     }
 
@@ -148,7 +150,7 @@ impl Checkpoint {
             ));
         }
         if let Ok(mut state) = self.state.lock() {
-            state.log = Some(log);
+            (state.log, state.resumed) = (Some(log), true);
         }
         Ok(true)
     }
@@ -225,7 +227,16 @@ impl Checkpoint {
 
     /// Deletes the file: the job is done.
     pub fn remove(&self) {
-        if self.state.lock().is_ok_and(|s| s.log.is_some()) {
+        self.remove_if(|_| true);
+    }
+
+    /// Deletes the file unless an earlier run began it: nothing of this run is worth going on with.
+    pub fn discard(&self) {
+        self.remove_if(|state| !state.resumed);
+    }
+
+    fn remove_if(&self, chosen: impl FnOnce(&State) -> bool) {
+        if self.state.lock().is_ok_and(|s| s.log.is_some() && chosen(&s)) {
             // It does no harm if it stays.
             let _ = std::fs::remove_file(&self.path);
         }

@@ -2,7 +2,10 @@
 
 #![cfg(target_os = "linux")]
 
+use isolume::bake::{BakeOptions, BakeSettings, Engine, Preset, job};
+use isolume::checkpoint::Checkpoint;
 use isolume::rng::{Rng, Stage};
+use isolume::scene_file::{SceneOptions, load};
 use isolume::volume::Samples;
 use isolume::volume::vti::VtiFile;
 use std::fs;
@@ -212,6 +215,49 @@ fn a_full_disk_is_one_clear_line_and_keeps_the_last_checkpoint() {
     let (output, text) = finish(bake(dir, "whole.vti", &[]));
     assert!(output.status.success(), "{text}");
     assert!(light(&dir.join("out.vti")) == light(&dir.join("whole.vti")));
+}
+
+/// A bake that no resuming can help: no grid point holds anything of its sweep.
+fn hopeless(dir: &Path, more: &[&str]) -> String {
+    let mut command = Command::new(PROGRAM);
+    command.current_dir(dir).args(["bake", "b.vti", "-o", "out.vti", "--isovalues", "50", "50.00001"]);
+    command.args(["--engine", "sweep", "--preset", "preview"]).args(more);
+    let (output, text) = finish(command.stderr(Stdio::piped()).spawn().unwrap());
+    assert_eq!(output.status.code(), Some(2), "{text}");
+    assert!(text.contains("no grid point lies on"), "{text}");
+    text
+}
+
+#[test]
+fn what_can_never_succeed_leaves_no_checkpoint_and_spares_older_ones() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    volume(dir, "17");
+    let checkpoint = dir.join("out.vti.checkpoint");
+    // One that waits for its minute, one that is written as the work goes on.
+    for every in ["60", "0"] {
+        let text = hopeless(dir, &["--checkpoint-every", every]);
+        assert!(!text.contains("--resume") && !checkpoint.exists(), "{text}");
+    }
+    // Another bake's.
+    let older = b"isolume checkpoint 8\nof another bake";
+    fs::write(&checkpoint, older).unwrap();
+    let text = hopeless(dir, &[]);
+    assert_eq!(fs::read(&checkpoint).unwrap(), older, "{text}");
+    fs::remove_file(&checkpoint).unwrap();
+    // Its own, of an interrupted run, however much this one adds.
+    let scene = SceneOptions { isovalues: Some(vec![50.0, 50.00001]), ..SceneOptions::default() };
+    let scene = load(&dir.join("b.vti"), &scene).unwrap().scene;
+    let options = BakeOptions { engine: Some(Engine::Sweep), preset: Some(Preset::Preview), ..BakeOptions::default() };
+    let job = job(&scene, &BakeSettings::new(&options, &scene).unwrap());
+    let interrupted = Checkpoint::new(&checkpoint, job, Duration::ZERO).unwrap();
+    interrupted.stage(99).save(0, || vec![7; 100]);
+    for every in ["60", "0"] {
+        let text = hopeless(dir, &["--resume", "--checkpoint-every", every]);
+        assert!(text.contains("1 finished blocks") || every == "0", "{text}");
+        assert!(checkpoint.exists(), "{text}");
+    }
+    assert!(interrupted.resume().unwrap(), "whole");
 }
 
 #[test]

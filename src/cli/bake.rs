@@ -228,7 +228,7 @@ impl Bake {
             bake_file::write_fields(&self.output, &loaded.scene, &volumes, &bakes)?;
             Ok((bakes, export))
         };
-        let (bakes, export) = work().inspect_err(|_| keep(&checkpoint))?;
+        let (bakes, export) = work().inspect_err(|e| keep(&checkpoint, e))?;
         checkpoint.remove();
         let mut reports: Vec<BakeReport> = bakes.into_iter().map(|b| b.report).collect();
         for report in &mut reports {
@@ -312,8 +312,12 @@ impl Bake {
     }
 }
 
-/// Saves what is finished and says so.
-fn keep(checkpoint: &Checkpoint) {
+/// Saves what is finished and says so, unless the same command would fail with the same `error` again.
+fn keep(checkpoint: &Checkpoint, error: &Error) {
+    // Files could be read and written before the work: if they no longer can, that may pass.
+    if matches!(error, Error::Invalid(_) | Error::NotSupported(_)) {
+        return checkpoint.discard();
+    }
     match checkpoint.save() {
         Ok(true) => {
             eprintln!("progress is kept in {}; the same command with --resume goes on", checkpoint.path().display())
