@@ -357,3 +357,35 @@ fn the_memory_estimate_is_near_the_peak() {
     }
     assert!(!dir.join("x.vti").exists(), "a dry run writes nothing");
 }
+
+/// When neither engine fits, the one that needs less says so, with what helps it; the limit stands as it is given.
+#[test]
+fn too_little_memory_is_told_for_the_engine_that_needs_less() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    volume(dir, "20");
+    let dry = |most: &str, more: &[&str]| {
+        let mut command = Command::new(PROGRAM);
+        command.current_dir(dir).args(["bake", "b.vti", "-o", "x.vti", "--isovalues", "3.6", "95"]);
+        command.args(["--preset", "preview", "--dry-run", "--max-memory", most]).args(more);
+        let (output, text) = finish(command.stderr(Stdio::piped()).spawn().unwrap());
+        (output.status.code(), text)
+    };
+    let (code, text) = dry("30M", &[]);
+    assert_eq!(code, Some(2), "{text}");
+    let message = text.lines().find(|l| l.contains("--max-memory")).unwrap_or_else(|| panic!("no word of it: {text}"));
+    assert!(message.contains("--max-memory 30M: ") && message.contains("(sweep "), "{message}");
+    assert!(!message.contains("photons") && message.contains("--grid"), "{message}");
+    let needed: f64 = message.split("about ").nth(1).unwrap().split(' ').next().unwrap().parse().unwrap();
+    let (code, text) = dry(&format!("{}", (needed + 1.0) * 1e6), &[]);
+    assert!(code == Some(0) && text.contains("sweep: every isovalue"), "what it asked for is enough: {text}");
+    let (code, text) = dry("30M", &["--engine", "photon"]);
+    assert!(code == Some(2) && text.contains("--max-memory 30M: ") && text.contains("lower --photons"), "{text}");
+    // As it would be read again.
+    for (given, printed) in
+        [("1000", "1000"), ("1024", "1K"), ("1.5k", "1.5K"), ("2560KiB", "2.5M"), ("20000000", "20000000")]
+    {
+        let (code, text) = dry(given, &["--engine", "sweep"]);
+        assert!(code == Some(2) && text.contains(&format!("--max-memory {printed}: ")), "{given}: {text}");
+    }
+}

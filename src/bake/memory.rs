@@ -93,10 +93,10 @@ impl MemoryEstimate {
     }
 
     /// The least number of bands whose estimate is at most `most` bytes, and that estimate; as many bands as `settings` ask
-    /// for at least.
+    /// for at least. If none fits, the least estimate there is.
     ///
     /// # Errors
-    /// `Invalid` with the least estimate there is if none fits; as [`MemoryEstimate::new`].
+    /// As [`MemoryEstimate::new`].
     pub fn within(
         most: u64,
         scene: &Scene,
@@ -120,7 +120,7 @@ impl MemoryEstimate {
                 (bands, least) = (count, estimate);
             }
         }
-        least.check(most, bands).map(|()| (bands, least))
+        Ok((bands, least))
     }
 
     /// The largest stage.
@@ -128,15 +128,22 @@ impl MemoryEstimate {
         self.stages.iter().map(|s| s.1).max().unwrap_or(0)
     }
 
-    /// Refuses a bake that needs more than `most` bytes.
-    fn check(&self, most: u64, bands: usize) -> Result<()> {
+    /// Refuses a bake by `engine` in so many bands that needs more than `most` bytes.
+    ///
+    /// # Errors
+    /// `Invalid` with the estimate and what would lower it.
+    pub fn check(&self, most: u64, engine: Engine, bands: usize) -> Result<()> {
         if self.peak() <= most {
             return Ok(());
         }
         let cut = if bands > 1 { format!(", cut into {bands} bands,") } else { String::new() };
+        let remedy = match engine {
+            Engine::Photon => "lower --photons or --grid",
+            Engine::Sweep => "lower --grid or --wall-resolution",
+        };
         Err(Error::Invalid(format!(
-            "--max-memory {}: the bake{cut} is estimated at {self}; lower --photons or --grid, or allow more",
-            size(most)
+            "--max-memory {}: the bake{cut} is estimated at {self}; {remedy}, or allow more",
+            limit(most)
         )))
     }
 }
@@ -321,6 +328,16 @@ fn landings(scene: &Scene, settings: &BakeSettings, device: &Device) -> Result<[
     let each = settings.photons as f64 / pilots.emitted.max(1) as f64;
     let of = |side: Side| pilots.surface.iter().filter(|p| p.side == side && p.bounces > 0).count() as f64 * each;
     Ok([pilots.stored() as f64 * each, of(Side::Lower), of(Side::Higher)])
+}
+
+/// Bytes as --max-memory reads them: in its largest unit of which they are a short number without a remainder.
+fn limit(bytes: u64) -> String {
+    let tenths = 10 * u128::from(bytes);
+    let in_unit = |(shift, unit): (u32, &str)| {
+        let short = (10..100_000).contains(&(tenths >> shift)) && tenths.trailing_zeros() >= shift;
+        short.then(|| format!("{}{unit}", (tenths >> shift) as f64 / 10.0))
+    };
+    [(40, "T"), (30, "G"), (20, "M"), (10, "K")].into_iter().find_map(in_unit).unwrap_or_else(|| bytes.to_string())
 }
 
 /// Bytes for people.

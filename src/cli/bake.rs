@@ -186,12 +186,16 @@ impl Bake {
         let memory = match self.max_memory {
             Some(most) => {
                 let fit = |s: &BakeSettings| MemoryEstimate::within(most, &loaded.scene, &volumes, s, &device);
-                let mut fitted = fit(&settings);
-                if fitted.is_err() && settings.engine == Engine::Sweep && options.leaves_engine() {
-                    settings = BakeSettings::with_engine(&options, Engine::Photon)?;
-                    fitted = fit(&settings);
+                let (mut bands, mut estimate) = fit(&settings)?;
+                if estimate.peak() > most && settings.engine == Engine::Sweep && options.leaves_engine() {
+                    let photon = BakeSettings::with_engine(&options, Engine::Photon)?;
+                    let fitted = fit(&photon)?;
+                    // If neither fits, the one that needs less is worth hearing of.
+                    if fitted.1.peak() < estimate.peak() {
+                        (settings, (bands, estimate)) = (photon, fitted);
+                    }
                 }
-                let (bands, estimate) = fitted?;
+                estimate.check(most, settings.engine, bands)?;
                 settings.bands = bands;
                 estimate
             }
