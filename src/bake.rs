@@ -205,12 +205,8 @@ pub fn bake_fields(
         let named = |e: Error| if scene.name.is_empty() { e } else { e.in_file(format!("volume '{}'", scene.name)) };
         let lattice = settings.grid.lattice(scene.lattice()).map_err(named)?;
         let masks = masks(&scene.field, &lattice);
-        if masks.iter().all(|&m| m == Mask::Empty) {
-            return Err(named(Error::Invalid(
-                "no isosurface of the sweep has a gradient anywhere: the volume is constant there; choose other \
-                 isovalues"
-                    .into(),
-            )));
+        if nothing_in(&masks) {
+            return Err(named(Error::Invalid(nothing_found(&scene, &lattice))));
         }
         Ok(Job { number, scene, lattice, masks })
     };
@@ -228,6 +224,25 @@ pub fn bake_fields(
         bakes.extend(finish(group, lit, scene.exposure(), &digest, settings, device)?);
     }
     Ok(bakes)
+}
+
+fn nothing_in(masks: &[Mask]) -> bool {
+    masks.iter().all(|&m| m == Mask::Empty)
+}
+
+/// Why no point of a grid's lattice holds anything.
+fn nothing_found(scene: &Scene, grid: &Lattice) -> String {
+    // Finer lattices hold the volume's own points, or some within each of its cells.
+    if grid == scene.lattice() || nothing_in(&masks(&scene.field, scene.lattice())) {
+        return "no isosurface of the sweep has a gradient anywhere: the volume is constant there; choose other \
+                isovalues"
+            .into();
+    }
+    let [nx, ny, nz] = grid.dims();
+    format!(
+        "no isosurface of the sweep passes near a point of the grid: {nx}×{ny}×{nz} is too coarse for this volume; \
+         refine --grid"
+    )
 }
 
 /// Whether the engine can light the scene.
@@ -261,7 +276,7 @@ fn finish(
     let s = lit.seconds;
     let fields = std::mem::take(&mut lit.fields);
     let bake = |(job, mut sides): (&Job, Vec<(Side, IlluminationGrid)>)| {
-        if sides.iter().all(|(_, grid)| grid.mask.iter().all(|&m| m == Mask::Empty)) {
+        if sides.iter().all(|(_, grid)| nothing_in(&grid.mask)) {
             return Err(Error::Invalid(
                 "no grid point lies on or beside an isosurface of the sweep: its values are too close together for this \
                  volume; widen --isovalues, or refine --grid"

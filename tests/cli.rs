@@ -201,6 +201,26 @@ fn bad_input_is_one_clear_line_and_leaves_nothing() {
     refused(dir, &["bake", "s.toml", "-o", "out.vti"], &["s.toml:5", "albdo", "albedo"]);
 }
 
+/// The surfaces are there, but between the grid's points; a volume without any is another matter.
+#[test]
+fn a_grid_that_is_too_coarse_is_told_from_a_constant_volume() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "20", "-o", "b.nrrd", "-q"]);
+    for engine in ["sweep", "photon"] {
+        let bake = ["bake", "b.nrrd", "--isovalues", "3.6", "95", "-o", "out.vti", "-q", "--engine", engine];
+        refused(dir, &[&bake[..], &["--grid", "2,2,2"]].concat(), &["too coarse", "--grid", "2×2×2"]);
+    }
+    // 0 and 10, and what is not finite between them.
+    let lattice = Lattice::aligned([8; 3], glam::DVec3::ZERO, glam::DVec3::ONE).unwrap();
+    let halves = (0..512).map(|o| [0.0, 0.0, 0.0, f32::NAN, f32::NAN, 10.0, 10.0, 10.0][o % 8]).collect();
+    Volume::new("halves", lattice, Samples::F32(halves)).unwrap().write(dir.join("h.nrrd")).unwrap();
+    for grid in ["1x", "2x"] {
+        let bake = ["bake", "h.nrrd", "--isovalues", "3", "4", "-o", "out.vti", "-q", "--grid", grid];
+        refused(dir, &bake, &["constant", "other isovalues"]);
+    }
+}
+
 /// Sweeps, unless the scene, an option or the user asks for photons; options of both need a word.
 #[test]
 fn scene_and_options_choose_the_engine() {
