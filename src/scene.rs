@@ -3,6 +3,7 @@
 
 mod companion;
 mod cover;
+mod mtl;
 mod obj;
 
 pub use companion::{Companion, Member, Policy};

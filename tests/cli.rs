@@ -221,6 +221,43 @@ fn a_grid_that_is_too_coarse_is_told_from_a_constant_volume() {
     }
 }
 
+/// MTL: one number is grey; what tobj would panic at is refused with its line.
+#[test]
+fn colours_of_an_mtl_are_one_number_or_three() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.nrrd", "-q"]);
+    fs::write(dir.join("w.obj"), "mtllib w.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl w\nf 1 2 3\n").unwrap();
+    fs::write(
+        dir.join("s.toml"),
+        "[volume]\nfile = \"b.nrrd\"\n[box]\nkind = \"none\"\n[[context]]\nfile = \"w.obj\"\n",
+    )
+    .unwrap();
+    let bake = ["bake", "b.nrrd", "--isovalues", "3.6", "95", "-o", "out.vti", "-q", "--dry-run", "--box", "w.obj"];
+    let context = ["bake", "s.toml", "-o", "out.vti", "-q", "--dry-run"];
+    for lines in
+        ["Kd 0.7", "Ks 0", "Ka 0.2", "Tf 1", "Ke 2", "Kd 0.7\nKs 0\nKa 0.2\nTf 1\nKe 2", "Kd 0.1 0.2 0.3 # and more"]
+    {
+        fs::write(dir.join("w.mtl"), format!("newmtl w\n{lines}\n")).unwrap();
+        ok(dir, &bake);
+        ok(dir, &context);
+    }
+    for (line, found) in [
+        ("Kd 0.7 0.7", "Kd 0.7 0.7"),
+        ("Ks", "Ks"),
+        ("Ka red", "Ka red"),
+        ("Ke 1 2 x", "Ke 1 2 x"),
+        ("Kd spectral red.rfl", "Kd spectral red.rfl"),
+        ("Kd # 1 1 1", "Kd # 1 1 1"),
+        ("Ns", "Ns"),
+        ("illum x", "illum x"),
+    ] {
+        fs::write(dir.join("w.mtl"), format!("newmtl w\n\n  {line}\n")).unwrap();
+        refused(dir, &bake, &["w.mtl:3: ", found]);
+        refused(dir, &context, &["s.toml", "w.mtl:3: ", found]);
+    }
+}
+
 /// Sweeps, unless the scene, an option or the user asks for photons; options of both need a word.
 #[test]
 fn scene_and_options_choose_the_engine() {

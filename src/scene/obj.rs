@@ -1,16 +1,20 @@
 //! Walls, luminaires and context geometry from a Wavefront OBJ with MTL, through tobj: Kd is the albedo, Ke the emission.
 
+use super::mtl;
 use crate::error::{Error, Result};
+use crate::files;
 use crate::polygon::Polygon;
 use glam::{DQuat, DVec3, EulerRot};
+use std::cell::RefCell;
+use std::io::BufReader;
 use std::path::Path;
 
 /// Reads all faces as polygons, in file order; vertices counter-clockwise from the visible side. A face without a
 /// material is white as the default box's walls.
 ///
 /// # Errors
-/// `Io` if the OBJ or its MTL cannot be read, `Invalid` for faces that are no planar convex polygons; messages name
-/// the file and the face.
+/// `Io` if the OBJ or its MTL cannot be read, `Invalid` for faces that are no planar convex polygons and for malformed lines of the
+/// MTL; messages name the file and the face or line.
 pub fn read_obj(path: &Path) -> Result<Vec<Polygon>> {
     let mut polygons = Vec::new();
     for face in faces(path)? {
@@ -46,8 +50,8 @@ impl Default for Placement {
 /// triangles; those without an area are left out.
 ///
 /// # Errors
-/// `Io` if the OBJ or its MTL cannot be read; `Invalid` if no face has an area, for coordinates that are not finite, and for
-/// an albedo or emission out of range.
+/// `Io` if the OBJ or its MTL cannot be read; `Invalid` if no face has an area, for coordinates that are not finite, for
+/// an albedo or emission out of range, and for malformed lines of the MTL.
 pub fn read_context(path: &Path, placement: &Placement) -> Result<Vec<Polygon>> {
     let Placement { scale, rotate, translate, .. } = *placement;
     let [x, y, z] = rotate.to_array().map(f64::to_radians);
@@ -96,10 +100,21 @@ struct Face {
 
 fn faces(path: &Path) -> Result<Vec<Face>> {
     let options = tobj::LoadOptions { single_index: false, triangulate: false, ..Default::default() };
-    if let Err(e) = std::fs::metadata(path) {
-        return Err(Error::io(path, e));
+    let folder = path.parent().unwrap_or(Path::new(""));
+    // tobj takes none of our errors.
+    let fault = RefCell::new(None);
+    let library = |name: &Path| match mtl::text(&folder.join(name)) {
+        Ok(text) => tobj::load_mtl_buf(&mut text.as_bytes()),
+        Err(e) => {
+            fault.borrow_mut().get_or_insert(e);
+            Err(tobj::LoadError::MaterialParseError)
+        }
+    };
+    let loaded = tobj::load_obj_buf(&mut BufReader::new(files::open(path)?), &options, library);
+    if let Some(e) = fault.into_inner() {
+        return Err(e);
     }
-    let (models, materials) = tobj::load_obj(path, &options).map_err(|e| Error::invalid(path, e))?;
+    let (models, materials) = loaded.map_err(|e| Error::invalid(path, e))?;
     let materials = materials.map_err(|e| Error::invalid(path, format!("its material library: {e}")))?;
     let mut faces = Vec::new();
     for model in &models {
