@@ -299,7 +299,7 @@ impl Render {
         if !(1..=1 << 16).contains(&self.samples) {
             return Err(Error::Invalid("--samples: 1 to 65536 rays per pixel".into()));
         }
-        let baked = match extract::open_bake(&self.file)? {
+        let baked = match extract::open_bake(&self.file, &self.scene)? {
             None if !self.reference && !self.local => Some(BakedVolume::read(&self.file)?),
             found => found,
         };

@@ -197,6 +197,29 @@ pub struct SceneOptions {
     pub raw: RawOptions,
 }
 
+impl SceneOptions {
+    /// Flags that speak of one volume, and whether they are given.
+    fn of_volume(&self) -> [(&'static str, bool); 8] {
+        let s = &self.surface;
+        [
+            ("--time", self.time.is_some()),
+            ("--isovalues", self.isovalues.is_some()),
+            ("--albedo", s.albedo.is_some()),
+            ("--emission", s.emission.is_some()),
+            ("--outside", s.outside.is_some()),
+            ("--sides", s.sides.is_some()),
+            ("--boundary", s.boundary.is_some()),
+            ("--raw-…", self.raw.given()),
+        ]
+    }
+
+    /// The first flag that is given, if any.
+    pub fn first_given(&self) -> Option<&'static str> {
+        let around = [("--box", self.surroundings.kind.is_some()), ("--margin", self.surroundings.margin.is_some())];
+        self.of_volume().into_iter().chain(around).find(|f| f.1).map(|f| f.0)
+    }
+}
+
 /// A scene ready to bake, and the volume it came from.
 pub struct Loaded {
     /// The volume in source units; of several, the first.

@@ -348,6 +348,51 @@ fn several_volumes_in_one_scene() {
     refused(dir, &["render", "two.vtm", "--isovalue", "50", "-o", "c.png"], &["two-b.vti"]);
 }
 
+/// What would change a bake's scene is refused where a bake is read: its light is that of the scene it holds.
+#[test]
+fn scene_flags_are_refused_where_the_input_is_a_bake() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
+    ok(dir, &[&["bake", "b.vti", "--isovalues", "30", "60", "-o", "lit.vti", "-q"], &QUICK[..]].concat());
+    let verbs: [&[&str]; 5] = [
+        &["reference", "--samples", "16", "--vertices", "5", "-o", "r.ply"],
+        &["extract", "-o", "m.ply"],
+        &["render", "-o", "p.png", "--height", "8", "--samples", "1"],
+        &["render", "-o", "p.png", "--height", "8", "--samples", "1", "--local"],
+        &["render", "-o", "p.png", "--height", "8", "--samples", "1", "--reference"],
+    ];
+    for verb in verbs {
+        let with = |extra: &[&'static str]| [verb, &["lit.vti", "-q"], extra].concat();
+        for flags in [
+            &["--isovalues", "49", "51"][..],
+            &["--time", "1"],
+            &["--albedo", "0"],
+            &["--emission", "1"],
+            &["--outside", "higher"],
+            &["--sides", "both"],
+            &["--boundary", "open"],
+            &["--box", "none"],
+            &["--margin", "0"],
+            &["--raw-skip", "0"],
+        ] {
+            let named = if flags[0].starts_with("--raw") { "--raw-…" } else { flags[0] };
+            let says = ["lit.vti", &format!("{named}: "), "the bake holds its scene"];
+            refused(dir, &with(&[flags, &["--isovalue", "50"]].concat()), &says);
+        }
+        // No light is no light of 0.
+        refused(dir, &with(&["--isovalue", "90"]), &["90", "outside the sweep", "30 … 60"]);
+        ok(dir, &with(&["--isovalue", "50"]));
+    }
+    refused(dir, &["extract", "lit.vti", "-o", "m.ply", "--isovalue", "90"], &["lit.vti", "isolume export", "value"]);
+    // The way that the message says, and a volume as it was.
+    ok(dir, &["export", "lit.vti", "--array", "value", "-o", "value.vti", "-q"]);
+    for volume in ["value.vti", "b.vti"] {
+        ok(dir, &["extract", volume, "-o", "m.ply", "--isovalue", "90", "--outside", "higher", "-q"]);
+    }
+    assert!(!text(&fs::read(dir.join("m.ply")).unwrap()).contains("radiance"));
+}
+
 #[test]
 fn a_second_bake_never_harms_the_first_unless_it_finishes() {
     let dir = tempfile::tempdir().unwrap();

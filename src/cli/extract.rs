@@ -1,13 +1,13 @@
 //! `isolume extract`: one isosurface as a mesh, with a bake's light on its vertices.
 
 use super::{expect_extension, outputs};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::export::Mesh;
 use crate::export::bake_file::BakedVolume;
 use crate::progress::Progress;
 use crate::scene::Scene;
 use crate::scene_file::{Inputs, SceneOptions, load};
-use crate::surface_mesh::{SurfaceMesh, channel, display_colours, texture};
+use crate::surface_mesh::{SurfaceMesh, channel, display_colours, texture, unit_isovalue};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -48,7 +48,12 @@ impl Extract {
         outputs([&*self.output], &Inputs::of(&self.input, &self.scene)?)?;
         let begun = Instant::now();
         let (scene, baked) = open_scene(&self.input, &self.scene, self.field.as_deref())?;
-        let mesh = SurfaceMesh::extract(&scene, scene.field.sweep().isovalue(self.isovalue), self.refine)?;
+        let isovalue = match &baked {
+            // There is light on isosurfaces of the sweep only.
+            Some(_) => unit_isovalue(&scene.field, self.isovalue).map_err(|e| self.without_light(&e))?,
+            None => scene.field.sweep().isovalue(self.isovalue),
+        };
+        let mesh = SurfaceMesh::extract(&scene, isovalue, self.refine)?;
         let radiance = baked.as_ref().map(|b| texture(b, &mesh.positions)).transpose()?;
         let channels: Option<[Vec<f32>; 3]> = radiance.as_ref().map(|r| [0, 1, 2].map(|c| channel(r, c)));
         let colours = radiance.as_ref().zip(baked.as_ref()).map(|(r, b)| display_colours(r, b.exposure));
@@ -78,15 +83,32 @@ impl Extract {
         }
         Ok(())
     }
+
+    /// The refusal of an isovalue that the bake has no light at.
+    fn without_light(&self, e: &Error) -> Error {
+        Error::invalid(
+            &self.input,
+            format!(
+                "{e}; for a mesh without light, `isolume export` its array `value` as a volume, and extract from that"
+            ),
+        )
+    }
 }
 
-/// The bake in a `.vti` or `.vtm`, if it is one.
-pub(super) fn open_bake(path: &Path) -> Result<Option<BakedVolume>> {
+/// The bake in a `.vti` or `.vtm`, if it is one; it takes no scene from `options`.
+pub(super) fn open_bake(path: &Path, options: &SceneOptions) -> Result<Option<BakedVolume>> {
     let is = |extension: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(extension));
-    match () {
+    let baked = match () {
         () if is("vtm") => BakedVolume::read(path).map(Some),
         () if is("vti") => BakedVolume::try_read(path),
         () => Ok(None),
+    }?;
+    match options.first_given().filter(|_| baked.is_some()) {
+        Some(flag) => Err(Error::invalid(
+            path,
+            format!("{flag}: the bake holds its scene; leave the flag out, or bake the volume anew with it"),
+        )),
+        None => Ok(baked),
     }
 }
 
@@ -97,7 +119,7 @@ pub(super) fn open_scene(
     options: &SceneOptions,
     field: Option<&str>,
 ) -> Result<(Scene, Option<BakedVolume>)> {
-    if let Some(baked) = open_bake(path)? {
+    if let Some(baked) = open_bake(path, options)? {
         let baked = if let Some(name) = field { baked.select(name).map_err(|e| e.in_file(path))? } else { baked };
         return Ok((baked.scene.clone(), Some(baked)));
     }

@@ -192,18 +192,7 @@ impl VolumeEntry {
 /// Loads the volumes of a scene file and what surrounds them.
 pub(super) fn load(entries: &[VolumeEntry], file: &SceneFile, input: &Path, options: &SceneOptions) -> Result<Loaded> {
     let folder = input.parent().unwrap_or(Path::new(""));
-    let s = &options.surface;
-    let flags = [
-        ("--time", options.time.is_some()),
-        ("--isovalues", options.isovalues.is_some()),
-        ("--albedo", s.albedo.is_some()),
-        ("--emission", s.emission.is_some()),
-        ("--outside", s.outside.is_some()),
-        ("--sides", s.sides.is_some()),
-        ("--boundary", s.boundary.is_some()),
-        ("--raw-…", options.raw.given()),
-    ];
-    if let Some((flag, _)) = flags.into_iter().find(|f| f.1) {
+    if let Some((flag, _)) = options.of_volume().into_iter().find(|f| f.1) {
         return Err(Error::invalid(
             input,
             format!("{flag}: the scene has several volumes; set it in their [[volume]] tables"),
