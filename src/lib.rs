@@ -33,6 +33,7 @@ pub mod isosurface;
 // What a hyperplane contains.
 pub mod brdf;
 pub mod reflectance;
+pub mod emission;
 pub mod polygon;
 pub mod luminaire;
 pub mod scene;

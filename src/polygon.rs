@@ -1,6 +1,7 @@
 //! Planar convex polygons of R³: walls and luminaires, extruded over the sweep's isovalue range by standing in every
 //! hyperplane alike. \[BB09 §2.3: p × I\]
 
+use crate::emission;
 use crate::error::{Error, Result};
 use crate::flattened::{Departure, FlattenedRay};
 use crate::volume::Lattice;
@@ -31,7 +32,7 @@ pub struct Polygon {
 }
 
 impl Polygon {
-    /// A polygon of at least three vertices; `albedo` in [0, 1], `emission` ≥ 0. Emitters block light from both sides.
+    /// A polygon of at least three vertices; `albedo` in [0, 1], `emission` as [`emission::check`] takes it. Emitters block light from both sides.
     ///
     /// # Errors
     /// `Invalid` if it has no area, is not planar (1e-5 of its size), not convex, or a coefficient is out of range.
@@ -65,8 +66,8 @@ impl Polygon {
         if !(albedo.cmpge(DVec3::ZERO).all() && albedo.cmple(DVec3::ONE).all()) {
             return fail(format!("albedo {albedo} must lie in [0, 1]"));
         }
-        if !(emission.cmpge(DVec3::ZERO).all() && emission.is_finite()) {
-            return fail(format!("emission {emission} must be finite and not negative"));
+        if let Err(e) = emission::check(emission) {
+            return fail(e.to_string());
         }
         let (corner, edges) = parametrise(&vertices, normal);
         let opaque_back = emission != DVec3::ZERO;

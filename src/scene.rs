@@ -10,6 +10,7 @@ pub use companion::{Companion, Member, Policy};
 pub(crate) use cover::{SLIT, voxel_along};
 pub use obj::{Placement, read_context, read_obj};
 
+use crate::emission;
 use crate::error::{Error, Result};
 use crate::field::Field;
 use crate::flattened::{Departure, FlattenedRay, MAX_POLYGONS, MAX_TARGETS, Side};
@@ -98,9 +99,7 @@ fn check(surface: &Surface, boundary: Boundary, lattice: &Lattice, polygons: &[P
             return fail(format!("surface albedo {albedo}: every channel must lie in [0, 1]"));
         }
     }
-    if !(surface.emission.cmpge(DVec3::ZERO).all() && surface.emission.is_finite()) {
-        return fail(format!("surface emission {}: must be finite and not negative", surface.emission));
-    }
+    emission::check(surface.emission).or_else(|e| fail(format!("surface {e}")))?;
     if boundary == Boundary::Capped {
         // A cap is a surface of its own: a wall in the same plane would hide it or be hidden.
         let far = lattice.far();
@@ -125,7 +124,7 @@ impl Scene {
     /// Puts a scene together; polygons that emit are its luminaires. Luminaires are numbered first.
     ///
     /// # Errors
-    /// `Invalid` for an albedo outside [0, 1], a negative emission, too many polygons, capped faces that touch a wall, or cells
+    /// `Invalid` for an albedo outside [0, 1], an emission out of range, too many polygons, capped faces that touch a wall, or cells
     /// narrower than 10⁻¹⁶ or wider than 10¹⁶.
     pub fn new(
         field: impl Into<Arc<Field>>,

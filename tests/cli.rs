@@ -258,6 +258,36 @@ fn colours_of_an_mtl_are_one_number_or_three() {
     }
 }
 
+/// Radiances are stored in 32 bits, and so are the squares that their standard errors come from.
+#[test]
+fn emissions_that_floats_cannot_square_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.nrrd", "-q"]);
+    let bake = ["bake", "b.nrrd", "--isovalues", "3.6", "95", "-o", "out.vti", "-q", "--dry-run"];
+    let with = |extra: &[&'static str]| [&bake[..], extra].concat();
+    let lamp = |emission: &str| {
+        fs::write(dir.join("l.mtl"), format!("newmtl lamp\nKd 0 0 0\nKe {emission}\n")).unwrap();
+        fs::write(dir.join("l.obj"), "mtllib l.mtl\nv 0 0 1\nv 1 0 1\nv 0 1 1\nusemtl lamp\nf 1 3 2\n").unwrap();
+    };
+    for fine in ["0 0 0", "1e-15 0 0", "1e18 1e18 1e18", "1e18 1e-30 0"] {
+        lamp(fine);
+        ok(dir, &with(&["--box", "l.obj"]));
+    }
+    for wrong in ["1e22 1e22 1e22", "1.1e18 1 1", "0 1e22 0", "9e-16 0 0", "1e-20 1e-20 1e-20", "-1 0 0"] {
+        lamp(wrong);
+        refused(dir, &with(&["--box", "l.obj"]), &["l.obj", "face 1", "emission", "1e-15", "1e18"]);
+    }
+    ok(dir, &with(&["--emission", "1e18"]));
+    ok(dir, &with(&["--emission", "1e-15,0,0"]));
+    for wrong in ["1e22", "1e-20", "0,0,2e18", "inf", "nan", "-1"] {
+        let emission = format!("--emission={wrong}");
+        refused(dir, &[&bake[..], &[&emission]].concat(), &["emission", "1e-15", "1e18"]);
+    }
+    fs::write(dir.join("s.toml"), "[volume]\nfile = \"b.nrrd\"\n[surface]\nemission = 1e22\n").unwrap();
+    refused(dir, &["bake", "s.toml", "-o", "out.vti"], &["s.toml", "emission", "1e18"]);
+}
+
 /// Sweeps, unless the scene, an option or the user asks for photons; options of both need a word.
 #[test]
 fn scene_and_options_choose_the_engine() {

@@ -135,7 +135,7 @@ pub struct SurfaceOptions {
     /// Diffuse reflectance of the isosurfaces: one number or R,G,B in [0, 1] (default 0.75)
     #[arg(long, value_name = "RGB")]
     pub albedo: Option<Albedo>,
-    /// Radiance that the isosurfaces emit (default 0)
+    /// Radiance that the isosurfaces emit: 0 (default), or 1e-15 to 1e18 in the brightest channel
     #[arg(long, value_name = "RGB")]
     pub emission: Option<Rgb>,
     /// The side of the surface that is outside: where values are lower (default) or higher
