@@ -9,6 +9,8 @@ use std::path::Path;
 /// Reads the first one-component scalars of the point data (unsigned char ones may be called `COLOR_SCALARS`), or else the first one-component array of its `FIELD` data.
 ///
 /// `ASPECT_RATIO`, the keyword of version 1, means the same as `SPACING`; a missing spacing is 1. `long` has 64 bits.
+/// Cell data in front of the point data, where VTK's writer puts them, are passed over. Keywords and types may have any
+/// case, as in VTK.
 ///
 /// # Errors
 /// `Io`; `Invalid` for a broken header, or arrays cut short; `NotSupported` for other data sets and for cell data alone.
@@ -93,7 +95,7 @@ fn text_length(text: &[u8], count: usize) -> Result<usize, usize> {
 }
 
 fn element(kind: &str) -> Option<ElementType> {
-    Some(match kind {
+    Some(match kind.to_ascii_lowercase().as_str() {
         "char" | "signed_char" => ElementType::I8,
         "unsigned_char" => ElementType::U8,
         "short" => ElementType::I16,
@@ -105,7 +107,7 @@ fn element(kind: &str) -> Option<ElementType> {
         "float" => ElementType::F32,
         "double" => ElementType::F64,
         // Written with 32 bits, whatever VTK holds in memory.
-        "vtkIdType" | "vtkidtype" => ElementType::I32,
+        "vtkidtype" => ElementType::I32,
         _ => return None,
     })
 }
@@ -125,6 +127,35 @@ fn components(words: &[String], at: usize) -> Result<usize> {
     }
 }
 
+/// What the attributes that follow belong to.
+#[derive(Clone, Copy, PartialEq)]
+enum Section {
+    Points,
+    Cells,
+}
+
+impl Section {
+    fn keyword(self) -> &'static str {
+        match self {
+            Section::Points => "POINT_DATA",
+            Section::Cells => "CELL_DATA",
+        }
+    }
+
+    /// Fails unless there is a tuple for each point or cell.
+    fn check(self, tuples: usize, lattice: &Lattice) -> Result<()> {
+        let (wanted, what) = match self {
+            Section::Points => (lattice.len(), "points"),
+            Section::Cells => (lattice.cells().iter().product(), "cells"),
+        };
+        if tuples == wanted {
+            return Ok(());
+        }
+        let (keyword, dims) = (self.keyword(), lattice.dims());
+        invalid(format!("{keyword} {tuples} does not fit DIMENSIONS {dims:?}, which make {wanted} {what}"))
+    }
+}
+
 fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
     let mut cursor = Cursor { bytes, at: 0, binary: false };
     if !cursor.line().is_some_and(|l| l.starts_with("# vtk DataFile Version")) {
@@ -137,10 +168,10 @@ fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
         other => return invalid(format!("line 3 is {other:?}; it must be ASCII or BINARY")),
     };
     let dataset = cursor.words().unwrap_or_default();
-    if dataset.first().is_none_or(|w| w != "DATASET") || dataset.len() != 2 {
+    if dataset.first().is_none_or(|w| !w.eq_ignore_ascii_case("DATASET")) || dataset.len() != 2 {
         return invalid(format!("`{}`: it must be DATASET and a type", dataset.join(" ")));
     }
-    if dataset[1] != "STRUCTURED_POINTS" {
+    if !dataset[1].eq_ignore_ascii_case("STRUCTURED_POINTS") {
         let kind = &dataset[1];
         return Err(Error::NotSupported(format!(
             "holds a {kind}; only STRUCTURED_POINTS are read (resample it to an image)"
@@ -148,7 +179,7 @@ fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
     }
 
     let (mut dims, mut spacing, mut origin): (Option<[usize; 3]>, [f64; 3], [f64; 3]) = (None, [1.0; 3], [0.0; 3]);
-    let points = loop {
+    let (mut section, mut tuples) = loop {
         let Some(words) = cursor.words() else { return invalid("has no POINT_DATA".into()) };
         match words[0].to_ascii_uppercase().as_str() {
             "DIMENSIONS" => dims = Some(numbers(&words)?),
@@ -156,21 +187,20 @@ fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
             "ORIGIN" => origin = numbers(&words)?,
             "FIELD" => skip_field(&mut cursor, &words)?,
             "METADATA" => while cursor.line().is_some_and(|l| !l.is_empty()) {},
-            "POINT_DATA" => break numbers::<usize, 1>(&words)?[0],
-            "CELL_DATA" => return Err(cells()),
+            "POINT_DATA" => break (Section::Points, numbers::<usize, 1>(&words)?[0]),
+            "CELL_DATA" => break (Section::Cells, numbers::<usize, 1>(&words)?[0]),
             _ => return invalid(format!("`{}`: no keyword of STRUCTURED_POINTS", words.join(" "))),
         }
     };
     let dims = dims.ok_or_else(|| Error::Invalid("has no DIMENSIONS".into()))?;
     let lattice = Lattice::aligned(dims, DVec3::from_array(origin), DVec3::from_array(spacing))?;
-    if points != lattice.len() {
-        return invalid(format!("POINT_DATA {points} does not fit DIMENSIONS {dims:?}, which are {}", lattice.len()));
-    }
-
+    section.check(tuples, &lattice)?;
     let mut field: Option<Array> = None;
-    let count =
-        |n: usize| points.checked_mul(n).ok_or_else(|| Error::Invalid(format!("{n} components do not fit the memory")));
     while let Some(words) = cursor.words() {
+        let count = |n: usize| {
+            tuples.checked_mul(n).ok_or_else(|| Error::Invalid(format!("{n} components do not fit the memory")))
+        };
+        let wanted = |n: usize| n == 1 && section == Section::Points;
         let key = words[0].to_ascii_uppercase();
         let word = |at: usize| {
             words.get(at).ok_or_else(|| Error::Invalid(format!("`{}`: too few words behind {key}", words.join(" "))))
@@ -179,11 +209,11 @@ fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
             "SCALARS" => {
                 let n = components(&words, 3)?;
                 let before = cursor.at;
-                if cursor.words().is_none_or(|w| w[0] != "LOOKUP_TABLE") {
+                if cursor.words().is_none_or(|w| !w[0].eq_ignore_ascii_case("LOOKUP_TABLE")) {
                     cursor.at = before;
                 }
                 let array = cursor.array(word(1)?, word(2)?, count(n)?)?;
-                if n == 1 {
+                if wanted(n) {
                     return Ok((lattice, cursor.samples(&array)?));
                 }
             }
@@ -196,7 +226,7 @@ fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
             "COLOR_SCALARS" => {
                 let n = components(&words, 2)?;
                 let array = cursor.array(word(1)?, if cursor.binary { "unsigned_char" } else { "float" }, count(n)?)?;
-                if n == 1 {
+                if wanted(n) {
                     let samples = match cursor.samples(&array)? {
                         Samples::F32(v) => Samples::U8(v.into_iter().map(|v| (v * 255.0).round() as u8).collect()),
                         samples => samples,
@@ -210,6 +240,13 @@ fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
             "TENSORS" => {
                 cursor.array(word(1)?, word(2)?, count(9)?)?;
             }
+            "TENSORS6" => {
+                cursor.array(word(1)?, word(2)?, count(6)?)?;
+            }
+            // Numbers and marks of the points or cells are no samples.
+            "GLOBAL_IDS" | "PEDIGREE_IDS" | "EDGE_FLAGS" => {
+                cursor.array(word(1)?, word(2)?, count(1)?)?;
+            }
             "TEXTURE_COORDINATES" => {
                 let n = components(&words, 2)?;
                 cursor.array(word(1)?, word(3)?, count(n)?)?;
@@ -217,14 +254,18 @@ fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
             "FIELD" => {
                 for _ in 0..components(&words, 2)? {
                     let (array, n) = field_array(&mut cursor)?;
-                    if n == 1 && array.count == points && field.is_none() {
+                    if wanted(n) && array.count == tuples && field.is_none() {
                         field = Some(array);
                     }
                 }
             }
             "METADATA" => while cursor.line().is_some_and(|l| !l.is_empty()) {},
-            "CELL_DATA" => break,
-            _ => return invalid(format!("`{}`: no keyword of POINT_DATA", words.join(" "))),
+            "POINT_DATA" if section == Section::Cells => {
+                (section, tuples) = (Section::Points, numbers::<usize, 1>(&words)?[0]);
+                section.check(tuples, &lattice)?;
+            }
+            "CELL_DATA" if section == Section::Points => break,
+            _ => return invalid(format!("`{}`: no keyword of {}", words.join(" "), section.keyword())),
         }
     }
     match field {
@@ -243,7 +284,7 @@ fn cells() -> Error {
 fn field_array<'a>(cursor: &mut Cursor<'a>) -> Result<(Array<'a>, usize)> {
     let mut words = cursor.words().unwrap_or_default();
     // Behind each array there may be notes about it.
-    if words.first().is_some_and(|w| w == "METADATA") {
+    if words.first().is_some_and(|w| w.eq_ignore_ascii_case("METADATA")) {
         while cursor.line().is_some_and(|l| !l.is_empty()) {}
         words = cursor.words().unwrap_or_default();
     }
@@ -336,6 +377,59 @@ mod tests {
         ok(text.as_bytes(), ElementType::I16);
     }
 
+    /// VTK's writer puts what belongs to cells in front of what belongs to points.
+    #[test]
+    fn cell_data_in_front_is_passed_over() {
+        let kinds = [
+            ("SCALARS c short 1\nLOOKUP_TABLE default\n", 2, 2),
+            ("SCALARS c double 2\n", 4, 8),
+            ("COLOR_SCALARS c 3\n", 6, 1),
+            ("LOOKUP_TABLE c 5\n", 20, 1),
+            ("VECTORS c float\n", 6, 4),
+            ("NORMALS c double\n", 6, 8),
+            ("TENSORS c float\n", 18, 4),
+            ("TENSORS6 c float\n", 12, 4),
+            ("TEXTURE_COORDINATES c 3 float\n", 6, 4),
+            ("GLOBAL_IDS c vtkIdType\n", 2, 4),
+            ("PEDIGREE_IDS c int\n", 2, 4),
+            ("EDGE_FLAGS c unsigned_char\n", 2, 1),
+            ("FIELD FieldData 1\nc 1 12 short\n", 12, 2),
+        ];
+        let samples: Vec<u8> = (0..12i16).flat_map(i16::to_be_bytes).collect();
+        for binary in [false, true] {
+            let head = if binary { HEAD.replace("ASCII", "BINARY") } else { HEAD.to_string() };
+            let (head, points) = (
+                head.replace("POINT_DATA 12", "CELL_DATA 2"),
+                "POINT_DATA 12\nSCALARS s short\nLOOKUP_TABLE default\n",
+            );
+            let mut all = Vec::new();
+            let end: Vec<u8> = [points.as_bytes(), if binary { &samples } else { NUMBERS.as_bytes() }, b"\n"].concat();
+            for (line, count, size) in kinds {
+                // Bytes that look like lines.
+                let values = if binary { "\n".repeat(count * size) } else { "1 ".repeat(count) };
+                let one = format!("{line}{values}\nMETADATA\nINFORMATION 0\n\n");
+                ok(&[head.as_bytes(), one.as_bytes(), &end].concat(), ElementType::I16);
+                all.extend(one.into_bytes());
+            }
+            ok(&[head.as_bytes(), &all, &end].concat(), ElementType::I16);
+        }
+    }
+
+    #[test]
+    fn keywords_are_the_same_in_any_case() {
+        let bytes: Vec<u8> = (0..12i16).flat_map(i16::to_be_bytes).collect();
+        for change in [str::to_ascii_lowercase, str::to_ascii_uppercase] {
+            let (magic, rest) = HEAD.split_once('\n').unwrap();
+            let head = format!("{magic}\n{}", change(rest));
+            let in_bytes = format!("{magic}\n{}", change(&rest.replace("ASCII", "BINARY")));
+            let scalars = change("SCALARS s short 1\nLOOKUP_TABLE default\n");
+            ok(format!("{head}{scalars}{NUMBERS}").as_bytes(), ElementType::I16);
+            ok(&[in_bytes.as_bytes(), scalars.as_bytes(), &bytes].concat(), ElementType::I16);
+            let notes = change("FIELD f 2\na 3 1 float\n1 2 3\nMETADATA\nINFORMATION 0\n\nb 1 12 short\n");
+            ok(format!("{head}{notes}{NUMBERS}").as_bytes(), ElementType::I16);
+        }
+    }
+
     #[test]
     fn broken_files_are_refused() {
         let refused = |text: String, words: &str| {
@@ -348,7 +442,8 @@ mod tests {
         refused(good.replace("int", "bit"), "`bit`");
         refused(good.replace(" 11\n", " x\n"), "`x`");
         refused(good.replace("POINT_DATA 12", "POINT_DATA 13"), "13");
-        refused(good.replace("POINT_DATA", "CELL_DATA"), "cell data");
+        refused(format!("{HEAD}SCALARS s int\n0 1\n").replace("POINT_DATA 12", "CELL_DATA 2"), "cell data");
+        refused(good.replace("POINT_DATA", "CELL_DATA"), "CELL_DATA 12 does not fit");
         refused(good.replace("3 2 2", "12 1 1"), "flatland");
         refused(good.replace("3 2 2", "9999999 9999999 9999999"), "too large");
         refused(good.replace("STRUCTURED_POINTS", "POLYDATA"), "POLYDATA");
