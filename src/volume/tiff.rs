@@ -3,6 +3,7 @@
 //! Sample (i, j, k) is column i, row j from the top, page k; rows run downwards, so y does too, as in ImageJ and ITK.
 
 mod directories;
+mod ome;
 
 use crate::error::{Error, Result};
 use crate::files;
@@ -21,12 +22,14 @@ const TEXT_LIMIT: usize = 16 << 20;
 /// Reads all pages as one volume: grey, integers of 8 to 64 bits or floats (16-bit ones stored as f32), not packed or by
 /// LZW, Deflate or PackBits.
 ///
-/// World units are the spacing's: `spacing=` and the resolution of ImageJ, `PhysicalSizeX`, `Y` and `Z` of OME. Otherwise, and
-/// where a step is missing, it is 1; the resolution of other programs is one of paper and is left aside. Origin 0.
+/// World units are the spacing's: `spacing=` and the resolution of ImageJ; micrometres from `PhysicalSizeX`, `Y` and
+/// `Z` of OME, whose units are converted (units without a length, such as `pixel`, are kept if all axes have the same).
+/// Otherwise, and where a step is missing, it is 1; the resolution of other programs is one of paper and is left aside.
+/// Origin 0.
 ///
 /// # Errors
-/// `Io`; `Invalid` for broken or truncated pages, and for pages that differ; `NotSupported` for colours and series of channels
-/// or times.
+/// `Io`; `Invalid` for broken or truncated pages, for pages that differ, and for OME's steps in units that do not go
+/// together; `NotSupported` for colours and series of channels or times.
 pub fn read(path: &Path) -> Result<Volume> {
     if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("zip")) {
         decode(Cursor::new(unzip(path)?), path)
@@ -93,7 +96,10 @@ fn decode<R: Read + Seek>(mut reader: R, path: &Path) -> Result<Volume> {
     let mut page = 0;
     let decoded = (|| -> TiffResult<_> {
         let mut decoder = Decoder::new(&mut reader)?.with_limits(limits.clone());
-        let place = Place::of(&mut decoder);
+        let place = match Place::of(&mut decoder) {
+            Ok(place) => place,
+            Err(message) => return Ok(Err(Error::invalid(path, message))),
+        };
         let start = decoder.find_tag_unsigned_vec::<u64>(Tag::StripOffsets)?.and_then(|o| o.first().copied());
         let order = decoder.byte_order();
         let mut pages: Option<Pages> = None;
@@ -246,7 +252,8 @@ struct Place {
 
 impl Place {
     /// From the first page's tags; texts that are missing or not understood leave the defaults.
-    fn of<R: Read + Seek>(decoder: &mut Decoder<R>) -> Self {
+    /// The error is a message without the file's name.
+    fn of<R: Read + Seek>(decoder: &mut Decoder<R>) -> Result<Self, String> {
         let mut place = Self { spacing: DVec3::ONE, images: 1, channels: 1, frames: 1 };
         let text = decoder.get_tag(Tag::ImageDescription).and_then(Value::into_string).unwrap_or_default();
         if let Some(lines) = text.strip_prefix("ImageJ=") {
@@ -257,9 +264,9 @@ impl Place {
             });
             place.imagej(lines, steps);
         } else if text.contains("<OME") {
-            place.ome(&text);
+            place.ome(&text)?;
         }
-        place
+        Ok(place)
     }
 
     fn imagej(&mut self, lines: &str, [x, y]: [f64; 2]) {
@@ -271,16 +278,13 @@ impl Place {
         (self.images, self.channels, self.frames) = (count("images"), count("channels"), count("frames"));
     }
 
-    fn ome(&mut self, text: &str) {
-        let Ok(document) = files::xml(text.trim_end_matches('\0')) else { return };
-        let Some(pixels) = document.descendants().find(|n| n.tag_name().name() == "Pixels") else { return };
-        let step = |key: &str| {
-            let step = pixels.attribute(key).and_then(|v| v.parse::<f64>().ok());
-            step.filter(|v| *v > 0.0 && v.is_finite()).unwrap_or(1.0)
-        };
+    fn ome(&mut self, text: &str) -> Result<(), String> {
+        let Ok(document) = files::xml(text.trim_end_matches('\0')) else { return Ok(()) };
+        let Some(pixels) = document.descendants().find(|n| n.tag_name().name() == "Pixels") else { return Ok(()) };
         let count = |key: &str| pixels.attribute(key).and_then(|v| v.parse().ok()).unwrap_or(1);
-        self.spacing = DVec3::new(step("PhysicalSizeX"), step("PhysicalSizeY"), step("PhysicalSizeZ"));
+        self.spacing = ome::spacing(pixels)?;
         (self.channels, self.frames) = (count("SizeC"), count("SizeT"));
+        Ok(())
     }
 }
 
@@ -356,6 +360,22 @@ mod tests {
         for text in ["ImageJ=1\nimages=2\nchannels=2\n", &ome.replace("SizeT='1'", "SizeT='2'")] {
             assert!(open(&gray(2, text)).unwrap_err().to_string().contains("channels"), "{text}");
         }
+    }
+
+    #[test]
+    fn ome_steps_have_units() {
+        let of = |units: &str| {
+            let text = format!(
+                "<OME><Image><Pixels PhysicalSizeX='0.5' PhysicalSizeY='0.5' PhysicalSizeZ='2000' \
+                 {units}/></Image></OME>"
+            );
+            open(&stack::<colortype::Gray8>(2, &text, |i| i as u8)).map(|v| v.lattice.spacing())
+        };
+        let z = "PhysicalSizeZUnit='nm'";
+        assert_eq!(of(z).unwrap(), DVec3::new(0.5, 0.5, 2.0));
+        assert_eq!(of(&format!("{z} PhysicalSizeXUnit='&#xb5;m'")).unwrap(), DVec3::new(0.5, 0.5, 2.0));
+        let message = of("PhysicalSizeZUnit='pixel'").unwrap_err().to_string();
+        assert!(message.contains("a.tif") && message.contains("PhysicalSizeZUnit is `pixel`"), "{message}");
     }
 
     /// As ImageJ writes stacks beyond 4 GB: one page of 3×2 16-bit samples, the other images behind its strip.
