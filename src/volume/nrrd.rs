@@ -16,12 +16,14 @@ use std::path::Path;
 
 /// Reads a 3D scalar volume (or a 4D one with an axis of a single sample). Samples keep the file's type.
 ///
-/// Encodings raw, gzip and ascii; versions NRRD0001 to NRRD0005. Without `space directions`, `spacings` and
-/// `axis mins` (or `axis maxs`) place the lattice; a missing spacing is 1.
+/// Encodings raw, gzip and ascii; versions NRRD0001 to NRRD0005. Without `space directions`, `spacings` and `axis mins`
+/// (or `axis maxs`) place the lattice; a missing spacing is 1. By their `kinds` axes are of space (`domain`, `space`,
+/// `time`, or unknown: `???`, `none`) or hold the components of vectors, colours or lists.
 ///
 /// # Errors
 /// `Io`; `Invalid` for a broken header, too few bytes (known before they are allocated) or a damaged stream;
-/// `NotSupported` for vectors, other dimensions, other encodings and split data files.
+/// `NotSupported` for vectors (axes of more than one component), other dimensions, other encodings and split data
+/// files.
 pub fn read(path: &Path) -> Result<Volume> {
     let header = Fields::read(path)?;
     let keep = header.kept_axes()?;
@@ -42,6 +44,7 @@ pub fn read(path: &Path) -> Result<Volume> {
 pub fn read_plane(path: &Path) -> Result<Option<Plane>> {
     let header = Fields::read(path)?;
     let sizes: Vec<usize> = header.list("sizes")?;
+    header.refuse_vectors(&sizes)?;
     let Some(axes) = Plane::long_axes(&sizes).map_err(|e| e.in_file(path))? else { return Ok(None) };
     let spacing = if header.get("spacedirections").is_some() {
         let vectors = header.vectors("spacedirections")?;
@@ -186,9 +189,27 @@ impl<'a> Fields<'a> {
         Ok(vectors)
     }
 
+    /// Fails if an axis of several components is none of space.
+    fn refuse_vectors(&self, sizes: &[usize]) -> Result<()> {
+        let kinds = self.get("kinds").unwrap_or("").split_whitespace();
+        let domain =
+            |kind: &str| ["domain", "space", "time", "???", "none"].contains(&kind.to_ascii_lowercase().as_str());
+        match kinds.zip(sizes).enumerate().find(|(_, (kind, size))| **size > 1 && !domain(kind)) {
+            None => Ok(()),
+            Some((a, (kind, size))) => Err(Error::not_supported(
+                self.path,
+                format!(
+                    "axis {a} is of kind `{kind}` with {size} components: vectors and colours are not read; extract \
+                     one component, as with `unu slice -a {a} -p 0`"
+                ),
+            )),
+        }
+    }
+
     /// The three axes of space. Of four, one of a single sample is dropped: the one without a direction if it can be.
     fn kept_axes(&self) -> Result<[usize; 3]> {
         let sizes: Vec<usize> = self.list("sizes")?;
+        self.refuse_vectors(&sizes)?;
         match sizes.len() {
             3 => Ok([0, 1, 2]),
             4 => {

@@ -138,6 +138,51 @@ fn only_a_vector_of_one_is_a_scalar() {
 }
 
 #[test]
+fn an_axis_of_vectors_is_none_of_space() {
+    let pictures = |sizes: &str, kinds: &str, more: &str| {
+        let n = sizes.split(' ').count();
+        format!("NRRD0004\ntype: uchar\ndimension: {n}\nsizes: {sizes}\nkinds: {kinds}\n{more}encoding: raw\n\n")
+    };
+    let refused = |sizes: &str, kinds: &str, more: &str, words: [&str; 2]| {
+        let error = read_one(&pictures(sizes, kinds, more), &[0; 48]).unwrap_err();
+        let message = error.to_string();
+        assert!(matches!(error, Error::NotSupported(_)), "{sizes} {kinds} {more}: {message}");
+        assert!(words.iter().all(|w| message.contains(w)), "{message}");
+    };
+    for more in [
+        "",
+        "space dimension: 2\nspace directions: none (1,0) (0,1)\n",
+        "space: RAS\nspace directions: none (1,0,0) (0,1,0)\n",
+        "space: RAS\nspace directions: (0,0,1) (1,0,0) (0,1,0)\n",
+    ] {
+        refused("3 4 2", "RGB-color domain domain", more, ["axis 0", "RGB-color"]);
+    }
+    refused("4 2 3", "space space rgb-COLOR", "", ["axis 2", "rgb-COLOR"]);
+    refused("2 4 2", "list space space", "", ["axis 0", "list"]);
+    refused("3 4 2 1", "vector domain domain domain", "", ["axis 0", "vector"]);
+    for (sizes, kinds) in [
+        ("3 2 2", "domain space time"),
+        ("3 2 2", "??? none domain"),
+        ("3 2 2", "domain"),
+        ("3 2 2 1", "domain domain domain stub"),
+        ("1 3 2 2", "vector domain domain domain"),
+    ] {
+        let v = read_one(&pictures(sizes, kinds, ""), &TWELVE).unwrap();
+        assert_eq!((v.lattice.dims(), v.samples()), ([3, 2, 2], &Samples::U8(TWELVE.to_vec())), "{sizes} {kinds}");
+    }
+    // As flat fields likewise.
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.nrrd");
+    let plane = |sizes: &str, kinds: &str| {
+        std::fs::write(&path, [pictures(sizes, kinds, "").as_bytes(), &[0; 48]].concat()).unwrap();
+        read_plane(&path)
+    };
+    assert_eq!(plane("1 3 4", "scalar domain domain").unwrap().unwrap().dims, [3, 4]);
+    assert!(matches!(plane("2 4", "complex domain"), Err(Error::NotSupported(_))));
+    assert!(matches!(plane("3 4 2", "RGB-color domain domain"), Err(Error::NotSupported(_))));
+}
+
+#[test]
 fn short_lying_and_unknown_files_are_refused() {
     let raw = format!("NRRD0004\n{U8}encoding: raw\n\n");
     assert!(matches!(read_one(&raw, &TWELVE[..11]), Err(Error::Invalid(_))));
