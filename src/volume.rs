@@ -429,8 +429,10 @@ impl Volume {
             ("mrc" | "map" | "ccp4" | "rec", "" | "gz") => mrc::read(path),
             ("cube" | "cub", "" | "gz") => cube::read(path),
             ("vti", "") => {
-                let (lattice, samples) = vti::VtiFile::read(path)?.into_scalars().map_err(|e| e.in_file(path))?;
-                Self::new(path.display().to_string(), lattice, samples)
+                let file = vti::VtiFile::read(path)?;
+                let space = file.space();
+                let (lattice, samples) = file.into_scalars().map_err(|e| e.in_file(path))?;
+                Ok(Self { space, ..Self::new(path.display().to_string(), lattice, samples)? })
             }
             ("vtk", "") => legacy_vtk::read(path),
             ("npy", "") => npy::read(path),
@@ -464,7 +466,9 @@ impl Volume {
         let extension = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
         match extension.as_str() {
             "vti" => {
-                let writer = vti::VtiWriter::new(&self.lattice).point_data("value", 1, &self.samples);
+                let writer = vti::VtiWriter::new(&self.lattice)
+                    .point_data("value", 1, &self.samples)
+                    .field_string(vti::SPACE, self.space.name());
                 notes
                     .iter()
                     .fold(writer, |w, (name, text)| w.field_string(name, text))

@@ -326,6 +326,23 @@ fn scene_and_options_choose_the_engine() {
 }
 
 /// Two volumes: a file each and one that names them; every verb that should takes them.
+/// What Slicer draws mirrored if it is lost.
+#[test]
+fn what_the_axes_mean_goes_from_file_to_file() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.nrrd", "--quiet"]);
+    ok(dir, &["export", "b.nrrd", "--space", "ras", "-o", "b.vti", "--quiet"]);
+    let mut bake = vec!["bake", "b.vti", "--isovalues", "3.6", "95", "-o", "lit.vti", "--quiet"];
+    bake.extend(QUICK);
+    ok(dir, &bake);
+    for input in ["b.vti", "lit.vti"] {
+        ok(dir, &["export", input, "-o", "e.nrrd", "--quiet"]);
+        let head = text(&fs::read(dir.join("e.nrrd")).unwrap());
+        assert!(head.contains("\nspace: right-anterior-superior\n"), "{input}");
+    }
+}
+
 #[test]
 fn several_volumes_in_one_scene() {
     let dir = tempfile::tempdir().unwrap();

@@ -2,10 +2,10 @@
 
 use super::{expect_extension, outputs};
 use crate::error::{Error, Result};
-use crate::export::{bake_file, slices};
+use crate::export::slices;
 use crate::progress::Progress;
 use crate::scene_file::{Inputs, RawOptions};
-use crate::volume::vti::{VtiFile, VtiWriter};
+use crate::volume::vti::{self, VtiFile, VtiWriter};
 use crate::volume::{Lattice, Samples, Space, Volume, npy, nrrd};
 use std::path::{Path, PathBuf};
 
@@ -65,7 +65,7 @@ impl Export {
             _ => VtiWriter::new(lattice)
                 .point_data(name, *components, samples)
                 .active_scalars(name)
-                .field_string(bake_file::SPACE, space.name())
+                .field_string(vti::SPACE, space.name())
                 .write(path)?,
         }
         if progress == Progress::Shown {
@@ -95,8 +95,7 @@ impl Export {
 /// An array of a `.vti`: the one of that name, else `radiance`, else the scalars.
 fn array_of(path: &Path, name: Option<&str>) -> Result<Array> {
     let mut file = VtiFile::read(path)?;
-    let text = file.field_strings.iter().find(|(key, _)| key == bake_file::SPACE);
-    let space = text.and_then(|(_, text)| Space::from_name(text)).unwrap_or_default();
+    let space = file.space();
     let chosen = file.point_data.iter().position(|a| a.name == name.unwrap_or("radiance"));
     let Some(chosen) = chosen else {
         if let Some(name) = name {

@@ -13,7 +13,7 @@ use crate::mask::Mask;
 use crate::polygon::Polygon;
 use crate::reflectance::Reflectance;
 use crate::scene::{Boundary, Member, Policy, Scene, Surface};
-use crate::volume::vti::{VtiArray, VtiFile, VtiWriter};
+use crate::volume::vti::{self, VtiArray, VtiFile, VtiWriter};
 use crate::volume::{Lattice, Samples, Volume};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -25,9 +25,6 @@ const DESCRIPTION: &str = "isolume";
 
 /// Name of the array that holds the radiance of all context geometry.
 const CONTEXT: &str = "context";
-
-/// Name of the field string that holds the volume's [`crate::volume::Space`].
-pub const SPACE: &str = "space";
 
 /// A scene without its samples: enough to draw the box and to trace the stored volume again.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -198,7 +195,7 @@ pub fn write(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
     for (name, samples) in &constants {
         writer = writer.field_data(name, 1, samples);
     }
-    writer.field_string(SPACE, volume.space.name()).field_string(DESCRIPTION, &json).write(path)
+    writer.field_string(vti::SPACE, volume.space.name()).field_string(DESCRIPTION, &json).write(path)
 }
 
 /// Every number of a JSON tree by its dotted path.

@@ -11,6 +11,18 @@ fn files_are_told_apart_by_their_extension() {
         let read = Volume::open(at(name)).unwrap();
         assert_eq!((&read.lattice, read.samples()), (&volume.lattice, volume.samples()));
     }
+    let turned = Volume { space: Space::RightAnteriorSuperior, ..volume.clone() };
+    for name in ["a.vti", "b.nrrd"] {
+        turned.write(at(name)).unwrap();
+        assert_eq!(Volume::open(at(name)).unwrap().space, turned.space, "{name}");
+    }
+    // Other programs may call something else so.
+    vti::VtiWriter::new(&volume.lattice)
+        .point_data("value", 1, volume.samples())
+        .field_string("space", "outer")
+        .write(&at("a.vti"))
+        .unwrap();
+    assert_eq!(Volume::open(at("a.vti")).unwrap().space, Space::default());
     assert!(matches!(volume.write(at("c.png")), Err(Error::NotSupported(_))));
     assert!(!at("c.png").exists());
     std::fs::write(at("d.xyz"), []).unwrap();

@@ -13,11 +13,14 @@ pub use writer::{SamplesRef, VtiWriter};
 use crate::error::{Error, Result};
 use crate::files;
 use crate::volume::plane::Plane;
-use crate::volume::{ElementType, Lattice, Samples, ascii};
+use crate::volume::{ElementType, Lattice, Samples, Space, ascii};
 use codec::Encoding;
 use glam::{DMat3, DVec3};
 use roxmltree::Node;
 use std::path::Path;
+
+/// Name of the field string that holds the [`Space`], as isolume writes it.
+pub const SPACE: &str = "space";
 
 /// A named array of a file. Sample t of component c is element `t · components + c`.
 #[derive(Clone, Debug, PartialEq)]
@@ -62,6 +65,12 @@ impl VtiFile {
     pub fn into_scalars(self) -> Result<(Lattice, Samples)> {
         let Self { lattice, point_data, active_scalars, .. } = self;
         Ok((lattice, scalars(point_data, active_scalars.as_deref())?))
+    }
+
+    /// What the file says that the world's axes mean; the default if it says nothing that is understood.
+    pub fn space(&self) -> Space {
+        let text = self.field_strings.iter().find(|(key, _)| key == SPACE);
+        text.and_then(|(_, text)| Space::from_name(text)).unwrap_or_default()
     }
 
     /// Reads the bytes of a file.
