@@ -115,8 +115,8 @@ pub struct RawOptions {
     /// Byte order of a headerless file: little or big
     #[arg(long = "raw-endian", value_name = "ORDER")]
     pub endian: Option<String>,
-    /// World distance between samples of a headerless file
-    #[arg(long = "raw-spacing", value_name = "DX,DY,DZ", value_delimiter = ',')]
+    /// World distance between samples of a headerless file, negative where an axis is flipped
+    #[arg(long = "raw-spacing", value_name = "DX,DY,DZ", value_delimiter = ',', allow_hyphen_values = true)]
     pub spacing: Option<Vec<f64>>,
     /// World position of the first sample of a headerless file
     #[arg(long = "raw-origin", value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true)]

@@ -326,6 +326,18 @@ fn scene_and_options_choose_the_engine() {
 }
 
 /// Two volumes: a file each and one that names them; every verb that should takes them.
+#[test]
+fn a_headerless_file_may_have_flipped_axes() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    fs::write(dir.join("r.raw"), (0..12).collect::<Vec<u8>>()).unwrap();
+    let place = ["--raw-dims", "3,2,2", "--raw-spacing", "-1,2,-3", "--raw-origin", "-7,0,1"];
+    let info = ok(dir, &[&["info", "r.raw", "--json"], &place[..]].concat());
+    let json: serde_json::Value = serde_json::from_slice(&info.stdout).unwrap();
+    assert_eq!(json["axes"], serde_json::json!([[-1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, -3.0]]));
+    assert_eq!(json["origin"], serde_json::json!([-7.0, 0.0, 1.0]));
+}
+
 /// What Slicer draws mirrored if it is lost.
 #[test]
 fn what_the_axes_mean_goes_from_file_to_file() {
