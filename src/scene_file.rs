@@ -301,9 +301,9 @@ pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
     let isovalues = match (options.isovalues.as_deref(), file.isovalues, &series) {
         (Some(&[lo, hi]), ..) => [lo, hi],
         (_, Some(range), _) => range,
-        (.., Some(series)) => {
-            series.check(read)?.ok_or_else(|| Error::invalid(input, "no frame holds an isosurface"))?
-        }
+        (.., Some(series)) => series
+            .check(read)?
+            .ok_or_else(|| Error::invalid(input, "no frame suggests a sweep; choose one with --isovalues"))?,
         _ => suggested(&volume)?,
     };
     let given = options.isovalues.is_some() || file.isovalues.is_none();
@@ -328,10 +328,21 @@ fn context(entries: &[ContextOptions], folder: &Path) -> Result<Vec<Polygon>> {
 
 /// The sweep that the data suggest.
 fn suggested(volume: &Volume) -> Result<[f64; 2]> {
-    VolumeStatistics::of(volume).sweep.ok_or_else(|| match volume.range() {
+    let statistics = VolumeStatistics::of(volume);
+    let none = || match statistics.range {
         None => Error::invalid(&volume.name, "none of its samples is finite"),
-        Some((v, _)) => Error::invalid(&volume.name, format!("every sample is {v}: it holds no isosurface")),
-    })
+        Some([v, _]) if statistics.constant() => {
+            Error::invalid(&volume.name, format!("every sample is {v}: it holds no isosurface"))
+        }
+        Some([lo, hi]) => Error::invalid(
+            &volume.name,
+            format!(
+                "its samples, {lo:?} to {hi:?}, suggest no sweep (they are too far apart, or no neighbours are \
+                 finite); choose one (--isovalues, or `isovalues` in a scene file)"
+            ),
+        ),
+    };
+    statistics.sweep.ok_or_else(none)
 }
 
 /// The scene file that `input` is or stands for, its text if it is one, and where its paths begin.
@@ -400,6 +411,20 @@ mod tests {
         assert_eq!(loaded.scene.field.sweep().hi(), 95.0);
         let options = SceneOptions { isovalues: Some(vec![10.0, 20.0]), ..SceneOptions::default() };
         assert_eq!(load(&path, &options).unwrap().scene.field.sweep().lo(), 10.0, "flags win");
+    }
+
+    #[test]
+    fn volumes_without_a_suggestion_are_told_why() {
+        let of = |samples: Vec<f64>| {
+            let lattice = Lattice::aligned([2; 3], DVec3::ZERO, DVec3::ONE).unwrap();
+            let volume = Volume::new("v", lattice, crate::volume::Samples::F64(samples)).unwrap();
+            suggested(&volume).unwrap_err().to_string()
+        };
+        assert!(of(vec![2.5; 8]).contains("v: every sample is 2.5"));
+        assert!(of(vec![f64::NAN; 8]).contains("finite"));
+        let wide = of([-1.5e308, 1.5e308].repeat(4));
+        let words = ["v: ", "-1.5e308", " 1.5e308", "--isovalues"];
+        assert!(words.iter().all(|w| wide.contains(w)) && !wide.contains("every"), "{wide}");
     }
 
     #[test]

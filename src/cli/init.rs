@@ -79,7 +79,10 @@ fn scene_text(volume: &Path, raw: &RawOptions, statistics: &VolumeStatistics) ->
     };
     let sweep = match statistics.sweep {
         Some([lo, hi]) => format!("isovalues = [{lo:?}, {hi:?}]"),
-        None => "# isovalues = [LO, HI]    # nothing to suggest: the volume holds no isosurface".to_owned(),
+        None if statistics.constant() => {
+            "# isovalues = [LO, HI]    # nothing to suggest: the volume holds no isosurface".to_owned()
+        }
+        None => "# isovalues = [LO, HI]    # nothing to suggest: choose them".to_owned(),
     };
     let mut layout = String::new();
     if raw.given() {

@@ -44,7 +44,8 @@ pub struct VolumeStatistics {
     pub commonest_share: Option<f64>,
     /// Samples whose central-difference gradient (one-sided on the boundary) is exactly zero.
     pub flat: usize,
-    /// Suggested sweep [lo, hi]: see [`VolumeStatistics::of`]. `None` for a constant volume.
+    /// Suggested sweep [lo, hi]: see [`VolumeStatistics::of`]. `None` for a constant volume, for a range that f64 does
+    /// not hold, and if no neighbours are finite.
     pub sweep: Option<[f64; 2]>,
 }
 
@@ -103,6 +104,11 @@ impl VolumeStatistics {
         statistics
     }
 
+    /// Whether no two finite samples differ, so that there is no isosurface.
+    pub fn constant(&self) -> bool {
+        self.range.is_none_or(|[min, max]| min == max)
+    }
+
     /// A table for people, one fact per line.
     pub fn to_text(&self) -> String {
         let mut t = String::new();
@@ -134,7 +140,10 @@ impl VolumeStatistics {
             "suggested sweep",
             match self.sweep {
                 Some(sweep) => list(&sweep).replace("  ", " … "),
-                None => "none: the volume has no isosurface".to_string(),
+                None if self.constant() => "none: the volume has no isosurface".to_string(),
+                None => {
+                    "none: its values are too far apart, or no neighbours are finite; choose --isovalues".to_string()
+                }
             },
         );
         if let Some(histogram) = &self.histogram {

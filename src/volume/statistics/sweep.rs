@@ -27,7 +27,7 @@ const COHERENT: f64 = 0.85;
 /// Sums over the samples of each fine bin, and the samples whose gradient is zero.
 pub(super) struct Survey {
     range: [f64; 2],
-    /// ∫|∇h| dV in units of the cell volume: isosurface area × bin width.
+    /// ∫|∇h| dV in units of the cell volume and of [`unit`]: isosurface area × bin width.
     area: Vec<f64>,
     /// Σ ∇₁h·∇₂h/|∇₂h| over gradients of ±1 and ±2 samples: the part of `area` that the wider one confirms.
     confirmed: Vec<f64>,
@@ -71,20 +71,22 @@ impl Survey {
             self.value(order((0..FINE).find(reached).unwrap_or(FINE - 1)))
         };
         let span = far_end - background;
-        let beyond = |a: f64, b: f64| if (a - b) * span > 0.0 { a } else { b };
-        let before = |a: f64, b: f64| if (a - b) * span > 0.0 { b } else { a };
+        // A sign, because the product of two differences may vanish.
+        let side = span.signum();
+        let beyond = |a: f64, b: f64| if (a - b) * side > 0.0 { a } else { b };
+        let before = |a: f64, b: f64| if (a - b) * side > 0.0 { b } else { a };
         let far = before(quantile(1.0 - FAR_AREA), far_end - MARGIN * span);
         let mut near = beyond(quantile(NEAR_AREA), self.coherent_from(background, far));
         // The background itself has no surface: it is a plateau.
         near = beyond(near, background + MARGIN * (far - background));
-        if (far - near) * span <= 0.0 {
+        if (far - near) * side <= 0.0 {
             // A field of two plateaus: anything between them will do.
             let middle = |t: f64| background + t * span;
             return Some(sorted(middle(0.25), middle(0.75)));
         }
         let sweep = sorted(near, far);
         // Rounding must not undo what was decided, and both ends must stay inside the range: try finer steps then.
-        let kept = |c: f64| c > min && c < max && (c - background) * span > 0.0;
+        let kept = |c: f64| c > min && c < max && (c - background) * side > 0.0;
         let parts: [f64; 3] = if integer { [20.0, 50.0, 100.0] } else { [200.0, 500.0, 1000.0] };
         let mut tries = parts.into_iter().map(|p| nice(sweep, p));
         Some(tries.find(|r| r[0] < r[1] && kept(r[0]) && kept(r[1])).unwrap_or(sweep))
@@ -137,7 +139,14 @@ fn difference(get: &impl Fn(usize) -> f64, o: usize, i: usize, n: usize, stride:
     (get(o + above * stride) - get(o - below * stride)) / (below + above) as f64
 }
 
+/// The power of two next to 1 / the range's greatest magnitude: squares of what it multiplies neither overflow nor
+/// vanish, and no bits change.
+fn unit([min, max]: [f64; 2]) -> f64 {
+    (-min.abs().max(max.abs()).log2().floor()).clamp(-1022.0, 1022.0).exp2()
+}
+
 fn scan(lattice: &Lattice, range: [f64; 2], get: impl Fn(usize) -> f64 + Sync) -> Survey {
+    let unit = unit(range);
     let [nx, ny, nz] = lattice.dims();
     let slabs = SLABS.min(nz);
     let parts: Vec<Survey> = (0..slabs)
@@ -161,12 +170,12 @@ fn scan(lattice: &Lattice, range: [f64; 2], get: impl Fn(usize) -> f64 + Sync) -
                             part.flat += usize::from(h.is_finite());
                             continue;
                         }
-                        let near = lattice.gradient_to_world(near);
+                        let near = lattice.gradient_to_world(near * unit);
                         let area = near.length();
                         if !(area.is_finite() && h.is_finite()) {
                             continue;
                         }
-                        let wide = lattice.gradient_to_world(gradient(2)).normalize_or_zero();
+                        let wide = lattice.gradient_to_world(gradient(2) * unit).normalize_or_zero();
                         let b = bin(h, range, FINE);
                         part.area[b] += area;
                         part.confirmed[b] += if wide.is_finite() { near.dot(wide) } else { 0.0 };

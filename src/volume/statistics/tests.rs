@@ -75,6 +75,34 @@ fn what_is_not_finite_is_counted_and_left_out() {
 }
 
 #[test]
+fn the_sweep_does_not_depend_on_the_unit() {
+    let ball = |unit: f64| {
+        let sample = |o: usize| {
+            let [i, j, k] = [o % 17, o / 17 % 17, o / 289].map(|i| i as f64 - 8.0);
+            unit * (-(i * i + j * j + k * k) / 18.0).exp()
+        };
+        volume([17; 3], Samples::F64((0..17 * 17 * 17).map(sample).collect()))
+    };
+    let one = VolumeStatistics::of(&ball(1.0)).sweep.unwrap();
+    for unit in [1e-300, 1e-200, 1e200, 1e300] {
+        let s = VolumeStatistics::of(&ball(unit));
+        let [lo, hi] = s.sweep.unwrap_or_else(|| panic!("no sweep in units of {unit}"));
+        assert!((lo / unit - one[0]).abs() < 1e-9 && (hi / unit - one[1]).abs() < 1e-9, "{unit}: {lo} {hi}, {one:?}");
+    }
+}
+
+#[test]
+fn nothing_untrue_is_said_where_nothing_is_suggested() {
+    // No two neighbours are finite.
+    let holes = (0..64).map(|o: usize| if (o + o / 4 + o / 16).is_multiple_of(2) { o as f64 } else { f64::NAN });
+    for samples in [[-f64::MAX, f64::MAX].repeat(32), holes.collect()] {
+        let s = VolumeStatistics::of(&volume([4; 3], Samples::F64(samples)));
+        let text = s.to_text();
+        assert!(s.sweep.is_none() && text.contains("--isovalues") && !text.contains("no isosurface"), "{text}");
+    }
+}
+
+#[test]
 fn the_sweep_of_a_smooth_field_is_nearly_all_of_it() {
     let s = VolumeStatistics::of(&Generator::Bumps.sample([51; 3]).unwrap());
     let [lo, hi] = s.sweep.unwrap();
