@@ -328,12 +328,25 @@ pub fn digest(job: &str) -> String {
 
 /// What determines a bake's bits, as lines of `key: value`: for [`Checkpoint::new`].
 pub fn job(scene: &Scene, settings: &BakeSettings) -> String {
-    let mut text = format!("version: {} ({})\n", env!("CARGO_PKG_VERSION"), env!("ISOLUME_COMMIT"));
+    let version = format!("version: {} ({})\n", env!("CARGO_PKG_VERSION"), env!("ISOLUME_COMMIT"));
+    version + &settings_job(settings) + &scene_job(scene)
+}
+
+/// The part of a [`job`] that settings determine.
+pub(crate) fn settings_job(settings: &BakeSettings) -> String {
+    let mut text = String::new();
     let mut add = |key: &str, value: String| text.push_str(&format!("{key}: {value}\n"));
     if let Ok(serde_json::Value::Object(settings)) = serde_json::to_value(settings) {
         settings.iter().for_each(|(key, value)| add(key, value.to_string()));
     }
     add("normalisation", format!("{:?}", settings.normalisation));
+    text
+}
+
+/// The part of a [`job`] that the scene determines, with all its volumes' samples.
+pub(crate) fn scene_job(scene: &Scene) -> String {
+    let mut text = String::new();
+    let mut add = |key: &str, value: String| text.push_str(&format!("{key}: {value}\n"));
     add("policy", format!("{:?}", scene.policy()));
     for member in scene.members() {
         let lattice = member.field.lattice();

@@ -12,7 +12,7 @@ pub use strategies::strategies;
 pub use table::Table;
 
 use crate::accuracy::{Accuracy, ReferenceMesh, compare};
-use crate::bake::{Bake, BakeSettings, bake};
+use crate::bake::{Bake, BakeOptions, BakeSettings, Engine, bake, digest, scene_job, settings_job};
 use crate::embree::{Device, SurfaceTracer};
 use crate::error::{Error, Result};
 use crate::export::ply;
@@ -85,8 +85,33 @@ impl Study {
         }
     }
 
+    /// Digests of what determines the rows of each subject besides their keys: its scene, what `base` sets for bakes by
+    /// either engine, and `quick`. Rows of `table` that bear a subject's name must be of its digest.
+    ///
+    /// # Errors
+    /// `Invalid` if some are not, or if two scenes that differ have one name.
+    fn jobs(&self, table: &Table, subjects: &[Subject], base: &BakeOptions) -> Result<Vec<String>> {
+        let settings = [Engine::Photon, Engine::Sweep].map(|engine| {
+            // An engine that cannot do what is asked for leaves no rows.
+            BakeSettings::with_engine(base, engine).map_or_else(|e| e.to_string(), |s| settings_job(&s))
+        });
+        let job = |s: &Subject| digest(&format!("{}{}quick: {}", scene_job(&s.scene), settings.concat(), self.quick));
+        let jobs: Vec<String> = subjects.iter().map(job).collect();
+        for (n, (subject, job)) in subjects.iter().zip(&jobs).enumerate() {
+            if subjects[..n].iter().zip(&jobs).any(|(s, j)| s.name == subject.name && j != job) {
+                return Err(Error::Invalid(format!(
+                    "two of the scenes are named '{}' and differ, which tables do not tell apart; study each in a folder of \
+                     its own, or rename its file",
+                    subject.name
+                )));
+            }
+            table.expect(&subject.name, job)?;
+        }
+        Ok(jobs)
+    }
+
     /// Two independent references on a fixed subset of the vertices of the isosurface at `isovalue` (source units), from
-    /// the cache or computed; `None` if there is no surface.
+    /// the cache or computed; `None` if there is no surface. The cache tells them apart by scene, settings and isovalue.
     ///
     /// # Errors
     /// As `reference()`, or from reading the cache.
@@ -100,15 +125,18 @@ impl Study {
         let c = scene.field.sweep().isovalue(isovalue);
         let Ok(mesh) = SurfaceMesh::extract(scene, c, 1) else { return Ok(None) };
         let mut out = Vec::new();
+        let job = scene_job(scene);
         for seed in [101, 202] {
-            let name = format!("{}-{isovalue:.4}-{vertices}x{samples}-{seed}.ply", subject.name);
+            let settings =
+                ReferenceSettings { samples, vertices: Some(vertices), seed, ..ReferenceSettings::default() };
+            let isovalue = exactly(isovalue);
+            let digest = digest(&format!("{job}{settings:?} at {isovalue}"));
+            let name = format!("{}-{isovalue}-{vertices}x{samples}-{seed}-{digest}.ply", subject.name);
             let path = self.folder.join("references").join(name);
             if !path.exists() {
-                let settings =
-                    ReferenceSettings { samples, vertices: Some(vertices), seed, ..ReferenceSettings::default() };
                 let tracer = SurfaceTracer::new(&self.device, scene, c, 1)?;
                 let count = vertices.min(mesh.local.len()) as u64 * u64::from(settings.batches);
-                let stage = self.progress.stage(&format!("reference {isovalue:.1}"), count);
+                let stage = self.progress.stage(&format!("reference {isovalue}"), count);
                 let result = reference(scene, &tracer, &mesh, c, &settings, &|n| stage.tick(n));
                 stage.end()?;
                 result.write(&path, &mesh)?;
@@ -128,6 +156,11 @@ impl Study {
         let result = bake(&subject.scene, settings, &self.device, self.progress)?;
         Ok((result, [begun.elapsed().as_secs_f64(), processor_seconds() - worked]))
     }
+}
+
+/// An isovalue as tables and file names give it: with as many digits as no other number shares.
+fn exactly(isovalue: f64) -> String {
+    format!("{isovalue:?}")
 }
 
 /// The accuracy of a bake in memory against references of one isosurface.
@@ -160,4 +193,47 @@ fn provenance(study: &Study) -> String {
         crate::isa::Isa::current().name(),
         if study.quick { ", --quick" } else { "" }
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::{Field, Sweep};
+    use crate::scene::{Boundary, Surface, cornell_box};
+    use crate::volume::generate::Generator;
+    use crate::volume::{Samples, Volume};
+
+    /// Bumps whose values are small: isovalues that four digits after the point do not tell apart.
+    fn subject(albedo: f64) -> Subject {
+        let bumps = Generator::from_name("bumps").unwrap().sample([8; 3]).unwrap();
+        let values = (0..bumps.lattice.len()).map(|o| 1e-6 * bumps.value(o) as f32).collect();
+        let volume = Volume::new("small", bumps.lattice, Samples::F32(values)).unwrap();
+        let field = Field::new(&volume, Sweep::new(3.6e-6, 95e-6).unwrap()).unwrap();
+        let walls = cornell_box(field.lattice(), 0.0).unwrap();
+        let surface = Surface { albedo: DVec3::splat(albedo).into(), ..Surface::default() };
+        let scene = Scene::new(field, surface, Boundary::Open, walls).unwrap();
+        Subject { name: "s".into(), scene, isovalue: None }
+    }
+
+    #[test]
+    fn references_are_of_the_scene_and_the_isovalue_that_are_asked_for() {
+        let dir = tempfile::tempdir().unwrap();
+        let new = || Study::new(dir.path().into(), Device::new(1).unwrap(), Progress::Quiet, true).unwrap();
+        let study = new();
+        let of = |study: &Study, subject: &Subject, isovalue: f64| {
+            study.references(subject, isovalue, Effort::Table).unwrap().expect("a surface").swap_remove(0)
+        };
+        let (dark, bright) = (subject(0.1), subject(0.9));
+        let at_47 = of(&study, &dark, 47e-6);
+        assert!(of(&study, &dark, 46e-6).positions != at_47.positions, "another isovalue has another surface");
+        let other = of(&study, &bright, 47e-6);
+        assert!(
+            other.positions == at_47.positions && other.radiance != at_47.radiance,
+            "another scene has another light"
+        );
+        let files = || std::fs::read_dir(dir.path().join("references")).unwrap().count();
+        assert_eq!(files(), 6);
+        assert!(of(&new(), &dark, 47e-6).radiance == at_47.radiance);
+        assert_eq!(files(), 6, "what is there is taken up");
+    }
 }

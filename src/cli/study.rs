@@ -51,7 +51,8 @@ struct Flatland {
 #[derive(clap::Args, Debug)]
 #[command(after_help = "\
 Writes CSV, Markdown and SVG into DIR; rows that are there are kept, so that an interrupted study goes on where it
-stopped. References are cached in DIR/references.
+stopped. They must be of the same scene and settings: others need a folder of their own. References are cached in
+DIR/references.
 
 Examples:
   isolume study strategies scenes/cornell-bumps.toml -o results

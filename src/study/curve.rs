@@ -5,7 +5,7 @@ use crate::bake::{BakeOptions, BakeSettings, Engine, StrategyName, TimeEstimate}
 use crate::error::Result;
 use crate::plot::{Plot, Series};
 
-const COLUMNS: [&str; 12] = [
+const COLUMNS: [&str; 13] = [
     "scene",
     "way",
     "photons",
@@ -18,6 +18,7 @@ const COLUMNS: [&str; 12] = [
     "seconds",
     "cpu_seconds",
     "rays_per_second",
+    "job",
 ];
 
 /// One way to bake.
@@ -72,7 +73,8 @@ fn candidates(quick: bool) -> Vec<Candidate> {
 /// As bakes, references and tables.
 pub fn curve(study: &Study, subjects: &[Subject], base: &BakeOptions, limit: Option<f64>) -> Result<()> {
     let mut table = Table::open(study.folder.join("curve.csv"), &COLUMNS, 7)?;
-    for subject in subjects {
+    let jobs = study.jobs(&table, subjects, base)?;
+    for (subject, job) in subjects.iter().zip(&jobs) {
         let fractions: &[f64] = if study.quick { &[0.475] } else { &[0.18, 0.344, 0.475, 0.617, 0.836] };
         let mut references = Vec::new();
         for &f in fractions {
@@ -116,6 +118,7 @@ pub fn curve(study: &Study, subjects: &[Subject], base: &BakeOptions, limit: Opt
                 format!("{:.3}", seconds[0]),
                 format!("{:.3}", seconds[1]),
                 format!("{:.0}", bake.report.rays_per_second),
+                job.clone(),
             ]);
             table.push(row)?;
         }

@@ -1,6 +1,6 @@
 //! The table of data sets: error and seconds with and without final gather, and where the error comes from.
 
-use super::{Effort, Study, Subject, Table, accuracy_of, provenance};
+use super::{Effort, Study, Subject, Table, accuracy_of, exactly, provenance};
 use crate::accuracy::{ReferenceMesh, interpolation_floor, total_floor};
 use crate::bake::{Bake, BakeOptions, BakeSettings, Engine, StrategyName};
 use crate::embree::{GraphTracer, SurfaceTracer};
@@ -12,7 +12,7 @@ use crate::scene::Scene;
 use crate::surface_mesh::SurfaceMesh;
 use std::time::Instant;
 
-const COLUMNS: [&str; 25] = [
+const COLUMNS: [&str; 26] = [
     "scene",
     "mode",
     "isovalue",
@@ -38,6 +38,7 @@ const COLUMNS: [&str; 25] = [
     "cpu_s",
     "extract_s",
     "picture_s",
+    "job",
 ];
 
 /// Each data set at its main isovalue: straight from the map, with uniform samples as BB09 and with samples at the nodes;
@@ -64,14 +65,15 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
     let modes =
         modes.into_iter().filter(|(_, options)| base.engine.is_none_or(|engine| options.engine == Some(engine)));
     let modes: Vec<(&str, BakeOptions)> = modes.collect();
-    for subject in subjects {
+    let jobs = study.jobs(&table, subjects, base)?;
+    for (subject, job) in subjects.iter().zip(&jobs) {
         let scene = &subject.scene;
         let c = subject.main_isovalue();
-        let key = |mode: &str| vec![subject.name.clone(), mode.to_owned(), format!("{c:.3}")];
+        let key = |mode: &str| vec![subject.name.clone(), mode.to_owned(), exactly(c)];
         if modes.iter().all(|(mode, _)| table.has(&key(mode))) {
             continue;
         }
-        study.say(&format!("{}: isovalue {c:.3}", subject.name));
+        study.say(&format!("{}: isovalue {c}", subject.name));
         let unit = scene.field.sweep().isovalue(c);
         let begun = Instant::now();
         let mesh = SurfaceMesh::extract(scene, unit, 1)?;
@@ -127,6 +129,7 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
                 picture_seconds,
             ];
             row.extend(numbers.map(|x| format!("{x:.4}")));
+            row.push(job.clone());
             table.push(row)?;
         }
     }

@@ -1,14 +1,14 @@
 //! BB09's table: where radiance is sampled, against the isovalue. \[BB09 §3\]
 
 use super::figure6::figure6;
-use super::{Effort, Study, Subject, Table, accuracy_of, provenance};
+use super::{Effort, Study, Subject, Table, accuracy_of, exactly, provenance};
 use crate::bake::{BakeOptions, BakeSettings, Engine, StrategyName};
 use crate::error::Result;
 use crate::illumination_grid::GridSize;
 use crate::mask::{Mask, masks};
 use crate::plot::{Plot, Series};
 
-const COLUMNS: [&str; 14] = [
+const COLUMNS: [&str; 15] = [
     "scene",
     "samples",
     "strategy",
@@ -23,6 +23,7 @@ const COLUMNS: [&str; 14] = [
     "max",
     "seconds",
     "cpu_seconds",
+    "job",
 ];
 
 const STRATEGIES: [(StrategyName, &str); 4] = [
@@ -40,18 +41,26 @@ const STRATEGIES: [(StrategyName, &str); 4] = [
 pub fn strategies(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Result<()> {
     let mut table = Table::open(study.folder.join("strategies.csv"), &COLUMNS, 4)?;
     let counts: &[u64] = if study.quick { &[20_000, 100_000] } else { &[100_000, 1_000_000, 10_000_000] };
+    let jobs = study.jobs(&table, subjects, base)?;
     // Plots of what is there, also after an interrupt.
-    let measured = measure(study, subjects, base, counts, &mut table);
+    let measured = measure(study, subjects, &jobs, base, counts, &mut table);
     summarise(study, subjects, &table, counts)?;
     measured
 }
 
-fn measure(study: &Study, subjects: &[Subject], base: &BakeOptions, counts: &[u64], table: &mut Table) -> Result<()> {
-    for subject in subjects {
+fn measure(
+    study: &Study,
+    subjects: &[Subject],
+    jobs: &[String],
+    base: &BakeOptions,
+    counts: &[u64],
+    table: &mut Table,
+) -> Result<()> {
+    for (subject, job) in subjects.iter().zip(jobs) {
         let isovalues = isovalues(study, subject);
         for &count in counts {
             for (strategy, name) in STRATEGIES {
-                let key = |c: f64| vec![subject.name.clone(), count.to_string(), name.to_owned(), format!("{c:.3}")];
+                let key = |c: f64| vec![subject.name.clone(), count.to_string(), name.to_owned(), exactly(c)];
                 if isovalues.iter().all(|&c| table.has(&key(c))) {
                     continue;
                 }
@@ -87,6 +96,7 @@ fn measure(study: &Study, subjects: &[Subject], base: &BakeOptions, counts: &[u6
                         seconds[1],
                     ];
                     row.extend(numbers.map(|x| format!("{x:.4}")));
+                    row.push(job.clone());
                     table.push(row)?;
                 }
                 if strategy != StrategyName::Nodes && count == counts[1] {
@@ -127,7 +137,8 @@ fn grid_of(subject: &Subject, count: u64) -> Result<GridSize> {
 
 /// Whether an isovalue is among those that are read off the table rather than the plot.
 fn is_in_table(subject: &Subject, isovalue: f64) -> bool {
-    [35.0, 47.0, 80.0].iter().any(|c| (subject.at((c - 3.6) / 91.4) - isovalue).abs() < 1e-9)
+    // The same numbers as `isovalues` makes: those of narrow sweeps lie closer together than any tolerance.
+    [35.0, 47.0, 80.0].iter().any(|c| subject.at((c - 3.6) / 91.4) == isovalue)
 }
 
 /// Level sets of strategy 1, the middles between them, 35, 47 and 80 of [3.6, 95], and a regular comb; source units,
@@ -154,7 +165,7 @@ fn level_sets() -> Vec<f64> {
 fn summarise(study: &Study, subjects: &[Subject], table: &Table, counts: &[u64]) -> Result<()> {
     let mut notes = String::from("RMS over the isovalues | at 47.0 of [3.6, 95]:\n\n");
     for subject in subjects {
-        let main = format!("{:.3}", subject.main_isovalue());
+        let main = exactly(subject.main_isovalue());
         let mut series = Vec::new();
         for &count in counts {
             for (_, name) in STRATEGIES {

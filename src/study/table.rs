@@ -2,11 +2,12 @@
 
 use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
+use std::borrow::Cow;
 use std::fmt::Write as _;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
-/// Rows of text under named columns; the first `keys` columns tell rows apart.
+/// Rows of text under named columns; the first `keys` columns tell rows apart, the last one is the digest of their job.
 pub struct Table {
     path: PathBuf,
     columns: Vec<&'static str>,
@@ -23,12 +24,11 @@ impl Table {
         let mut table = Self { path, columns: columns.to_vec(), keys, rows: Vec::new() };
         if table.path.exists() {
             let text = std::fs::read_to_string(&table.path).map_err(|e| Error::io(&table.path, e))?;
-            let mut lines = text.lines();
-            let split = |l: &str| l.split(',').map(str::to_owned).collect::<Vec<_>>();
-            if lines.next().map(split).is_none_or(|found| found != columns) {
+            let mut rows = records(&text).into_iter();
+            if rows.next().is_none_or(|found| found != columns) {
                 return Err(Error::invalid(&table.path, "holds other columns; move it away or choose another folder"));
             }
-            table.rows = lines.map(split).filter(|r| r.len() == columns.len()).collect();
+            table.rows = rows.filter(|r| r.len() == columns.len()).collect();
         }
         Ok(table)
     }
@@ -36,6 +36,25 @@ impl Table {
     /// Whether a row with these keys is there.
     pub fn has(&self, keys: &[String]) -> bool {
         self.rows.iter().any(|r| r[..self.keys] == *keys)
+    }
+
+    /// Refuses rows of `scene` (the first column) that another job left: their last column is not `job`.
+    ///
+    /// # Errors
+    /// `Invalid`.
+    pub fn expect(&self, scene: &str, job: &str) -> Result<()> {
+        let of_another = |r: &&Vec<String>| r[0] == scene && r.last().is_some_and(|found| found != job);
+        match self.rows.iter().find(of_another) {
+            None => Ok(()),
+            Some(row) => Err(Error::invalid(
+                &self.path,
+                format!(
+                    "holds rows of '{scene}' that are of another scene, volume or settings (job {}, this one is {job}); \
+                     choose another folder, or move the table away",
+                    row[row.len() - 1]
+                ),
+            )),
+        }
     }
 
     /// Adds a row and writes the file.
@@ -47,13 +66,12 @@ impl Table {
     /// If the row has another number of values than there are columns.
     pub fn push(&mut self, row: Vec<String>) -> Result<()> {
         assert_eq!(row.len(), self.columns.len(), "a value per column");
-        self.rows.push(row.into_iter().map(|v| v.replace([',', '\n'], " ")).collect());
-        let mut text = self.columns.join(",");
-        self.rows.iter().for_each(|r| {
+        self.rows.push(row);
+        let mut text = self.columns.join(",") + "\n";
+        for row in &self.rows {
+            text += &row.iter().map(|v| quoted(v)).collect::<Vec<_>>().join(",");
             text.push('\n');
-            text += &r.join(",");
-        });
-        text.push('\n');
+        }
         write_text(&self.path, &text)
     }
 
@@ -88,6 +106,38 @@ impl Table {
     }
 }
 
+/// A value as CSV: quoted where it holds what would end it.
+fn quoted(value: &str) -> Cow<'_, str> {
+    if value.contains([',', '"', '\n', '\r']) {
+        return Cow::Owned(format!("\"{}\"", value.replace('"', "\"\"")));
+    }
+    Cow::Borrowed(value)
+}
+
+/// The records of a CSV file, the inverse of [`quoted`].
+fn records(text: &str) -> Vec<Vec<String>> {
+    let mut records = Vec::new();
+    let mut record = vec![String::new()];
+    let mut quote = false;
+    let mut letters = text.chars().peekable();
+    while let Some(letter) = letters.next() {
+        let value = record.last_mut().expect("a record has a value");
+        match letter {
+            // Two of them stand for one.
+            '"' if quote && letters.next_if_eq(&'"').is_some() => value.push('"'),
+            '"' => quote = !quote,
+            ',' if !quote => record.push(String::new()),
+            '\n' if !quote => records.push(std::mem::replace(&mut record, vec![String::new()])),
+            '\r' if !quote => {}
+            letter => value.push(letter),
+        }
+    }
+    if record != [""] {
+        records.push(record);
+    }
+    records
+}
+
 /// Writes a text file, whole or not at all.
 pub(super) fn write_text(path: &Path, text: &str) -> Result<()> {
     let mut file = AtomicFile::create(path)?;
@@ -105,11 +155,23 @@ mod tests {
         let path = dir.path().join("t.csv");
         let open = || Table::open(path.clone(), &["name", "c", "error"], 2);
         let mut t = open().unwrap();
-        t.push(vec!["a, b".into(), "1".into(), "0.5".into()]).unwrap();
+        let names = ["a, b", "a  b", "say \"a\", or b", "", "two\r\nlines\n", "plain"];
+        for name in names {
+            assert!(!t.has(&[name.into(), "1".into()]), "{name:?}");
+            t.push(vec![name.into(), "1".into(), "0.5".into()]).unwrap();
+        }
+        let before = std::fs::read_to_string(&path).unwrap();
+        assert!(before.ends_with("\nplain,1,0.5\n"), "{before}");
         drop(t);
-        let t = open().unwrap();
-        assert!(t.has(&["a  b".into(), "1".into()]) && !t.has(&["a  b".into(), "2".into()]));
+        let mut t = open().unwrap();
+        for (row, name) in t.rows().iter().zip(names) {
+            assert_eq!(t.text(row, "name"), name);
+            assert!(t.has(&[name.into(), "1".into()]) && !t.has(&[name.into(), "2".into()]), "{name:?}");
+        }
+        assert_eq!(t.rows().len(), names.len());
         assert_eq!(t.number(&t.rows()[0], "error"), 0.5);
+        t.push(vec!["last".into(), "1".into(), "0.5".into()]).unwrap();
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), before + "last,1,0.5\n");
         assert!(Table::open(path.clone(), &["other"], 1).is_err());
     }
 }

@@ -1,0 +1,73 @@
+//! Studies as users meet them: what an earlier run left is taken up if it is of the same scene, settings and volume, and
+//! refused otherwise.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output};
+
+fn isolume(dir: &Path, args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_isolume")).current_dir(dir).args(args).output().expect("the program starts")
+}
+
+fn scene(dir: &Path, albedo: f64) {
+    fs::create_dir_all(dir).unwrap();
+    fs::write(dir.join("s.toml"), format!("[volume]\nfile = \"../b.vti\"\n[surface]\nalbedo = {albedo}\n")).unwrap();
+}
+
+/// All files below `dir` with their content.
+fn content(dir: &Path) -> Vec<(String, Vec<u8>)> {
+    let mut files = Vec::new();
+    for entry in fs::read_dir(dir).unwrap().map(|e| e.unwrap().path()) {
+        if entry.is_dir() {
+            files.extend(content(&entry));
+        } else {
+            files.push((entry.display().to_string(), fs::read(&entry).unwrap()));
+        }
+    }
+    files.sort();
+    files
+}
+
+#[test]
+fn what_another_scene_or_other_settings_left_is_refused_and_the_same_study_adds_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    assert!(isolume(dir, &["generate", "bumps", "--size", "8", "-o", "b.vti", "-q"]).status.success());
+    scene(&dir.join("sa"), 0.1);
+    scene(&dir.join("sb"), 0.9);
+    let study = |scenes: &[&str], more: &[&str]| {
+        let common = ["-o", "st", "--quick", "-q", "--engine", "photon", "--photons", "2000", "--gather", "2"];
+        isolume(dir, &[&["study", "datasets"], scenes, &common, more].concat())
+    };
+    let refused = |scenes: &[&str], more: &[&str], words: &[&str]| {
+        let before = fs::exists(dir.join("st")).unwrap().then(|| content(&dir.join("st")));
+        let output = study(scenes, more);
+        let message = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(2), "{scenes:?} {more:?}: {message}");
+        for word in words {
+            assert!(message.contains(word), "'{word}' is missing in: {message}");
+        }
+        if let Some(before) = before {
+            assert!(content(&dir.join("st")) == before, "{scenes:?} {more:?} changed files");
+        }
+    };
+    // Two of one name at once would be told apart by nothing.
+    refused(&["sa/s.toml", "sb/s.toml"], &[], &["'s'", "folder"]);
+
+    let first = study(&["sa/s.toml"], &[]);
+    assert!(first.status.success(), "{}", String::from_utf8_lossy(&first.stderr));
+    let table = fs::read_to_string(dir.join("st/datasets.csv")).unwrap();
+    assert_eq!(table.lines().count(), 4, "{table}");
+    let before = content(&dir.join("st"));
+    assert!(study(&["sa/s.toml"], &[]).status.success());
+    assert!(content(&dir.join("st")) == before, "the same command again added something");
+
+    refused(&["sb/s.toml"], &[], &["datasets.csv", "'s'", "another folder"]);
+    refused(&["sa/s.toml"], &["--preset", "preview"], &["datasets.csv", "'s'", "another folder"]);
+    scene(&dir.join("sa"), 0.2);
+    refused(&["sa/s.toml"], &[], &["datasets.csv", "'s'", "another folder"]);
+    scene(&dir.join("sa"), 0.1);
+    let other = isolume(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
+    assert!(other.status.success());
+    refused(&["sa/s.toml"], &[], &["datasets.csv", "'s'", "another folder"]);
+}
