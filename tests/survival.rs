@@ -275,6 +275,31 @@ fn output_that_cannot_be_written_is_refused_at_once() {
     }
 }
 
+#[test]
+fn a_dry_run_takes_little_memory_whatever_the_walls() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    volume(dir, "12");
+    let dry = |more: &[&str]| {
+        let script = "ulimit -v 4000000; exec \"$0\" \"$@\"";
+        let mut command = Command::new("sh");
+        command.current_dir(dir).args(["-c", script, PROGRAM, "bake", "b.vti", "-o", "q.vti", "--dry-run"]).args(more);
+        let (output, text) =
+            finish(command.args(["--threads", "2"]).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap());
+        assert!(output.status.success(), "{more:?}: {text}");
+        let line = text.lines().find(|l| l.trim_start().starts_with("time")).expect("the time is printed").to_owned();
+        let seconds: f64 = line.split_whitespace().nth(2).unwrap().parse().unwrap();
+        (seconds, line)
+    };
+    let (small, _) = dry(&["--wall-resolution", "256"]);
+    let (large, line) = dry(&["--wall-resolution", "2048"]);
+    // 64 times as many texels, which are nearly all of the work.
+    assert!(large > 8.0 * small, "{small} s, then {line}");
+    dry(&["--wall-resolution", "2048", "--engine", "photon"]);
+    let (_, line) = dry(&["--engine", "photon", "--photons", "0"]);
+    assert!(line.contains("photons 0.0"), "{line}");
+}
+
 /// Peak resident memory of a bake, bytes; and the estimate it printed.
 fn memory(dir: &Path, more: &[&str]) -> (f64, f64) {
     let mut command = Command::new(PROGRAM);

@@ -33,6 +33,9 @@ const LIGHT_POINTS: usize = 4;
 /// Lattices of more points than this are tried on a coarse copy of the field.
 const MOST_POINTS: f64 = (1u64 << 21) as f64;
 
+/// A sweep is tried with at most about this many texels, of 100 bytes: the walls of the standard preset.
+const MOST_TEXELS: f64 = (1u64 << 20) as f64;
+
 /// Estimated wall seconds of a bake, stage by stage, on as many threads as it will have.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TimeEstimate {
@@ -63,16 +66,22 @@ impl TimeEstimate {
             #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a part of a length")]
             let shrunk = |n: usize| ((n as f64 / shrink).round() as usize).max(2);
             let tried = GridSize::Points(grid.dims().map(shrunk)).lattice(&grid)?;
-            let pilot = SweepSettings {
-                directions: settings.directions.min(DIRECTIONS),
-                light_points: settings.light_points.min(LIGHT_POINTS),
-                max_bounces: settings.sweep().max_bounces.min(1),
-                replicates: 1,
-                // So that a wall's share of the work stays what it is.
-                flat_resolution: (shrunk(settings.wall_resolution), settings.wall_isovalues),
-                ..settings.sweep()
+            let lit = lit.resampled(&tried);
+            let pilot = |across: usize| {
+                let pilot = SweepSettings {
+                    directions: settings.directions.min(DIRECTIONS),
+                    light_points: settings.light_points.min(LIGHT_POINTS),
+                    max_bounces: settings.sweep().max_bounces.min(1),
+                    replicates: 1,
+                    flat_resolution: (across, settings.wall_isovalues),
+                    ..settings.sweep()
+                };
+                sweep_seconds(&lit, &pilot, &settings.sweep())
             };
-            let seconds = sweep_seconds(&lit.resampled(&tried), &pilot, &settings.sweep())?;
+            // So that a wall's share of the work stays what it is.
+            let walls = shrunk(settings.wall_resolution);
+            let texels = |across: usize| flat::texels(&lit, across, settings.wall_isovalues) as f64;
+            let seconds = with_texels(walls, &texels, &pilot)?;
             all += seconds * grid.len() as f64 / tried.len() as f64;
         }
         Ok(Self { stages: vec![("sweep", all)] })
@@ -85,7 +94,7 @@ impl TimeEstimate {
         let pilot = PhotonSettings { count, max_bounces: settings.bounces, seed: settings.seed, fixed_isovalue: None };
         let begun = Instant::now();
         let photons = trace_photons(scene, &tracer, &pilot, &|_| true);
-        let all = begun.elapsed().as_secs_f64() * settings.photons as f64 / count as f64;
+        let all = begun.elapsed().as_secs_f64() * settings.photons as f64 / count.max(1) as f64;
         let (mut cache, mut samples, mut per_ray) = (0.0, 0.0, 0.0);
         for number in 0..scene.fields() {
             let seen = scene.seen_from(number);
@@ -102,6 +111,23 @@ impl TimeEstimate {
     pub fn total(&self) -> f64 {
         self.stages.iter().map(|s| s.1).sum()
     }
+}
+
+/// Seconds that `pilot` takes for walls of so many texels across, if need be from fewer: their work grows with `texels`, and
+/// what half as many across take less tells how fast.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a part of a length")]
+fn with_texels(walls: usize, texels: &dyn Fn(usize) -> f64, pilot: &dyn Fn(usize) -> Result<f64>) -> Result<f64> {
+    let part = (MOST_TEXELS / texels(walls).max(1.0)).sqrt().min(1.0);
+    let across = ((walls as f64 * part) as usize).clamp(walls.min(4), walls);
+    let seconds = pilot(across)?;
+    if across == walls {
+        return Ok(seconds);
+    }
+    let fewer = across / 2;
+    let per_texel = (seconds - pilot(fewer)?) / (texels(across) - texels(fewer)).max(1.0);
+    // Walls take no more than all of it.
+    let per_texel = per_texel.clamp(0.0, seconds / texels(across).max(1.0));
+    Ok(seconds + per_texel * (texels(walls) - texels(across)))
 }
 
 /// Estimated seconds of a sweep, of which `pilot` does a small part.
@@ -137,7 +163,8 @@ fn field_seconds(
     photons: &Photons,
     settings: &BakeSettings,
 ) -> Result<[f64; 3]> {
-    let needed = |masks: &[Mask]| masks.iter().filter(|&&m| m != Mask::Empty).count() as f64;
+    let own = scene.lattice();
+    let needed = masks(&scene.field, own).iter().filter(|&&m| m != Mask::Empty).count() as f64;
     let side = scene.surface.outside;
     let at = positions(&scene.field, &Strategy::Uniform, SAMPLES, settings.seed)?;
     let tried = at.len().max(1) as f64;
@@ -160,7 +187,7 @@ fn field_seconds(
     let per_node = begun.elapsed().as_secs_f64() / tried;
     // Light reaches the other side of most surfaces, too.
     let sides = if photons.surface.iter().any(|p| p.side != side) { 2.0 } else { 1.0 };
-    let nodes = if settings.gather_rays > 0 { sides * needed(&masks(&scene.field, scene.lattice())) } else { 0.0 };
+    let nodes = if settings.gather_rays > 0 { sides * needed } else { 0.0 };
 
     let begun = Instant::now();
     let empty = RadianceCache::from_parts([None, None], vec![None; flat::count(scene)]);
@@ -172,8 +199,8 @@ fn field_seconds(
     let (shadow, seed) = (settings.shadow_rays, settings.seed);
     let sampled = sample_radiance(scene, tracer, &indirect, &at, side, shadow, seed, unsaved, &|_| true);
     let seconds = begun.elapsed().as_secs_f64();
-    let lattice = settings.grid.lattice(scene.lattice())?;
-    let points = needed(&masks(&scene.field, &lattice));
+    // A finer grid needs about the same share of its points, and its masks may need more memory than there is.
+    let points = needed * settings.grid.lattice(own)?.len() as f64 / own.len() as f64;
     let samples = match settings.strategy {
         StrategyName::Nodes => points,
         _ => settings.samples.map_or(points * settings.samples_per_point, |n| n as f64),
@@ -207,6 +234,30 @@ mod tests {
         let field = Field::new(&volume, Sweep::new(range[0], range[1]).unwrap()).unwrap();
         let walls = cornell_box(field.lattice(), 0.0).unwrap();
         Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap()
+    }
+
+    #[test]
+    fn walls_too_fine_to_be_tried_are_scaled_by_their_texels() {
+        let texels = |across: usize| 200.0 * (across * across) as f64;
+        let seconds = |across: usize| 3.0 + 1e-6 * texels(across);
+        for walls in [2, 3, 5, 64, 72, 73, 500, 2048] {
+            let tried = Mutex::new(Vec::new());
+            let pilot = |across: usize| {
+                tried.lock().unwrap().push(across);
+                Ok(seconds(across))
+            };
+            let estimate = with_texels(walls, &texels, &pilot).unwrap();
+            assert!((estimate / seconds(walls) - 1.0).abs() < 1e-9, "{walls}: {estimate} for {}", seconds(walls));
+            let tried = tried.into_inner().unwrap();
+            assert!(tried.iter().all(|&across| texels(across) <= MOST_TEXELS), "{walls}: {tried:?}");
+            assert!(walls > 72 || tried == [walls], "{walls}: {tried:?}");
+        }
+        // Noise makes nothing of walls that take no part, and no more than all of walls that do.
+        for noise in [-1.0, 1.0] {
+            let pilot = |across: usize| Ok(3.0 + if across > 40 { 0.0 } else { noise });
+            let estimate = with_texels(500, &texels, &pilot).unwrap();
+            assert!((3.0..=3.0 * texels(500) / texels(72)).contains(&estimate), "{noise}: {estimate}");
+        }
     }
 
     /// Directions along lines and back, of one side, that a sweep took.
