@@ -299,6 +299,9 @@ impl Render {
         if !(1..=1 << 16).contains(&self.samples) {
             return Err(Error::Invalid("--samples: 1 to 65536 rays per pixel".into()));
         }
+        if !(self.exposure > 0.0 && self.exposure.is_finite()) {
+            return Err(Error::Invalid(format!("--exposure {}: must be a positive finite number", self.exposure)));
+        }
         let baked = match extract::open_bake(&self.file, &self.scene)? {
             None if !self.reference && !self.local => Some(BakedVolume::read(&self.file)?),
             found => found,
@@ -328,6 +331,17 @@ impl Render {
             camera.target = target;
         }
         let exposure = baked.as_ref().map_or_else(|| scene.exposure(), |b| b.exposure);
+        let exr = self.output.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr"));
+        #[allow(clippy::cast_possible_truncation, reason = "a brightness")]
+        let brightness = (exposure * self.exposure) as f32;
+        let storable = exr || (brightness > 0.0 && brightness.is_finite());
+        if !storable {
+            return Err(Error::Invalid(format!(
+                "--exposure {}: times {exposure}, the exposure of {}, it is no brightness that a .png can have",
+                self.exposure,
+                self.file.display()
+            )));
+        }
         if self.reference && scene.fields() > 1 && scene.policy() == Policy::Independent {
             return Err(Error::not_supported(
                 &self.file,
@@ -345,7 +359,7 @@ impl Render {
             render(scene, isovalue, &camera, shading, self.samples, &device()?)?
         };
         let exposure = exposure * self.exposure;
-        if self.output.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr")) {
+        if exr {
             let attributes = [
                 ("isolume".to_owned(), format!("{} ({})", env!("CARGO_PKG_VERSION"), env!("ISOLUME_COMMIT"))),
                 ("source".to_owned(), self.file.display().to_string()),
@@ -357,8 +371,7 @@ impl Render {
             ];
             rendered.picture.write_exr(&self.output, &attributes)?;
         } else {
-            #[allow(clippy::cast_possible_truncation, reason = "a brightness")]
-            rendered.picture.write_png(&self.output, exposure as f32)?;
+            rendered.picture.write_png(&self.output, brightness)?;
         }
         if progress == Progress::Shown {
             let seconds = begun.elapsed().as_secs_f64();

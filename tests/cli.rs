@@ -193,6 +193,15 @@ fn bad_input_is_one_clear_line_and_leaves_nothing() {
     refused(dir, &["bake", "ramp.nrrd", "-o", "out.png"], &["out.png", ".vti"]);
     refused(dir, &["bake", "ramp.nrrd", "-o", "out.nrrd"], &["out.nrrd", "isolume export"]);
 
+    // Before the file is opened, which is not there.
+    for exposure in ["nan", "inf", "-inf", "-1", "0", "-0"] {
+        for output in ["out.png", "out.exr"] {
+            let exposure = format!("--exposure={exposure}");
+            let render = ["render", "nowhere.vti", "--isovalue", "5", "-o", output, &exposure];
+            refused(dir, &render, &["--exposure", "positive"]);
+        }
+    }
+
     // A luminaire without area, and a scene with an unknown key.
     fs::write(dir.join("l.mtl"), "newmtl lamp\nKe 1 1 1\n").unwrap();
     fs::write(dir.join("l.obj"), "mtllib l.mtl\nv 0 0 0\nv 1 1 1\nv 2 2 2\nusemtl lamp\nf 1 2 3\n").unwrap();
