@@ -118,6 +118,14 @@ pub fn compare(texture: &[DVec3], references: &[ReferenceMesh], exposure: f64) -
             ));
         }
     }
+    let black = |r: &ReferenceMesh| r.radiance.iter().all(|&rgb| rgb == DVec3::ZERO);
+    if references.len() == 2 && references.iter().all(black) {
+        return Err(Error::Invalid(
+            "both references are black: none of their paths brought light, so that there is no noise that two could cancel; \
+             compare with one of them"
+                .into(),
+        ));
+    }
     if references.len() == 2 && first.radiance == references[1].radiance {
         return Err(Error::Invalid("the two references are the same; give the second another --seed".into()));
     }

@@ -380,6 +380,11 @@ fn compare_computes_what_it_says() {
     };
     refuses(&[], "no reference");
     refuses(&[reference.clone(), reference.clone()], "--seed");
+    // Whatever the seeds, which another one would not change.
+    let black = flat([0.0; 4], 0.0);
+    refuses(&[black.clone(), black.clone()], "both references are black");
+    assert!(!compare(&texture, &[black.clone(), black.clone()], 2.0).unwrap_err().to_string().contains("--seed"));
+    assert!(compare(&texture, &[black], 2.0).unwrap().0.percent_rms > 0.0, "one is enough");
     refuses(&[reference.clone(), ReferenceMesh { triangles: Vec::new(), ..reference.clone() }], "different meshes");
     refuses(&[ReferenceMesh { sampled: vec![false; 4], ..reference }], "no vertex");
 }
