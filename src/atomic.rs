@@ -54,11 +54,12 @@ impl AtomicFile {
         }
     }
 
-    /// Flushes to the disk, and gives the file its name.
+    /// Flushes to the disk and closes: what is missing is the name. Of files that belong together all are completed before the
+    /// first is committed.
     ///
     /// # Errors
     /// `Io`, for example on a full disk; the temporary file is then removed and the old content stays.
-    pub fn commit(mut self) -> Result<()> {
+    pub fn complete(mut self) -> Result<Self> {
         let mut finish = || -> io::Result<()> {
             let file = self.open()?;
             file.flush()?;
@@ -67,15 +68,31 @@ impl AtomicFile {
         };
         let finished = finish();
         self.close();
-        finished.and_then(|()| fs::rename(&self.temporary, &self.target)).map_err(|e| Error::io(&self.target, e))?;
-        self.temporary.clear();
+        finished.map_err(|e| Error::io(&self.target, e))?;
+        Ok(self)
+    }
+
+    /// Completes the file unless it is, and gives it its name.
+    ///
+    /// # Errors
+    /// As [`AtomicFile::complete`].
+    pub fn commit(self) -> Result<()> {
+        // Closed by `complete` alone, which gives no file back that is not whole.
+        let mut file = if self.file.is_some() { self.complete()? } else { self };
+        fs::rename(&file.temporary, &file.target).map_err(|e| Error::io(&file.target, e))?;
+        file.temporary.clear();
         Ok(())
+    }
+
+    /// Completes what `written` says was written well; its failure becomes an [`Error::Io`] at the file.
+    pub(crate) fn complete_if(self, written: io::Result<()>) -> Result<Self> {
+        written.map_err(|e| Error::io(&self.target, e))?;
+        self.complete()
     }
 
     /// Commits what `written` says was written well; its failure becomes an [`Error::Io`] at the file.
     pub(crate) fn finish(self, written: io::Result<()>) -> Result<()> {
-        written.map_err(|e| Error::io(&self.target, e))?;
-        self.commit()
+        self.complete_if(written)?.commit()
     }
 
     fn open(&mut self) -> io::Result<&mut BufWriter<File>> {

@@ -223,9 +223,17 @@ fn broken(path: &Path, section: Section, found: u64, total: u64, source: std::io
 /// # Errors
 /// `Io` with the path, or what `write` returns; the temporary file is removed then.
 pub(crate) fn write_atomically(path: &Path, write: impl FnOnce(&mut AtomicFile) -> std::io::Result<()>) -> Result<()> {
+    completed(path, write)?.commit()
+}
+
+/// As [`write_atomically`], but the name is left to the caller.
+///
+/// # Errors
+/// As [`write_atomically`].
+pub(crate) fn completed(path: &Path, write: impl FnOnce(&mut AtomicFile) -> std::io::Result<()>) -> Result<AtomicFile> {
     let mut file = AtomicFile::create(path)?;
     let written = write(&mut file);
-    file.finish(written)
+    file.complete_if(written)
 }
 
 #[cfg(test)]

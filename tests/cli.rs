@@ -375,6 +375,10 @@ fn several_volumes_in_one_scene() {
     refused(dir, &["bake", "two.toml", "-o", "two.vti"], &["two.vti", ".vtm", "2"]);
     refused(dir, &["bake", "two.toml", "-o", "two.vtm", "--engine", "sweep"], &["sweep", "photon"]);
     refused(dir, &["bake", "two.toml", "-o", "two.vtm", "--albedo", "1"], &["--albedo", "[[volume]]"]);
+    // At once: before a line about the scene.
+    fs::create_dir(dir.join("two-b.vti")).unwrap();
+    refused(dir, &["bake", "two.toml", "-o", "two.vtm"], &["two-b.vti", "is a folder"]);
+    fs::remove_dir(dir.join("two-b.vti")).unwrap();
     let bake = |seed: &str| {
         let mut args = vec!["bake", "two.toml", "-o", "two.vtm", "-q", "--seed", seed, "--report", "two.json"];
         args.extend(QUICK);

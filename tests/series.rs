@@ -145,6 +145,14 @@ fn scenes_name_series_and_share_a_sweep() {
     refused(&["bake", "s.toml", "--time", "3", "-o", "x.vti"], &["time 3", "from 0.5 to 2"]);
     refused(&["bake", "a.nrrd", "--time", "3", "-o", "x.vti"], &["single volume"]);
     refused(&["bake", "c_%d.nrrd", "-o", "x.vti"], &["c_%d.nrrd", "two or more"]);
+    // Before the first frame.
+    for folder in ["y_0001.vti", "z.pvd", "r_0001.json"] {
+        fs::remove_file(dir.join(folder)).unwrap_or_default();
+        fs::create_dir(dir.join(folder)).unwrap();
+        let output = if folder.starts_with('z') { "z.vti" } else { "y.vti" };
+        refused(&["bake", "s.toml", "-o", output, "--report", "r.json"], &[folder, "is a folder"]);
+        fs::remove_dir(dir.join(folder)).unwrap();
+    }
     write(&dir.join("b.nrrd"), &ball(1.0, 9), "float", 9);
     refused(&["bake", "s.toml", "-o", "x.vti"], &["b.nrrd", "9×9×9", "11×11×11", "share"]);
     fs::write(dir.join("s.toml"), scene.replace(", 2.0", "")).unwrap();

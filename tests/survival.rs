@@ -261,6 +261,30 @@ fn what_can_never_succeed_leaves_no_checkpoint_and_spares_older_ones() {
 }
 
 #[test]
+fn a_full_disk_leaves_a_set_of_several_volumes_as_it_was() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let scene = "[[volume]]\nname = \"a\"\ngenerator = \"bumps\"\nsize = 9\nisovalues = [10, 90]\n\
+        [[volume]]\nname = \"b\"\ngenerator = \"bumps\"\nsize = 31\norigin = [0.05, 0.1, 0.02]\nscale = 0.3\n\
+        isovalues = [10, 90]\n";
+    fs::write(dir.join("two.toml"), scene).unwrap();
+    let names = ["two-a.vti", "two-b.vti", "two.vtm"];
+    names.iter().for_each(|name| fs::write(dir.join(name), "precious").unwrap());
+    // Room for the first, not for the second.
+    let script = "trap '' XFSZ; ulimit -f 600; exec \"$0\" \"$@\"";
+    let mut command = Command::new("sh");
+    command.current_dir(dir).args(["-c", script, PROGRAM, "bake", "two.toml", "-o", "two.vtm", "-q"]);
+    command.args(["--photons", "2000", "--gather", "2", "--wall-resolution", "4"]);
+    let (output, text) = finish(command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap());
+    assert_eq!(output.status.code(), Some(1), "{text}");
+    assert!(text.contains("two-b.vti"), "the second failed: {text}");
+    for name in names {
+        assert!(fs::read(dir.join(name)).unwrap() == b"precious", "{name} is of another bake than the others");
+    }
+    assert_eq!(fs::read_dir(dir).unwrap().count(), 4, "a temporary file was left");
+}
+
+#[test]
 fn output_that_cannot_be_written_is_refused_at_once() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();

@@ -155,7 +155,12 @@ impl Bake {
                     ),
                 ));
             }
-            _ => {}
+            (1, _) => {}
+            _ => {
+                let mut files =
+                    loaded.scene.members().into_iter().map(|m| bake_file::field_file(&self.output, &m.name));
+                files.try_for_each(|file| writable(&file))?;
+            }
         }
         let volumes: Vec<&Volume> = [&loaded.volume].into_iter().chain(&loaded.companions).collect();
         let options = self.bake.clone().or(&loaded.bake);

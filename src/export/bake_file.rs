@@ -3,6 +3,7 @@
 
 use super::multi_block;
 use super::picture::srgb_encode;
+use crate::atomic::AtomicFile;
 use crate::bake::Bake;
 use crate::error::{Error, Result};
 use crate::field::{Field, FieldRows, Sweep};
@@ -78,7 +79,8 @@ fn suffix(i: usize) -> &'static str {
 
 /// Writes the bakes of a scene's fields: one as `.vti` ([`write()`]); several as `.vtm` at `path` and beside it a `.vti` for
 /// each, `NAME-FIELD.vti`, which stands for itself and also holds `s`, the parameter that the fields share: a contour of it
-/// in all blocks shows all fields of one hyperplane.
+/// in all blocks shows all fields of one hyperplane. All are complete before the first has its name, so that what fails leaves
+/// the old set.
 ///
 /// # Errors
 /// `Io`.
@@ -86,14 +88,15 @@ pub fn write_fields(path: &Path, scene: &Scene, volumes: &[&Volume], bakes: &[Ba
     if let ([volume], [bake]) = (volumes, bakes) {
         return write(path, scene, volume, bake);
     }
-    let mut parts = Vec::new();
+    let (mut parts, mut files) = (Vec::new(), Vec::new());
     for (n, (volume, bake)) in volumes.iter().zip(bakes).enumerate() {
         let lit = scene.seen_from(n);
         let file = field_file(path, &lit.name);
-        write(&file, &lit, volume, bake)?;
+        files.push(completed(&file, &lit, volume, bake)?);
         parts.push((lit.name, file.file_name().unwrap_or_default().to_string_lossy().into_owned()));
     }
-    multi_block::write(path, &parts)
+    files.push(multi_block::completed(path, &parts)?);
+    files.into_iter().try_for_each(AtomicFile::commit)
 }
 
 /// Where the field named `name` of the bake at `path` goes.
@@ -108,8 +111,13 @@ pub fn field_file(path: &Path, name: &str) -> PathBuf {
 ///
 /// # Errors
 /// `Io` if the file cannot be written.
-#[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
 pub fn write(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result<()> {
+    completed(path, scene, volume, bake)?.commit()
+}
+
+/// As [`write()`], but the file's name is left to the caller.
+#[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+fn completed(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result<AtomicFile> {
     let report = serde_json::to_value(&bake.report).expect("the report is plain data");
     let lattice = &bake.lattice;
     let own = lattice == &volume.lattice;
@@ -195,7 +203,7 @@ pub fn write(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
     for (name, samples) in &constants {
         writer = writer.field_data(name, 1, samples);
     }
-    writer.field_string(vti::SPACE, volume.space.name()).field_string(DESCRIPTION, &json).write(path)
+    writer.field_string(vti::SPACE, volume.space.name()).field_string(DESCRIPTION, &json).complete(path)
 }
 
 /// Every number of a JSON tree by its dotted path.

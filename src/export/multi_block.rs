@@ -2,6 +2,7 @@
 
 use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
+use crate::files;
 use std::fmt::Write as _;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
@@ -11,6 +12,14 @@ use std::path::{Path, PathBuf};
 /// # Errors
 /// `Io`.
 pub fn write(path: &Path, parts: &[(String, String)]) -> Result<()> {
+    completed(path, parts)?.commit()
+}
+
+/// As [`write()`], but the file's name is left to the caller.
+///
+/// # Errors
+/// `Io`.
+pub(super) fn completed(path: &Path, parts: &[(String, String)]) -> Result<AtomicFile> {
     let mut text = String::from(
         "<?xml version=\"1.0\"?>\n<VTKFile type=\"vtkMultiBlockDataSet\" version=\"1.0\" byte_order=\"LittleEndian\">\n  \
          <vtkMultiBlockDataSet>\n",
@@ -20,9 +29,7 @@ pub fn write(path: &Path, parts: &[(String, String)]) -> Result<()> {
         let _ = writeln!(text, "    <DataSet index=\"{n}\" name=\"{name}\" file=\"{file}\"/>");
     }
     text.push_str("  </vtkMultiBlockDataSet>\n</VTKFile>\n");
-    let mut out = AtomicFile::create(path)?;
-    out.write_all(text.as_bytes()).map_err(|e| Error::io(path, e))?;
-    out.commit()
+    files::completed(path, |out| out.write_all(text.as_bytes()))
 }
 
 fn escaped(text: &str) -> String {

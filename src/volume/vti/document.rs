@@ -3,6 +3,7 @@
 
 use super::SamplesRef;
 use super::writer::Values;
+use crate::atomic::AtomicFile;
 use crate::error::Result;
 use crate::files;
 use crate::volume::ElementType;
@@ -62,9 +63,17 @@ impl<'a> Document<'a> {
     ///
     /// # Errors
     /// `Io`.
-    pub(crate) fn write(mut self, path: &Path) -> Result<()> {
+    pub(crate) fn write(self, path: &Path) -> Result<()> {
+        self.complete(path)?.commit()
+    }
+
+    /// As [`Document::write`], but the file's name is left to the caller.
+    ///
+    /// # Errors
+    /// `Io`.
+    pub(super) fn complete(mut self, path: &Path) -> Result<AtomicFile> {
         self.text("  <AppendedData encoding=\"raw\">\n   _");
-        files::write_atomically(path, |out| {
+        files::completed(path, |out| {
             out.write_all(self.text.as_bytes())?;
             let data = self.text.len() as u64;
             let mut offsets = Vec::with_capacity(self.slots.len());

@@ -1,6 +1,7 @@
 //! Writes `.vti`, with appended zlib blocks.
 
 use super::document::{BLOCK, Document, escape};
+use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
 use crate::volume::{ElementType, Lattice, Samples};
 use flate2::{Compression, write::ZlibEncoder};
@@ -230,9 +231,17 @@ impl<'a> VtiWriter<'a> {
     /// its components), if an array is empty, if the active scalars are none of the arrays, or if a text holds a 0
     /// character; `Io`.
     pub fn write(&self, path: &Path) -> Result<()> {
+        self.complete(path)?.commit()
+    }
+
+    /// As [`VtiWriter::write`], but the file's name is left to the caller.
+    ///
+    /// # Errors
+    /// As [`VtiWriter::write`].
+    pub(crate) fn complete(&self, path: &Path) -> Result<AtomicFile> {
         self.check().map_err(|message| Error::invalid(path, message))?;
         let document = self.document();
-        document.write(path)
+        document.complete(path)
     }
 
     fn check(&self) -> Result<(), String> {
