@@ -7,11 +7,14 @@ use std::io::{self, BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering};
 
+/// As many links one after another as Linux follows.
+const MOST_LINKS: usize = 40;
+
 /// A file under a temporary name beside its own; [`AtomicFile::commit`] renames it.
 ///
 /// Whoever reads the file's own name sees the old content or the complete new one, never a part. Dropped without
 /// commit, the temporary file is removed and the old content stays; only a killed process leaves it behind (hidden, named
-/// `.<name>.<process>-<count>.tmp`). A symbolic link is followed: the file it names is replaced, not the link.
+/// `.<name>.<process>-<count>.tmp`). A symbolic link is followed: the file it names is replaced, or made, not the link.
 #[derive(Debug)]
 pub struct AtomicFile {
     /// `None` once closed.
@@ -35,7 +38,7 @@ impl AtomicFile {
                 let what = if found.is_dir() { "a folder" } else { "no regular file" };
                 return Err(Error::invalid(path, format!("is {what}; give the name of a file to write")));
             }
-            Err(_) => path.to_path_buf(),
+            Err(_) => followed(path).map_err(|e| Error::io(path, e))?,
         };
         let Some(name) = target.file_name() else {
             return Err(Error::invalid(path, "has no file name; give the name of a file to write"));
@@ -103,6 +106,19 @@ impl AtomicFile {
     fn close(&mut self) {
         self.file.take().map(BufWriter::into_parts);
     }
+}
+
+/// What `path` names, or would if it were there: through symbolic links that lead to nothing yet.
+fn followed(path: &Path) -> io::Result<PathBuf> {
+    let mut named = path.to_path_buf();
+    for _ in 0..MOST_LINKS {
+        match fs::read_link(&named) {
+            // From the folder of the link, unless it says from the root.
+            Ok(next) => named = named.parent().unwrap_or(Path::new("")).join(next),
+            Err(_) => return Ok(named),
+        }
+    }
+    Err(io::Error::other("is a symbolic link that leads to itself"))
 }
 
 /// Removes the temporary files of `path` whose processes are gone; only where the system lists its processes.
@@ -225,5 +241,30 @@ mod tests {
         file.commit().unwrap();
         assert!(fs::symlink_metadata(&link).unwrap().is_symlink());
         assert_eq!(fs::read(&real).unwrap(), b"new");
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn links_that_lead_to_nothing_yet_are_followed() {
+        use std::os::unix::fs::symlink;
+        let folder = tempfile::tempdir().unwrap();
+        let inside = |name: &str| folder.path().join(name);
+        fs::create_dir(inside("deep")).unwrap();
+        // Relative to the folder of the link, not to that of the process; the second by way of the first.
+        symlink("deep/nothere", inside("link")).unwrap();
+        symlink(inside("link"), inside("deep/second")).unwrap();
+        for (link, content) in [("link", "new"), ("deep/second", "newer")] {
+            let mut file = AtomicFile::create(inside(link)).unwrap();
+            file.write_all(content.as_bytes()).unwrap();
+            assert_eq!(entries(folder.path()), ["deep", "link"], "the temporary file is beside the one it becomes");
+            file.commit().unwrap();
+            assert!(fs::symlink_metadata(inside(link)).unwrap().is_symlink());
+            assert_eq!(fs::read_to_string(inside("deep/nothere")).unwrap(), content);
+            fs::remove_file(inside("deep/nothere")).unwrap();
+        }
+        symlink("nowhere/a", inside("lost")).unwrap();
+        assert!(AtomicFile::create(inside("lost")).unwrap_err().to_string().contains("lost"));
+        symlink("round", inside("round")).unwrap();
+        assert!(AtomicFile::create(inside("round")).unwrap_err().to_string().contains("round"));
     }
 }
