@@ -511,6 +511,10 @@ fn no_output_takes_the_place_of_an_input() {
     taken(&["bake", "b.vti", "-o", "new.vti", "--report", "new.vti"], &["new.vti", "two outputs"]);
     taken(&["bake", "b.vti", "-o", "new.vti", "--checkpoint", "new.vti"], &["new.vti", "two outputs"]);
     taken(&["bake", "series/rho_%04d.vti", "-o", "series/rho.vti"], &["rho_%04d.vti", "would be a frame"]);
+    let two = "isovalues = [3.6, 95]\n[[volume]]\nname = \"a\"\nfile = \"b.vti\"\n[[volume]]\nname = \"b\"\nfile = \"b-a.vti\"\n";
+    fs::write(dir.join("two.toml"), two).unwrap();
+    fs::copy(dir.join("b.vti"), dir.join("b-a.vti")).unwrap();
+    taken(&["bake", "two.toml", "-o", "b.vtm"], &["b-a.vti", "is an input"]);
     taken(&["compare", "lit.vti", "r.ply", "-o", "r.ply"], &["r.ply", "is an input"]);
     taken(&["export", "lit.vti", "-o", "lit.vti"], &["lit.vti", "is an input"]);
     taken(&["extract", "scene.toml", "--isovalue", "47", "-o", "room.obj"], &["room.obj", "is an input"]);

@@ -90,7 +90,7 @@ impl Bake {
         self.frames(&series, frames, progress)
     }
 
-    /// What it writes: with several volumes, their collection only.
+    /// What it writes, but for the files of several volumes.
     fn outputs(&self) -> impl Iterator<Item = &Path> {
         [Some(&self.output), self.report.as_ref(), self.checkpoint.as_ref()].into_iter().flatten().map(PathBuf::as_path)
     }
@@ -157,9 +157,10 @@ impl Bake {
             }
             (1, _) => {}
             _ => {
-                let mut files =
-                    loaded.scene.members().into_iter().map(|m| bake_file::field_file(&self.output, &m.name));
-                files.try_for_each(|file| writable(&file))?;
+                let files: Vec<PathBuf> =
+                    loaded.scene.members().iter().map(|m| bake_file::field_file(&self.output, &m.name)).collect();
+                let all = self.outputs().chain(files.iter().map(PathBuf::as_path));
+                outputs(all, &Inputs::of(&self.input, &self.scene)?)?;
             }
         }
         let volumes: Vec<&Volume> = [&loaded.volume].into_iter().chain(&loaded.companions).collect();
