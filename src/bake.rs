@@ -18,9 +18,9 @@ use crate::embree::Device;
 use crate::error::{Error, Result};
 use crate::flat::FlatTexture;
 use crate::flattened::Side;
-use crate::illumination_grid::IlluminationGrid;
+use crate::illumination_grid::{GridSize, IlluminationGrid};
 use crate::isa::Isa;
-use crate::mask::{Mask, masks};
+use crate::mask::{Mask, masks, unknown_share};
 use crate::progress::{Clock, Progress};
 use crate::scene::{Policy, Scene};
 use crate::sweep;
@@ -262,6 +262,23 @@ fn can_sweep(scene: &Scene) -> Result<()> {
         Policy::Joint => sweep::supported(scene),
         Policy::Independent => (0..scene.fields()).try_for_each(|n| sweep::supported(&scene.lit(n))),
     }
+}
+
+/// What sweeps may not know of the points that surfaces need. Real volumes have 0.1 % at most, binary ones all.
+const UNKNOWN: f64 = 0.05;
+
+/// The share of the points that surfaces need where sweeps leave out what is reflected, because samples jump over the whole
+/// sweep there, as in binary volumes; `None` if that is none to speak of.
+///
+/// # Errors
+/// `Invalid` if the grid has too many points.
+pub fn left_out(scene: &Scene, grid: &GridSize) -> Result<Option<f64>> {
+    let mut most = 0.0f64;
+    for member in scene.members() {
+        let field = &member.field;
+        most = most.max(unknown_share(field, &grid.lattice(field.lattice())?));
+    }
+    Ok((most > UNKNOWN).then_some(most))
 }
 
 /// Bakes with their reports from what an engine gave.

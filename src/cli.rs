@@ -337,7 +337,8 @@ impl Render {
         let storable = exr || (brightness > 0.0 && brightness.is_finite());
         if !storable {
             return Err(Error::Invalid(format!(
-                "--exposure {}: times {exposure}, the exposure of {}, it is no brightness that a .png can have",
+                "--exposure {:?}: times {exposure:?}, the exposure of {}, it is no brightness that a .png can have; give \
+                 another",
                 self.exposure,
                 self.file.display()
             )));

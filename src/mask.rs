@@ -116,6 +116,22 @@ pub fn own_light<'a>(
     }
 }
 
+/// Of the points that the sweep's surfaces need, the share with none beside them that holds light of its own level set: where
+/// samples jump over the sweep, as in binary volumes. Nothing but rays knows what surfaces reflect there.
+pub fn unknown_share(field: &Field, lattice: &Lattice) -> f64 {
+    let masks = masks(field, lattice);
+    let own = own_light(field, lattice, &masks, true);
+    let own: Vec<bool> = (0..masks.len()).into_par_iter().with_min_len(1 << 12).map(own).collect();
+    let [nx, ny, nz] = lattice.dims();
+    let known = |&o: &usize| {
+        let [i, j, k] = lattice.ijk(o);
+        let around = |i: usize, n: usize| i.saturating_sub(1)..(i + 2).min(n);
+        around(k, nz).any(|z| around(j, ny).any(|y| around(i, nx).any(|x| own[lattice.offset(x, y, z)])))
+    };
+    let needed = || (0..masks.len()).into_par_iter().with_min_len(1 << 12).filter(|&o| masks[o] != Mask::Empty);
+    1.0 - needed().filter(known).count() as f64 / needed().count().max(1) as f64
+}
+
 /// Slices of constant z that are looked at together.
 const SLICES: usize = 8;
 /// The range of no values.
@@ -181,6 +197,26 @@ mod tests {
         use Mask::{Empty, Filled, Valid};
         // Cells 2–3, 3–4 hold the sweep; nodes of those cells and the cells beside them are filled.
         assert_eq!(got[..8], [Empty, Empty, Filled, Valid, Filled, Empty, Empty, Empty]);
+    }
+
+    /// A ball in a smooth field, and in one that jumps over the sweep within a step, all over or on one side.
+    #[test]
+    fn points_are_unknown_where_samples_jump_over_the_sweep() {
+        let lattice = Lattice::aligned([24; 3], DVec3::ZERO, DVec3::ONE).unwrap();
+        let share = |jumps: &dyn Fn(f64) -> bool| {
+            let h = |o: usize| {
+                let [i, j, k] = lattice.ijk(o).map(|i| i as f64 - 11.5);
+                let smooth = 0.5 + (8.0 - DVec3::new(i, j, k).length()) / 6.0;
+                if jumps(i) { smooth.round().clamp(0.0, 1.0) } else { smooth }
+            };
+            let samples = Samples::F64((0..lattice.len()).map(h).collect());
+            let volume = Volume::new("ball", lattice.clone(), samples).unwrap();
+            unknown_share(&Field::new(&volume, Sweep::new(0.1, 0.9).unwrap()).unwrap(), &lattice)
+        };
+        assert_eq!(share(&|_| false), 0.0);
+        assert_eq!(share(&|_| true), 1.0);
+        let half = share(&|x| x > 0.0);
+        assert!((0.1..0.5).contains(&half), "{half}");
     }
 
     /// Along each axis and across the slices that are looked at together: one point of the sweep among emptiness.

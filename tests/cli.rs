@@ -334,6 +334,35 @@ fn scene_and_options_choose_the_engine() {
     assert!(report["sweep_queries"].as_u64() > Some(50_000) && report["photons"]["emitted"] == 0, "{report}");
 }
 
+/// A cavity in a volume of zeros and ones: no grid point holds light of its own level set, and what sweeps know of it is its emission.
+/// Its walls emit 1 and reflect half: 2 comes from everywhere.
+#[test]
+fn binary_volumes_are_baked_by_exact_rays() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let lattice = Lattice::aligned([20; 3], glam::DVec3::ZERO, glam::DVec3::ONE).unwrap();
+    let outside = |o: usize| lattice.ijk(o).iter().map(|&i| (i as f64 - 9.5).powi(2)).sum::<f64>() > 36.0;
+    let samples = Samples::U8((0..lattice.len()).map(|o| u8::from(outside(o))).collect());
+    Volume::new("cavity", lattice.clone(), samples).unwrap().write(&dir.join("cavity.vti")).unwrap();
+    let bake =
+        ["bake", "cavity.vti", "--isovalues", ".25", ".75", "--box", "none", "--emission", "1", "--albedo", ".5"];
+    let more = ["--preset", "preview", "-o", "lit.vti"];
+    let lines = text(&ok(dir, &[&bake[..], &more].concat()).stderr);
+    assert!(lines.contains("engine  photon") && !lines.contains("warning"), "{lines}");
+    let file = VtiFile::read(&dir.join("lit.vti")).unwrap();
+    let of = |name: &str| &file.point_data.iter().find(|a| a.name == name).unwrap().samples;
+    let (Samples::F32(light), Samples::U8(mask)) = (of("radiance"), of("mask")) else { panic!("other types") };
+    let lit: Vec<f32> = light.chunks_exact(3).zip(mask).filter(|(_, m)| **m != 0).map(|(rgb, _)| rgb[0]).collect();
+    let mean = lit.iter().sum::<f32>() / lit.len() as f32;
+    assert!(lit.len() > 500 && (1.9..2.1).contains(&mean), "{mean} of {}", lit.len());
+    // Sweeps that are asked for say what they leave out; on a finer grid points lie within the sweep.
+    let dry = |more: &[&str]| text(&ok(dir, &[&bake[..], &["-o", "lit.vti", "--dry-run"], more].concat()).stderr);
+    let lines = dry(&["--engine", "sweep"]);
+    assert!(lines.contains("warning: samples jump over the whole sweep at 100 %"), "{lines}");
+    let lines = dry(&["--grid", "2x"]);
+    assert!(lines.contains("engine  sweep") && !lines.contains("warning"), "{lines}");
+}
+
 /// Two volumes: a file each and one that names them; every verb that should takes them.
 #[test]
 fn a_headerless_file_may_have_flipped_axes() {

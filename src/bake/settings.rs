@@ -1,6 +1,6 @@
 //! What a user may set about a bake, and the presets.
 
-use super::can_sweep;
+use super::{can_sweep, left_out};
 use crate::error::{Error, Result};
 use crate::illumination_grid::GridSize;
 use crate::photon_map::{EstimateSettings, Estimator, Normalisation};
@@ -85,7 +85,7 @@ pub struct BakeOptions {
     /// Amount of work: preview (seconds), standard (minutes) or reference
     #[arg(long)]
     pub preset: Option<Preset>,
-    /// How light is computed (default: sweep, or photon for scenes that cannot be swept and with options that are its own)
+    /// How light is computed (default: sweep, or photon for scenes that cannot be swept, for binary volumes, and with options that are its own)
     #[arg(long)]
     pub engine: Option<Engine>,
     /// Sweep engine: directions per pass and replicate (a power of two)
@@ -223,7 +223,7 @@ impl BakeOptions {
     }
 
     /// The engine for a scene: the one that is asked for; else sweeps, which are faster for the same error, unless options that
-    /// only photons know are set or the scene cannot be swept.
+    /// only photons know are set, the scene cannot be swept, or sweeps would leave out what its surfaces reflect.
     fn engine(&self, scene: &Scene) -> Result<Engine> {
         match (self.engine, self.of_photons(), self.of_sweeps()) {
             (Some(engine), ..) => Ok(engine),
@@ -232,7 +232,11 @@ impl BakeOptions {
             ))),
             (None, Some(_), None) => Ok(Engine::Photon),
             (None, None, Some(_)) => Ok(Engine::Sweep),
-            (None, None, None) => Ok(if can_sweep(scene).is_ok() { Engine::Sweep } else { Engine::Photon }),
+            (None, None, None) => {
+                let swept =
+                    can_sweep(scene).is_ok() && left_out(scene, &self.grid.unwrap_or(GridSize::Factor(1)))?.is_none();
+                Ok(if swept { Engine::Sweep } else { Engine::Photon })
+            }
         }
     }
 }

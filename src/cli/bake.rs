@@ -2,7 +2,8 @@
 
 use super::{device, expect_extension, outputs};
 use crate::bake::{
-    BakeOptions, BakeReport, BakeSettings, Engine, MemoryEstimate, TimeEstimate, bake_fields, digest, job, supported,
+    BakeOptions, BakeReport, BakeSettings, Engine, MemoryEstimate, TimeEstimate, bake_fields, digest, job, left_out,
+    supported,
 };
 use crate::checkpoint::Checkpoint;
 use crate::error::{Error, Result};
@@ -186,6 +187,15 @@ impl Bake {
             let dark = members.iter().all(|m| m.surface.emission == DVec3::ZERO);
             if loaded.scene.luminaires().is_empty() && dark {
                 eprintln!("warning: nothing emits light; everything will be black");
+            }
+            if settings.engine == Engine::Sweep
+                && let Some(share) = left_out(&loaded.scene, &settings.grid)?
+            {
+                eprintln!(
+                    "warning: samples jump over the whole sweep at {:.0} % of the points that surfaces need, where sweeps leave \
+                     out what surfaces reflect; use --engine photon, a finer --grid or smoother samples",
+                    100.0 * share
+                );
             }
         }
         let device = device()?;
