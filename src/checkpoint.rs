@@ -8,6 +8,7 @@
 use crate::atomic;
 use crate::error::{Error, Result};
 use crate::files;
+use crate::progress::say;
 use flate2::Crc;
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
@@ -190,7 +191,7 @@ impl Checkpoint {
             }
             if !state.warned {
                 state.warned = true;
-                eprintln!("warning: no checkpoint could be written: {e}");
+                say!("warning: no checkpoint could be written: {e}");
             }
         }
     }

@@ -17,7 +17,7 @@ use crate::embree::Device;
 use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
 use crate::isa::Isa;
-use crate::progress::{self, Progress};
+use crate::progress::{self, Progress, say};
 use crate::render::{Camera, Rendered, Shading, render};
 use crate::scene::{Policy, Scene};
 use crate::scene_file::{self, Inputs, RawOptions, SceneOptions, load};
@@ -376,9 +376,9 @@ impl Render {
         }
         if progress == Progress::Shown {
             let seconds = begun.elapsed().as_secs_f64();
-            eprintln!("{}: {}×{} in {seconds:.2} s", self.output.display(), camera.size[0], camera.size[1]);
+            say!("{}: {}×{} in {seconds:.2} s", self.output.display(), camera.size[0], camera.size[1]);
             if rendered.unbaked > 0.001 {
-                eprintln!(
+                say!(
                     "warning: {:.1} % of the picture shows the surface's inside, which was not baked; use --sides both",
                     100.0 * rendered.unbaked
                 );

@@ -6,6 +6,15 @@ use std::io::IsTerminal;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
+/// Prints a line to standard error. Where nobody reads it nothing else is lost; the library's own macro would end the work.
+macro_rules! say {
+    ($($line:tt)*) => {{
+        use std::io::Write;
+        let _ = writeln!(std::io::stderr(), $($line)*);
+    }};
+}
+pub(crate) use say;
+
 static INTERRUPTED: AtomicBool = AtomicBool::new(false);
 
 /// Asks all running stages to stop; what a signal handler calls.
@@ -59,7 +68,7 @@ impl Progress {
     /// Prints how long a part of the work took.
     pub fn line(self, name: &str, seconds: f64) {
         if self == Self::Shown {
-            eprintln!("{name:>14}  {seconds:.2} s");
+            say!("{name:>14}  {seconds:.2} s");
         }
     }
 
@@ -92,8 +101,8 @@ impl Stage {
     /// Prints a line without disturbing the bar.
     pub fn note(&self, label: &str, text: &str) {
         match &self.bar {
-            Some(bar) => bar.suspend(|| eprintln!("{label:>14}  {text}")),
-            None if self.shown => eprintln!("{label:>14}  {text}"),
+            Some(bar) => bar.suspend(|| say!("{label:>14}  {text}")),
+            None if self.shown => say!("{label:>14}  {text}"),
             None => {}
         }
     }
@@ -111,7 +120,7 @@ impl Stage {
             return Err(Error::Interrupted);
         }
         if self.shown {
-            eprintln!("{:>14}  {seconds:.2} s", self.name);
+            say!("{:>14}  {seconds:.2} s", self.name);
         }
         Ok(seconds)
     }

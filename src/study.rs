@@ -16,7 +16,7 @@ use crate::bake::{Bake, BakeOptions, BakeSettings, Engine, bake, digest, scene_j
 use crate::embree::{Device, SurfaceTracer};
 use crate::error::{Error, Result};
 use crate::export::ply;
-use crate::progress::{Progress, processor_seconds};
+use crate::progress::{Progress, processor_seconds, say};
 use crate::reference::{ReferenceSettings, reference};
 use crate::scene::Scene;
 use crate::surface_mesh::SurfaceMesh;
@@ -81,7 +81,7 @@ impl Study {
 
     fn say(&self, text: &str) {
         if self.progress == Progress::Shown {
-            eprintln!("{text}");
+            say!("{text}");
         }
     }
 

@@ -343,7 +343,7 @@ fn binary_volumes_are_baked_by_exact_rays() {
     let lattice = Lattice::aligned([20; 3], glam::DVec3::ZERO, glam::DVec3::ONE).unwrap();
     let outside = |o: usize| lattice.ijk(o).iter().map(|&i| (i as f64 - 9.5).powi(2)).sum::<f64>() > 36.0;
     let samples = Samples::U8((0..lattice.len()).map(|o| u8::from(outside(o))).collect());
-    Volume::new("cavity", lattice.clone(), samples).unwrap().write(&dir.join("cavity.vti")).unwrap();
+    Volume::new("cavity", lattice.clone(), samples).unwrap().write(dir.join("cavity.vti")).unwrap();
     let bake =
         ["bake", "cavity.vti", "--isovalues", ".25", ".75", "--box", "none", "--emission", "1", "--albedo", ".5"];
     let more = ["--preset", "preview", "-o", "lit.vti"];

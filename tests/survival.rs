@@ -438,3 +438,28 @@ fn too_little_memory_is_told_for_the_engine_that_needs_less() {
         assert!(code == Some(2) && text.contains(&format!("--max-memory {printed}: ")), "{given}: {text}");
     }
 }
+
+/// Lines that nobody reads, on a full disk or a pipe that was closed, cost no work; output that is wanted is another matter.
+#[test]
+fn standard_error_that_takes_nothing_ends_no_bake() {
+    let folder = tempfile::tempdir().unwrap();
+    let dir = folder.path();
+    volume(dir, "13");
+    let full = || Stdio::from(fs::OpenOptions::new().write(true).open("/dev/full").unwrap());
+    let command = |output: &str| {
+        let mut command = Command::new(PROGRAM);
+        command.current_dir(dir).args(BAKE).args(["-o", output]).stdout(Stdio::null());
+        command
+    };
+    assert_eq!(command("full.vti").stderr(full()).status().unwrap().code(), Some(0));
+    let mut child = command("closed.vti").stderr(Stdio::piped()).spawn().unwrap();
+    drop(child.stderr.take());
+    assert_eq!(child.wait().unwrap().code(), Some(0));
+    assert_eq!(light(&dir.join("full.vti")), light(&dir.join("closed.vti")));
+    // Bad input is told by the code at least.
+    assert_eq!(command("full.vti").arg("--photons=x").stderr(full()).status().unwrap().code(), Some(2));
+    let mut info = Command::new(PROGRAM);
+    let output = info.current_dir(dir).args(["info", "b.vti"]).stdout(full()).output().unwrap();
+    let message = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.code() == Some(1) && message.contains("standard output: No space"), "{message}");
+}

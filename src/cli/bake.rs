@@ -10,7 +10,7 @@ use crate::error::{Error, Result};
 use crate::export::bake_file;
 use crate::field::Sweep;
 use crate::isa::Isa;
-use crate::progress::Progress;
+use crate::progress::{Progress, say};
 use crate::scene::{Policy, Scene};
 use crate::scene_file::{Inputs, SceneOptions, load, load_series};
 use crate::series::{Series, write_collection};
@@ -113,21 +113,21 @@ impl Bake {
         let mut done = Vec::new();
         for (n, (&time, frame)) in series.times().iter().zip(frames).enumerate() {
             if progress == Progress::Shown {
-                eprintln!("{:>14}  {} of {}, time {time}", "frame", n + 1, series.times().len());
+                say!("{:>14}  {} of {}, time {time}", "frame", n + 1, series.times().len());
             }
             scene.time = Some(time);
             let frame = Self { scene: scene.clone(), ..frame };
             let sweep = frame.one(Instant::now(), progress)?;
             scene.isovalues = Some(vec![sweep.lo(), sweep.hi()]);
             if self.dry_run {
-                eprintln!("{:>14}  that for each of {} frames", "series", series.times().len());
+                say!("{:>14}  that for each of {} frames", "series", series.times().len());
                 return Ok(());
             }
             done.push((time, frame.output));
             write_collection(&self.output.with_extension("pvd"), &done)?;
         }
         if progress == Progress::Shown {
-            eprintln!("{:>14}  {}", "written", self.output.with_extension("pvd").display());
+            say!("{:>14}  {}", "written", self.output.with_extension("pvd").display());
         }
         Ok(())
     }
@@ -173,7 +173,7 @@ impl Bake {
         if progress == Progress::Shown {
             for member in &members {
                 let ([nx, ny, nz], sweep) = (member.field.lattice().dims(), member.field.sweep());
-                eprintln!(
+                say!(
                     "{}{}: {nx}×{ny}×{nz}, isovalues {} … {}, {} luminaire(s), {} threads, {}",
                     self.input.display(),
                     if members.len() > 1 { format!(" '{}'", member.name) } else { String::new() },
@@ -186,12 +186,12 @@ impl Bake {
             }
             let dark = members.iter().all(|m| m.surface.emission == DVec3::ZERO);
             if loaded.scene.luminaires().is_empty() && dark {
-                eprintln!("warning: nothing emits light; everything will be black");
+                say!("warning: nothing emits light; everything will be black");
             }
             if settings.engine == Engine::Sweep
                 && let Some(share) = left_out(&loaded.scene, &settings.grid)?
             {
-                eprintln!(
+                say!(
                     "warning: samples jump over the whole sweep at {:.0} % of the points that surfaces need, where sweeps leave \
                      out what surfaces reflect; use --engine photon, a finer --grid or smoother samples",
                     100.0 * share
@@ -222,19 +222,19 @@ impl Bake {
                 Engine::Sweep => "sweep: every isovalue at once",
                 Engine::Photon => "photon: exact rays",
             };
-            eprintln!("{:>14}  {engine}", "engine");
-            eprintln!("{:>14}  {memory}", "memory");
+            say!("{:>14}  {engine}", "engine");
+            say!("{:>14}  {memory}", "memory");
             if settings.bands > 1 {
-                eprintln!("{:>14}  {} of isovalues, one after another", "bands", settings.bands);
+                say!("{:>14}  {} of isovalues, one after another", "bands", settings.bands);
             }
         }
         if self.dry_run {
-            eprintln!("{:>14}  {}", "time", TimeEstimate::new(&loaded.scene, &settings, &device)?);
+            say!("{:>14}  {}", "time", TimeEstimate::new(&loaded.scene, &settings, &device)?);
             return Ok(sweep);
         }
         let job = job(&loaded.scene, &settings);
         if self.resume && self.scene.time.is_some() && self.complete(&job) {
-            eprintln!("{:>14}  {} is complete", "resumed", self.output.display());
+            say!("{:>14}  {} is complete", "resumed", self.output.display());
             return Ok(sweep);
         }
         let checkpoint = self.checkpoint(job)?;
@@ -290,9 +290,9 @@ impl Bake {
                 sum(|r| r.samples)
             ),
         };
-        eprintln!("{:>14}  {:.2} s: {work} ({:.1} M/s)", "total", r.seconds.total, r.rays_per_second / 1e6);
+        say!("{:>14}  {:.2} s: {work} ({:.1} M/s)", "total", r.seconds.total, r.rays_per_second / 1e6);
         let each = |of: fn(&BakeReport) -> u64| reports.iter().map(of).sum::<u64>();
-        eprintln!(
+        say!(
             "{:>14}  {} masked ({} filled), {} gather misses, {} without gradient, {} not finite",
             "counts",
             each(|r| r.masked),
@@ -301,9 +301,9 @@ impl Bake {
             sum(|r| r.samples_without_gradient),
             each(|r| r.non_finite + r.non_finite_voxels)
         );
-        eprintln!("{:>14}  {}", "written", self.output.display());
+        say!("{:>14}  {}", "written", self.output.display());
         for member in scene.members().iter().filter(|_| reports.len() > 1) {
-            eprintln!("{:>14}  {}", "", bake_file::field_file(&self.output, &member.name).display());
+            say!("{:>14}  {}", "", bake_file::field_file(&self.output, &member.name).display());
         }
     }
 
@@ -321,12 +321,12 @@ impl Bake {
         let label = if self.resume { "resumed" } else { "note" };
         if !self.resume {
             if path.exists() {
-                eprintln!("{label:>14}  {} holds an unfinished bake; --resume would go on with it", path.display());
+                say!("{label:>14}  {} holds an unfinished bake; --resume would go on with it", path.display());
             }
         } else if checkpoint.resume()? {
-            eprintln!("{label:>14}  {} finished blocks from {}", checkpoint.blocks(), path.display());
+            say!("{label:>14}  {} finished blocks from {}", checkpoint.blocks(), path.display());
         } else {
-            eprintln!("{label:>14}  nothing: there is no {}; starting from the beginning", path.display());
+            say!("{label:>14}  nothing: there is no {}; starting from the beginning", path.display());
         }
         Ok(checkpoint)
     }
@@ -340,10 +340,10 @@ fn keep(checkpoint: &Checkpoint, error: &Error) {
     }
     match checkpoint.save() {
         Ok(true) => {
-            eprintln!("progress is kept in {}; the same command with --resume goes on", checkpoint.path().display())
+            say!("progress is kept in {}; the same command with --resume goes on", checkpoint.path().display())
         }
         Ok(false) => {}
-        Err(e) => eprintln!("warning: the last progress could not be kept: {e}"),
+        Err(e) => say!("warning: the last progress could not be kept: {e}"),
     }
 }
 

@@ -5,7 +5,7 @@ use crate::accuracy::{Accuracy, ReferenceMesh, compare};
 use crate::error::Result;
 use crate::export::bake_file::BakedVolume;
 use crate::export::{Mesh, ply};
-use crate::progress::Progress;
+use crate::progress::{Progress, say};
 use crate::scene_file::Inputs;
 use crate::surface_mesh::texture;
 use std::path::PathBuf;
@@ -55,7 +55,7 @@ impl Compare {
         if let Some(output) = &self.output {
             write_errors(output, &references[0], &errors)?;
             if progress == Progress::Shown {
-                eprintln!("{}: error-coloured mesh", output.display());
+                say!("{}: error-coloured mesh", output.display());
             }
         }
         Ok(())

@@ -3,7 +3,7 @@
 use super::Cli;
 use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
-use crate::progress::Progress;
+use crate::progress::{Progress, say};
 use clap::CommandFactory;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -48,7 +48,7 @@ impl ManualPages {
         root.build();
         let count = write_pages(&self.output, &root, "isolume")?;
         if progress == Progress::Shown {
-            eprintln!("{}: {count} manual pages", self.output.display());
+            say!("{}: {count} manual pages", self.output.display());
         }
         Ok(())
     }

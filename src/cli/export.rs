@@ -3,7 +3,7 @@
 use super::{expect_extension, outputs};
 use crate::error::{Error, Result};
 use crate::export::slices;
-use crate::progress::Progress;
+use crate::progress::{Progress, say};
 use crate::scene_file::{Inputs, RawOptions};
 use crate::volume::vti::{self, VtiFile, VtiWriter};
 use crate::volume::{Lattice, Samples, Space, Volume, npy, nrrd};
@@ -70,7 +70,7 @@ impl Export {
         }
         if progress == Progress::Shown {
             let [x, y, z] = lattice.dims();
-            eprintln!("{}: `{name}`, {x}×{y}×{z} × {components} {}", path.display(), samples.element_type().name());
+            say!("{}: `{name}`, {x}×{y}×{z} × {components} {}", path.display(), samples.element_type().name());
         }
         Ok(())
     }

@@ -4,7 +4,7 @@ use super::{expect_extension, outputs};
 use crate::error::{Error, Result};
 use crate::export::Mesh;
 use crate::export::bake_file::BakedVolume;
-use crate::progress::Progress;
+use crate::progress::{Progress, say};
 use crate::scene::Scene;
 use crate::scene_file::{Inputs, SceneOptions, load};
 use crate::surface_mesh::{SurfaceMesh, channel, display_colours, texture, unit_isovalue};
@@ -73,7 +73,7 @@ impl Extract {
             });
             println!("{numbers:#}");
         } else if progress == Progress::Shown {
-            eprintln!(
+            say!(
                 "{}: {} vertices, {} triangles in {:.2} s",
                 self.output.display(),
                 mesh.positions.len(),

@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::flatland::{PictureSettings, Solution, SolveSettings, Transport, World, load, write_pictures};
-use crate::progress::Progress;
+use crate::progress::{Progress, say};
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -64,7 +64,7 @@ impl Flatland {
             };
             let solution = Solution::new(&world, &settings)?;
             if progress == Progress::Shown {
-                eprintln!(
+                say!(
                     "{transport:?}: {:.1} M rays, {} passes, {:.2} s so far",
                     solution.rays as f64 / 1e6,
                     solution.passes,
@@ -78,7 +78,7 @@ impl Flatland {
         let names = write_pictures(&self.output, &device, &worlds, &settings)?;
         if progress == Progress::Shown {
             let seconds = begun.elapsed().as_secs_f64();
-            eprintln!("{}: {} in {seconds:.2} s", self.output.display(), names.join(", "));
+            say!("{}: {} in {seconds:.2} s", self.output.display(), names.join(", "));
         }
         Ok(())
     }

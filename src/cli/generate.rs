@@ -2,7 +2,7 @@
 
 use super::{expect_extension, writable};
 use crate::error::{Error, Result};
-use crate::progress::Progress;
+use crate::progress::{Progress, say};
 use crate::volume::Volume;
 use crate::volume::generate::fluid::{self, Fluid};
 use crate::volume::generate::molecular_dynamics::MolecularDynamics;
@@ -97,7 +97,7 @@ impl Generate {
         let volume = generator.sample([self.size.unwrap_or(Generator::DIMS[0]); 3])?;
         volume.write(&self.output)?;
         if progress == Progress::Shown {
-            eprintln!("{}: {} of {} samples", self.output.display(), generator.name(), volume.samples().len());
+            say!("{}: {} of {} samples", self.output.display(), generator.name(), volume.samples().len());
         }
         Ok(())
     }
@@ -189,7 +189,7 @@ impl Generate {
     fn summary(&self, md: &MolecularDynamics, link: f64, unit: &str, progress: Progress) {
         if progress == Progress::Shown {
             let sizes = clusters(&md.bounds, &md.positions, link);
-            eprintln!(
+            say!(
                 "{:>14}  {} particles at {:.2} {unit}: {} clusters of 10 or more, the greatest of {}",
                 self.kind,
                 md.positions.len(),
@@ -230,7 +230,7 @@ fn write(path: &Path, volume: &Volume, content: &str, command: &str, progress: P
     if progress == Progress::Shown
         && let Some((lo, hi)) = volume.range()
     {
-        eprintln!("{}: {} density, {lo:.4} … {hi:.4}", path.display(), volume.name);
+        say!("{}: {} density, {lo:.4} … {hi:.4}", path.display(), volume.name);
     }
     Ok(())
 }

@@ -3,7 +3,7 @@
 use super::{expect_extension, export};
 use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
-use crate::progress::Progress;
+use crate::progress::{Progress, say};
 use crate::scene_file::RawOptions;
 use crate::volume::statistics::VolumeStatistics;
 use std::io::Write;
@@ -42,7 +42,7 @@ impl Init {
         file.write_all(text.as_bytes()).map_err(|e| Error::io(&output, e))?;
         file.commit()?;
         if progress == Progress::Shown {
-            eprintln!("{}: edit it, then: isolume bake {} -o lit.vti", output.display(), output.display());
+            say!("{}: edit it, then: isolume bake {} -o lit.vti", output.display(), output.display());
         }
         Ok(())
     }

@@ -5,7 +5,7 @@ use super::{device, expect_extension, outputs};
 use crate::embree::{Device, GraphTracer, SurfaceTracer};
 use crate::error::{Error, Result};
 use crate::export::picture::Picture;
-use crate::progress::Progress;
+use crate::progress::{Progress, say};
 use crate::reference::{Integrator, Reference, ReferenceSettings, SurfaceMapSettings, path_picture, reference};
 use crate::render::Camera;
 use crate::scene::Scene;
@@ -111,7 +111,7 @@ impl ReferenceArgs {
             });
             println!("{numbers:#}");
         } else if progress == Progress::Shown {
-            eprintln!(
+            say!(
                 "{}: {count} of {} vertices in {seconds:.2} s ({:.0} vertices/s, {:.2} M rays/s), {inside} rays began inside",
                 self.output.display(),
                 mesh.local.len(),

@@ -3,7 +3,7 @@
 use super::{expect_extension, outputs};
 use crate::error::Result;
 use crate::export::bake_file::BakedVolume;
-use crate::progress::Progress;
+use crate::progress::{Progress, say};
 use crate::scene_file::Inputs;
 use crate::view;
 use std::path::PathBuf;
@@ -34,7 +34,7 @@ impl View {
         outputs([&*self.output], &Inputs::files([&*self.file]))?;
         let baked = BakedVolume::read(&self.file)?;
         if view::leaves_out(&baked.scene) && progress == Progress::Shown {
-            eprintln!(
+            say!(
                 "warning: context geometry is left out: {} polygons, and a page draws {}",
                 baked.scene.polygons().len(),
                 view::MOST_POLYGONS
@@ -45,11 +45,7 @@ impl View {
         let bytes = view::write(&self.output, &baked, &title).map_err(|e| e.in_file(&self.file))?;
         if progress == Progress::Shown {
             let [x, y, z] = baked.lattice().dims();
-            eprintln!(
-                "{}: {x}×{y}×{z} points in {:.1} MB; open it in a browser",
-                self.output.display(),
-                bytes as f64 / 1e6
-            );
+            say!("{}: {x}×{y}×{z} points in {:.1} MB; open it in a browser", self.output.display(), bytes as f64 / 1e6);
         }
         Ok(())
     }

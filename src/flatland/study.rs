@@ -10,7 +10,7 @@ use crate::embree::Device;
 use crate::error::{Error, Result};
 use crate::field::Sweep;
 use crate::nearest::{Neighbours, PointGrid};
-use crate::progress::Progress;
+use crate::progress::{Progress, say};
 use crate::rng::{Rng, Sobol, Stage};
 use glam::{DVec2, DVec3, Vec3};
 use rayon::prelude::*;
@@ -232,7 +232,7 @@ pub fn flatland(folder: &Path, device: &Device, settings: &StudySettings, progre
             let (measured, positions, grid) = bench.measure(placement, count)?;
             if progress == Progress::Shown {
                 let (name, n) = (placement.name(), measured.samples);
-                eprintln!("{name:>14}  {n:>8} samples: {:.2} % in {:.2} s", measured.percent_rms, measured.seconds);
+                say!("{name:>14}  {n:>8} samples: {:.2} % in {:.2} s", measured.percent_rms, measured.seconds);
             }
             if count == 20_000 {
                 rows.push(figure5(&bench, &positions, &grid));
@@ -251,7 +251,7 @@ pub fn flatland(folder: &Path, device: &Device, settings: &StudySettings, progre
         stacked(&rows).write_png(folder.join("figure5.png"), 1.0)?;
     }
     if progress == Progress::Shown {
-        eprintln!("{}: study.csv, study.md, study.svg, figure5.png", folder.display());
+        say!("{}: study.csv, study.md, study.svg, figure5.png", folder.display());
     }
     Ok(())
 }
