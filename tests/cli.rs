@@ -363,6 +363,41 @@ fn binary_volumes_are_baked_by_exact_rays() {
     assert!(lines.contains("engine  sweep") && !lines.contains("warning"), "{lines}");
 }
 
+/// Bumps on an offset a thousand million times their range: the bake has the isosurfaces of its volume, which are those without it.
+#[test]
+fn bakes_of_data_on_an_offset_hold_their_isosurfaces() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "13", "-o", "b.vti", "-q"]);
+    let bumps = Volume::open(dir.join("b.vti")).unwrap();
+    let raised = (0..bumps.lattice.len()).map(|o| 1e9 + 0.01 * bumps.value(o)).collect();
+    Volume::new("raised", bumps.lattice.clone(), Samples::F64(raised)).unwrap().write(dir.join("raised.vti")).unwrap();
+    let bake = |volume: &str, output: &str, sweep: [&str; 2], more: &[&str]| {
+        let given = ["bake", volume, "-o", output, "--preset", "preview", "-q", "--isovalues", sweep[0], sweep[1]];
+        ok(dir, &[&given[..], more].concat());
+    };
+    let surface = |bake: &str, isovalue: &str| {
+        ok(dir, &["extract", bake, "--isovalue", isovalue, "-o", "s.ply", "-q"]);
+        let mesh = isolume::export::ply::read(dir.join("s.ply")).unwrap();
+        mesh.triple(["x", "y", "z"]).unwrap()
+    };
+    for grid in ["1x", "2x"] {
+        bake("b.vti", "lit.vti", ["5", "95"], &["--grid", grid]);
+        bake("raised.vti", "high.vti", ["1000000000.05", "1000000000.95"], &["--grid", grid]);
+        let (plain, raised) = (surface("lit.vti", "47"), surface("high.vti", "1000000000.47"));
+        assert!(plain.len() == raised.len() && plain.len() > 100, "{grid}: {} {}", plain.len(), raised.len());
+        let off =
+            plain.iter().zip(&raised).flat_map(|(a, b)| [0, 1, 2].map(|x| (a[x] - b[x]).abs())).fold(0.0, f32::max);
+        let size = bumps.lattice.spacing().max_element();
+        assert!(f64::from(off) < 1e-3 * size, "{grid}: {off} of {size}");
+    }
+    let stored = |name: &str| {
+        let file = VtiFile::read(&dir.join(name)).unwrap();
+        matches!(file.point_data.iter().find(|a| a.name == "value").unwrap().samples, Samples::F32(_))
+    };
+    assert!(stored("lit.vti") && !stored("high.vti"), "no more bytes than are needed");
+}
+
 /// Two volumes: a file each and one that names them; every verb that should takes them.
 #[test]
 fn a_headerless_file_may_have_flipped_axes() {

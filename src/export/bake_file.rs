@@ -17,6 +17,7 @@ use crate::scene::{Boundary, Member, Policy, Scene, Surface};
 use crate::volume::vti::{self, VtiArray, VtiFile, VtiWriter};
 use crate::volume::{Lattice, Samples, Volume};
 use glam::DVec3;
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
@@ -105,7 +106,10 @@ pub fn field_file(path: &Path, name: &str) -> PathBuf {
     path.with_file_name(format!("{stem}-{name}.vti"))
 }
 
-/// Writes a bake. Point data: `value` (source units, active scalars), `radiance` (linear RGB), `rgb` (exposed, clamped,
+/// Steps of f32 this large, in sweeps, are steps to be seen in a surface.
+const COARSE: f64 = 1e-5;
+
+/// Writes a bake. Point data: `value` (source units, active scalars; in f64 where the sweep is narrow for its isovalues' size), `radiance` (linear RGB), `rgb` (exposed, clamped,
 /// sRGB-encoded), `std_error` (of luminance), `mask` ([`Mask`]); with both sides also `radiance_inside` and so on. Field
 /// data: `wall_<name>` radiance over (u, v, isovalue), `context` the same of all context geometry, exposure, every number of the report, and all of it as JSON.
 ///
@@ -123,9 +127,7 @@ fn completed(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
     let own = lattice == &volume.lattice;
     let sweep = scene.field.sweep();
     let rows = FieldRows::new(&scene.field, lattice);
-    let value = |o: usize| {
-        if own { volume.value(o) as f32 } else { sweep.from_unit(rows.value(lattice.ijk(o))) as f32 }
-    };
+    let value = |o: usize| if own { volume.value(o) } else { sweep.from_unit(rows.value(lattice.ijk(o))) };
     let exposure = bake.exposure as f32;
     let mut textures = Vec::new();
     let mut texels: Vec<(String, Cow<'_, [f32]>)> = Vec::new();
@@ -184,9 +186,16 @@ fn completed(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
         .chain([("exposure".to_owned(), vec![bake.exposure]), ("isovalues".to_owned(), range.to_vec())])
         .map(|(name, v)| (name, Samples::F64(v)))
         .collect();
-    let mut writer = VtiWriter::new(lattice).computed("value", 1, value).active_scalars("value");
+    let doubles: Option<Vec<f64>> =
+        coarse(&sweep).then(|| (0..lattice.len()).into_par_iter().with_min_len(1 << 12).map(value).collect());
+    let mut writer = VtiWriter::new(lattice);
+    writer = match &doubles {
+        Some(doubles) => writer.point_data("value", 1, &doubles[..]),
+        None => writer.computed("value", 1, |o| value(o) as f32),
+    };
+    writer = writer.active_scalars("value");
     if scene.fields() > 1 {
-        writer = writer.computed("s", 1, |o| sweep.isovalue(f64::from(value(o))));
+        writer = writer.computed("s", 1, |o| sweep.isovalue(value(o)));
     }
     for (i, (_, grid)) in bake.sides.iter().enumerate() {
         let s = suffix(i);
@@ -204,6 +213,11 @@ fn completed(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
         writer = writer.field_data(name, 1, samples);
     }
     writer.field_string(vti::SPACE, volume.space.name()).field_string(DESCRIPTION, &json).complete(path)
+}
+
+/// Whether f32 tells a sweep's isovalues apart too coarsely, as with a large offset.
+fn coarse(sweep: &Sweep) -> bool {
+    sweep.lo().abs().max(sweep.hi().abs()) * f64::from(f32::EPSILON) > COARSE * (sweep.hi() - sweep.lo())
 }
 
 /// Every number of a JSON tree by its dotted path.
@@ -326,8 +340,11 @@ impl BakedVolume {
             };
             sides.push((side, grid));
         }
-        let values = floats(&file.point_data, "value", points)?;
-        let volume = Volume::new(path.display().to_string(), file.lattice, Samples::F32(values))?;
+        let values = match array(&file.point_data, "value")? {
+            values @ Samples::F64(_) if values.len() == points => values,
+            _ => Samples::F32(floats(&file.point_data, "value", points)?),
+        };
+        let volume = Volume::new(path.display().to_string(), file.lattice, values)?;
         let field = Field::new(&volume, Sweep::new(d.isovalues[0], d.isovalues[1])?)?;
         let polygons = d
             .polygons
