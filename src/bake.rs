@@ -276,7 +276,11 @@ pub fn left_out(scene: &Scene, grid: &GridSize) -> Result<Option<f64>> {
     let mut most = 0.0f64;
     for member in scene.members() {
         let field = &member.field;
-        most = most.max(unknown_share(field, &grid.lattice(field.lattice())?));
+        let grid = grid.lattice(field.lattice())?;
+        let share = unknown_share(field, field.lattice());
+        // What a volume's own points know finer grids know, too.
+        let known = grid == *field.lattice() || (share <= UNKNOWN && grid.len() > field.lattice().len());
+        most = most.max(if known { share } else { unknown_share(field, &grid) });
     }
     Ok((most > UNKNOWN).then_some(most))
 }

@@ -172,12 +172,50 @@ pub fn stand_ins<const N: usize>(field: &Field, lattice: &Lattice, o: usize, see
     }
     let cell = field.lattice().far() / lattice.far();
     let mut rng = Rng::stream(seed, Stage::Cache, o as u64);
-    let tries = (0..16 * N).map(|_| {
+    let around = |rng: &mut Rng| {
         let p = centre + (DVec3::new(rng.unit(), rng.unit(), rng.unit()) * 2.0 - 1.0) * cell;
         p.clamp(DVec3::ZERO, field.lattice().far())
-    });
+    };
+    let tries = (0..16 * N).map(|_| around(&mut rng));
     found.iter_mut().zip(tries.filter(usable)).for_each(|(place, p)| *place = Some(p));
+    if found[0].is_none() {
+        // A sweep that is a thin slice of its cells lies on the way from anywhere to one of their corners.
+        let corners =
+            (0..27).map(|n| centre + (DVec3::new((n % 3) as f64, (n / 3 % 3) as f64, (n / 9) as f64) - 1.0) * cell);
+        let corners = corners.map(|p| p.clamp(DVec3::ZERO, field.lattice().far())).map(|p| (field.value(p), p));
+        let corners: Vec<(f64, DVec3)> = corners.filter(|(h, _)| h.is_finite()).collect();
+        let lowest = corners.iter().min_by(|a, b| a.0.total_cmp(&b.0));
+        let highest = corners.iter().max_by(|a, b| a.0.total_cmp(&b.0));
+        if let (Some(&lowest), Some(&highest)) = (lowest, highest) {
+            let ways = (0..16 * N).filter_map(|_| between(field, around(&mut rng), [lowest, highest], rng.unit()));
+            found.iter_mut().zip(ways.filter(usable)).for_each(|(place, p)| *place = Some(p));
+        }
+    }
     found
+}
+
+/// A place of f32 where h is in the sweep, around `isovalue`, on the way from `p` to the one of two places with h at them that lies
+/// on the other side; `None` if there is none.
+fn between(field: &Field, p: DVec3, [lowest, highest]: [(f64, DVec3); 2], isovalue: f64) -> Option<DVec3> {
+    let h = field.value(p);
+    if !(h.is_finite() && lowest.0 <= isovalue && highest.0 >= isovalue) {
+        return None;
+    }
+    let (mut low, mut high) = if h < isovalue { (p, highest.1) } else { (lowest.1, p) };
+    // Until f32 tells no more places apart.
+    for _ in 0..32 {
+        let middle = (0.5 * (low + high)).as_vec3().as_dvec3();
+        let h = field.value(middle);
+        if (0.0..=1.0).contains(&h) {
+            return Some(middle);
+        }
+        if h < isovalue {
+            low = middle;
+        } else {
+            high = middle;
+        }
+    }
+    None
 }
 
 #[cfg(test)]
@@ -217,6 +255,34 @@ mod tests {
         assert_eq!(share(&|_| true), 1.0);
         let half = share(&|x| x > 0.0);
         assert!((0.1..0.5).contains(&half), "{half}");
+    }
+
+    /// Waves over a sweep of a thousandth of a voxel's step: every point whose cells it crosses has places in it.
+    #[test]
+    fn thin_sweeps_have_stand_ins_everywhere() {
+        let lattice = Lattice::aligned([16; 3], DVec3::ZERO, DVec3::ONE).unwrap();
+        let h = |o: usize| {
+            let [i, j, k] = lattice.ijk(o).map(|i| i as f64);
+            (0.7 * i).sin() + (0.5 * j + 1.0).cos() + 0.3 * k
+        };
+        let samples = Samples::F64((0..lattice.len()).map(h).collect());
+        let volume = Volume::new("waves", lattice.clone(), samples).unwrap();
+        // Wide enough for points to fall into it, it may have fewer than are asked for.
+        for (lo, hi, wanted) in [(2.0, 2.0003, 4), (2.0, 2.3, 1)] {
+            let field = Field::new(&volume, Sweep::new(lo, hi).unwrap()).unwrap();
+            let masks = masks(&field, &lattice);
+            let filled: Vec<usize> = (0..masks.len()).filter(|&o| masks[o] == Mask::Filled).collect();
+            let mut all = 0;
+            for &o in &filled {
+                let places: [Option<DVec3>; 4] = stand_ins(&field, &lattice, o, 1);
+                all += usize::from(places[wanted - 1].is_some());
+                for p in places.into_iter().flatten() {
+                    let far = (p - local_position(&field, &lattice, o)).abs().max_element();
+                    assert!((0.0..=1.0).contains(&field.value(p)) && far <= 1.0, "{lo} {hi} {o}: {p}");
+                }
+            }
+            assert!(filled.len() > 400 && all * 100 > filled.len() * 99, "{lo} … {hi}: {all} of {}", filled.len());
+        }
     }
 
     /// Along each axis and across the slices that are looked at together: one point of the sweep among emptiness.
