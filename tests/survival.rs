@@ -221,7 +221,7 @@ fn a_full_disk_is_one_clear_line_and_keeps_the_last_checkpoint() {
 /// A bake that no resuming can help: no grid point holds anything of its sweep.
 fn hopeless(dir: &Path, more: &[&str]) -> String {
     let mut command = Command::new(PROGRAM);
-    command.current_dir(dir).args(["bake", "b.vti", "-o", "out.vti", "--isovalues", "50", "50.0000000001"]);
+    command.current_dir(dir).args(["bake", "b.vti", "-o", "out.vti", "--isovalues", "50", "50.00000001"]);
     command.args(["--engine", "sweep", "--preset", "preview"]).args(more);
     let (output, text) = finish(command.stderr(Stdio::piped()).spawn().unwrap());
     assert_eq!(output.status.code(), Some(2), "{text}");
@@ -247,7 +247,7 @@ fn what_can_never_succeed_leaves_no_checkpoint_and_spares_older_ones() {
     assert_eq!(fs::read(&checkpoint).unwrap(), older, "{text}");
     fs::remove_file(&checkpoint).unwrap();
     // Its own, of an interrupted run, however much this one adds.
-    let scene = SceneOptions { isovalues: Some(vec![50.0, 50.0000000001]), ..SceneOptions::default() };
+    let scene = SceneOptions { isovalues: Some(vec![50.0, 50.00000001]), ..SceneOptions::default() };
     let scene = load(&dir.join("b.vti"), &scene).unwrap().scene;
     let options = BakeOptions { engine: Some(Engine::Sweep), preset: Some(Preset::Preview), ..BakeOptions::default() };
     let job = job(&scene, &BakeSettings::new(&options, &scene).unwrap());
