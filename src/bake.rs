@@ -71,6 +71,10 @@ pub struct BakeReport {
     pub rays: u64,
     /// Gather and visibility queries answered by sweeps.
     pub sweep_queries: u64,
+    /// Bounces of sweeps, 0 by photons.
+    pub sweep_bounces: usize,
+    /// The share of indirect light that further bounces of sweeps would change, as far as that is known; NaN where it is not.
+    pub unsettled: f64,
     /// Rays and queries per second of the stages that trace them.
     pub rays_per_second: f64,
     /// Photons.
@@ -132,6 +136,8 @@ struct Lit {
     bands: usize,
     rays: u64,
     sweep_queries: u64,
+    sweep_bounces: usize,
+    unsettled: f64,
     photons: PhotonCounts,
     samples: u64,
     without_gradient: u64,
@@ -313,6 +319,8 @@ fn finish(
             bands: lit.bands,
             rays: lit.rays,
             sweep_queries: lit.sweep_queries,
+            sweep_bounces: lit.sweep_bounces,
+            unsettled: lit.unsettled,
             rays_per_second: (lit.rays + lit.sweep_queries) as f64 / (s.photons + s.cache + s.sweep + s.samples),
             photons: lit.photons,
             samples: lit.samples,

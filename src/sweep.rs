@@ -82,7 +82,7 @@ impl Default for SweepSettings {
         Self {
             directions: 64,
             light_points: 16,
-            max_bounces: 64,
+            max_bounces: 512,
             target: 4e-3,
             replicates: 4,
             flat_resolution: (32, 32),

@@ -66,6 +66,7 @@ pub(super) fn light(
     stage.end()?;
     lit.spend(clock, |s| &mut s.sweep);
     lit.sweep_queries = swept.counts.gather_rays + swept.counts.shadow_rays;
+    (lit.sweep_bounces, lit.unsettled) = (swept.bounces, swept.residual);
 
     let SweepResult { sides: mut swept, lit: own, flats, .. } = swept;
     swept.iter_mut().for_each(|s| whiten(&own, &mut s.irradiance));

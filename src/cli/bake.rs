@@ -301,6 +301,14 @@ impl Bake {
             sum(|r| r.samples_without_gradient),
             each(|r| r.non_finite + r.non_finite_voxels)
         );
+        if let Some(r) = runs.iter().find(|r| r.unsettled > UNSETTLED) {
+            say!(
+                "warning: light has not settled in {} bounces: {:.0} % of what is reflected may be missing; use --engine photon, \
+                 or smaller albedos",
+                r.sweep_bounces,
+                100.0 * r.unsettled
+            );
+        }
         say!("{:>14}  {}", "written", self.output.display());
         for member in scene.members().iter().filter(|_| reports.len() > 1) {
             say!("{:>14}  {}", "", bake_file::field_file(&self.output, &member.name).display());
@@ -331,6 +339,9 @@ impl Bake {
         Ok(checkpoint)
     }
 }
+
+/// The share of indirect light that may be missing without a word: five times what sweeps settle for.
+const UNSETTLED: f64 = 0.02;
 
 /// Saves what is finished and says so, unless the same command would fail with the same `error` again.
 fn keep(checkpoint: &Checkpoint, error: &Error) {
