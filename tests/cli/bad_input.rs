@@ -1,0 +1,196 @@
+//! What cannot be right: one clear line, exit code 2, and nothing left behind.
+
+use super::{QUICK, ok, refused, text};
+use isolume::volume::{Lattice, Samples, Volume};
+use std::fs;
+
+#[test]
+fn bad_input_is_one_clear_line_and_leaves_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    refused(dir, &["bake", "nowhere.nii.gz", "-o", "out.vti"], &["nowhere.nii.gz"]);
+    refused(dir, &["bake", "nowhere.xyz", "-o", "out.vti"], &["nowhere.xyz"]);
+
+    // A gzip stream cut short.
+    let lattice = Lattice::aligned([8, 8, 8], glam::DVec3::ZERO, glam::DVec3::ONE).unwrap();
+    let ramp = Samples::F32((0..512).map(|i| i as f32).collect());
+    Volume::new("ramp", lattice.clone(), ramp).unwrap().write(dir.join("ramp.nrrd")).unwrap();
+    let header = b"NRRD0004\ntype: float\ndimension: 3\nsizes: 8 8 8\nencoding: gzip\nendian: little\n\n";
+    let mut gz = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    std::io::Write::write_all(&mut gz, &[7; 2048]).unwrap();
+    let packed = gz.finish().unwrap();
+    fs::write(dir.join("cut.nrrd"), [&header[..], &packed[..packed.len() / 2]].concat()).unwrap();
+    refused(dir, &["bake", "cut.nrrd", "-o", "out.vti"], &["cut.nrrd"]);
+
+    // A header that promises 10¹² samples.
+    let big = b"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 10000 10000 10000\nencoding: raw\nendian: little\n\nxx";
+    fs::write(dir.join("big.nrrd"), big).unwrap();
+    refused(dir, &["bake", "big.nrrd", "-o", "out.vti"], &["big.nrrd", "1000000000000"]);
+
+    Volume::new("nan", lattice.clone(), Samples::F32(vec![f32::NAN; 512]))
+        .unwrap()
+        .write(dir.join("nan.nrrd"))
+        .unwrap();
+    refused(dir, &["bake", "nan.nrrd", "-o", "out.vti"], &["nan.nrrd", "finite"]);
+    Volume::new("flat", lattice, Samples::F32(vec![3.0; 512])).unwrap().write(dir.join("flat.nrrd")).unwrap();
+    refused(dir, &["bake", "flat.nrrd", "-o", "out.vti"], &["flat.nrrd", "isosurface"]);
+
+    let ramp = ["bake", "ramp.nrrd", "-o", "out.vti"];
+    let with = |extra: &[&'static str]| [&ramp[..], extra].concat();
+    refused(dir, &with(&["--isovalues", "600", "700"]), &["outside the data", "0 … 511"]);
+    refused(dir, &with(&["--isovalues", "7", "7"]), &["isovalues"]);
+    refused(dir, &with(&["--albedo", "1.5"]), &["albedo"]);
+    refused(dir, &with(&["--boundary", "capped"]), &["margin"]);
+    refused(dir, &with(&["--gather", "9999999"]), &["gather"]);
+    refused(dir, &["bake", "ramp.nrrd", "-o", "missing/folder/out.vti"], &["missing"]);
+    refused(dir, &["bake", "ramp.nrrd", "-o", "out.png"], &["out.png", ".vti"]);
+    refused(dir, &["bake", "ramp.nrrd", "-o", "out.nrrd"], &["out.nrrd", "isolume export"]);
+
+    // Before the file is opened, which is not there.
+    for exposure in ["nan", "inf", "-inf", "-1", "0", "-0"] {
+        for output in ["out.png", "out.exr"] {
+            let exposure = format!("--exposure={exposure}");
+            let render = ["render", "nowhere.vti", "--isovalue", "5", "-o", output, &exposure];
+            refused(dir, &render, &["--exposure", "positive"]);
+        }
+    }
+
+    // A luminaire without area, and a scene with an unknown key.
+    fs::write(dir.join("l.mtl"), "newmtl lamp\nKe 1 1 1\n").unwrap();
+    fs::write(dir.join("l.obj"), "mtllib l.mtl\nv 0 0 0\nv 1 1 1\nv 2 2 2\nusemtl lamp\nf 1 2 3\n").unwrap();
+    refused(dir, &with(&["--box", "l.obj"]), &["l.obj", "face 1", "area"]);
+    fs::write(dir.join("s.toml"), "[volume]\nfile = \"ramp.nrrd\"\n\n[surface]\nalbdo = 0.5\n").unwrap();
+    refused(dir, &["bake", "s.toml", "-o", "out.vti"], &["s.toml:5", "albdo", "albedo"]);
+}
+
+/// The surfaces are there, but between the grid's points; a volume without any is another matter.
+#[test]
+fn a_grid_that_is_too_coarse_is_told_from_a_constant_volume() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "20", "-o", "b.nrrd", "-q"]);
+    for engine in ["sweep", "photon"] {
+        let bake = ["bake", "b.nrrd", "--isovalues", "3.6", "95", "-o", "out.vti", "-q", "--engine", engine];
+        refused(dir, &[&bake[..], &["--grid", "2,2,2"]].concat(), &["too coarse", "--grid", "2×2×2"]);
+    }
+    // 0 and 10, and what is not finite between them.
+    let lattice = Lattice::aligned([8; 3], glam::DVec3::ZERO, glam::DVec3::ONE).unwrap();
+    let halves = (0..512).map(|o| [0.0, 0.0, 0.0, f32::NAN, f32::NAN, 10.0, 10.0, 10.0][o % 8]).collect();
+    Volume::new("halves", lattice, Samples::F32(halves)).unwrap().write(dir.join("h.nrrd")).unwrap();
+    for grid in ["1x", "2x"] {
+        let bake = ["bake", "h.nrrd", "--isovalues", "3", "4", "-o", "out.vti", "-q", "--grid", grid];
+        refused(dir, &bake, &["constant", "other isovalues"]);
+    }
+}
+
+/// MTL: one number is grey; what tobj would panic at is refused with its line.
+#[test]
+fn colours_of_an_mtl_are_one_number_or_three() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.nrrd", "-q"]);
+    fs::write(dir.join("w.obj"), "mtllib w.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl w\nf 1 2 3\n").unwrap();
+    fs::write(
+        dir.join("s.toml"),
+        "[volume]\nfile = \"b.nrrd\"\n[box]\nkind = \"none\"\n[[context]]\nfile = \"w.obj\"\n",
+    )
+    .unwrap();
+    let bake = ["bake", "b.nrrd", "--isovalues", "3.6", "95", "-o", "out.vti", "-q", "--dry-run", "--box", "w.obj"];
+    let context = ["bake", "s.toml", "-o", "out.vti", "-q", "--dry-run"];
+    for lines in
+        ["Kd 0.7", "Ks 0", "Ka 0.2", "Tf 1", "Ke 2", "Kd 0.7\nKs 0\nKa 0.2\nTf 1\nKe 2", "Kd 0.1 0.2 0.3 # and more"]
+    {
+        fs::write(dir.join("w.mtl"), format!("newmtl w\n{lines}\n")).unwrap();
+        ok(dir, &bake);
+        ok(dir, &context);
+    }
+    for (line, found) in [
+        ("Kd 0.7 0.7", "Kd 0.7 0.7"),
+        ("Ks", "Ks"),
+        ("Ka red", "Ka red"),
+        ("Ke 1 2 x", "Ke 1 2 x"),
+        ("Kd spectral red.rfl", "Kd spectral red.rfl"),
+        ("Kd # 1 1 1", "Kd # 1 1 1"),
+        ("Ns", "Ns"),
+        ("illum x", "illum x"),
+    ] {
+        fs::write(dir.join("w.mtl"), format!("newmtl w\n\n  {line}\n")).unwrap();
+        refused(dir, &bake, &["w.mtl:3: ", found]);
+        refused(dir, &context, &["s.toml", "w.mtl:3: ", found]);
+    }
+}
+
+/// Radiances are stored in 32 bits, and so are the squares that their standard errors come from.
+#[test]
+fn emissions_that_floats_cannot_square_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.nrrd", "-q"]);
+    let bake = ["bake", "b.nrrd", "--isovalues", "3.6", "95", "-o", "out.vti", "-q", "--dry-run"];
+    let with = |extra: &[&'static str]| [&bake[..], extra].concat();
+    let lamp = |emission: &str| {
+        fs::write(dir.join("l.mtl"), format!("newmtl lamp\nKd 0 0 0\nKe {emission}\n")).unwrap();
+        fs::write(dir.join("l.obj"), "mtllib l.mtl\nv 0 0 1\nv 1 0 1\nv 0 1 1\nusemtl lamp\nf 1 3 2\n").unwrap();
+    };
+    for fine in ["0 0 0", "1e-15 0 0", "1e18 1e18 1e18", "1e18 1e-30 0"] {
+        lamp(fine);
+        ok(dir, &with(&["--box", "l.obj"]));
+    }
+    for wrong in ["1e22 1e22 1e22", "1.1e18 1 1", "0 1e22 0", "9e-16 0 0", "1e-20 1e-20 1e-20", "-1 0 0"] {
+        lamp(wrong);
+        refused(dir, &with(&["--box", "l.obj"]), &["l.obj", "face 1", "emission", "1e-15", "1e18"]);
+    }
+    ok(dir, &with(&["--emission", "1e18"]));
+    ok(dir, &with(&["--emission", "1e-15,0,0"]));
+    for wrong in ["1e22", "1e-20", "0,0,2e18", "inf", "nan", "-1"] {
+        let emission = format!("--emission={wrong}");
+        refused(dir, &[&bake[..], &[&emission]].concat(), &["emission", "1e-15", "1e18"]);
+    }
+    fs::write(dir.join("s.toml"), "[volume]\nfile = \"b.nrrd\"\n[surface]\nemission = 1e22\n").unwrap();
+    refused(dir, &["bake", "s.toml", "-o", "out.vti"], &["s.toml", "emission", "1e18"]);
+}
+
+/// What would change a bake's scene is refused where a bake is read: its light is that of the scene it holds.
+#[test]
+fn scene_flags_are_refused_where_the_input_is_a_bake() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
+    ok(dir, &[&["bake", "b.vti", "--isovalues", "30", "60", "-o", "lit.vti", "-q"], &QUICK[..]].concat());
+    let verbs: [&[&str]; 5] = [
+        &["reference", "--samples", "16", "--vertices", "5", "-o", "r.ply"],
+        &["extract", "-o", "m.ply"],
+        &["render", "-o", "p.png", "--height", "8", "--samples", "1"],
+        &["render", "-o", "p.png", "--height", "8", "--samples", "1", "--local"],
+        &["render", "-o", "p.png", "--height", "8", "--samples", "1", "--reference"],
+    ];
+    for verb in verbs {
+        let with = |extra: &[&'static str]| [verb, &["lit.vti", "-q"], extra].concat();
+        for flags in [
+            &["--isovalues", "49", "51"][..],
+            &["--time", "1"],
+            &["--albedo", "0"],
+            &["--emission", "1"],
+            &["--outside", "higher"],
+            &["--sides", "both"],
+            &["--boundary", "open"],
+            &["--box", "none"],
+            &["--margin", "0"],
+            &["--raw-skip", "0"],
+        ] {
+            let named = if flags[0].starts_with("--raw") { "--raw-…" } else { flags[0] };
+            let says = ["lit.vti", &format!("{named}: "), "the bake holds its scene"];
+            refused(dir, &with(&[flags, &["--isovalue", "50"]].concat()), &says);
+        }
+        // No light is no light of 0.
+        refused(dir, &with(&["--isovalue", "90"]), &["90", "outside the sweep", "30 … 60"]);
+        ok(dir, &with(&["--isovalue", "50"]));
+    }
+    refused(dir, &["extract", "lit.vti", "-o", "m.ply", "--isovalue", "90"], &["lit.vti", "isolume export", "value"]);
+    // The way that the message says, and a volume as it was.
+    ok(dir, &["export", "lit.vti", "--array", "value", "-o", "value.vti", "-q"]);
+    for volume in ["value.vti", "b.vti"] {
+        ok(dir, &["extract", volume, "-o", "m.ply", "--isovalue", "90", "--outside", "higher", "-q"]);
+    }
+    assert!(!text(&fs::read(dir.join("m.ply")).unwrap()).contains("radiance"));
+}

@@ -1,0 +1,72 @@
+//! Which engine lights a scene, and what is said about it.
+
+use super::{ok, refused, text};
+use isolume::volume::vti::VtiFile;
+use isolume::volume::{Lattice, Samples, Volume};
+use std::fs;
+
+/// Sweeps, unless the scene, an option or the user asks for photons; options of both need a word.
+#[test]
+fn scene_and_options_choose_the_engine() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "13", "-o", "b.nrrd", "--quiet"]);
+    fs::write(dir.join("needle.obj"), "v .4 .4 .4\nv .6 .4 .4\nv .4 .6 .4\nf 1 2 3\n").unwrap();
+    let volume = "isovalues = [10, 90]\n[volume]\nfile = \"b.nrrd\"\n";
+    fs::write(dir.join("plain.toml"), volume).unwrap();
+    fs::write(dir.join("needle.toml"), format!("{volume}[[context]]\nfile = \"needle.obj\"\n")).unwrap();
+    fs::write(dir.join("map.toml"), format!("{volume}[bake]\ngather = 0\n")).unwrap();
+    for (scene, more, engine) in [
+        ("plain.toml", &[][..], "sweep"),
+        ("plain.toml", &["--preset", "reference", "--grid", "2x"], "sweep"),
+        ("plain.toml", &["--directions", "64"], "sweep"),
+        ("plain.toml", &["--photons", "1000"], "photon"),
+        ("plain.toml", &["--strategy", "planes"], "photon"),
+        ("plain.toml", &["--engine", "photon"], "photon"),
+        ("plain.toml", &["--engine", "sweep", "--gather", "8"], "sweep"),
+        ("map.toml", &[], "photon"),
+        ("map.toml", &["--engine", "sweep"], "sweep"),
+        ("needle.toml", &[], "photon"),
+    ] {
+        let dry = ok(dir, &[&["bake", scene, "-o", "out.vti", "--dry-run"], more].concat());
+        let lines = text(&dry.stderr);
+        assert!(lines.contains(&format!("engine  {engine}")), "{scene} {more:?}: {lines}");
+    }
+    let both = ["bake", "map.toml", "-o", "out.vti", "--directions", "64"];
+    refused(dir, &both, &["gather", "directions", "photon engine", "sweep engine"]);
+    refused(dir, &["bake", "needle.toml", "-o", "out.vti", "--engine", "sweep"], &["needle", "--engine photon"]);
+    // A bake says what it was.
+    ok(dir, &["bake", "plain.toml", "-o", "out.vti", "--preset", "preview", "--report", "r.json", "--quiet"]);
+    let report: serde_json::Value = serde_json::from_slice(&fs::read(dir.join("r.json")).unwrap()).unwrap();
+    assert_eq!(report["settings"]["engine"], "sweep");
+    assert!(report["sweep_queries"].as_u64() > Some(50_000) && report["photons"]["emitted"] == 0, "{report}");
+}
+
+/// A cavity in a volume of zeros and ones: no grid point holds light of its own level set, and what sweeps know of it is its emission.
+/// Its walls emit 1 and reflect half: 2 comes from everywhere.
+#[test]
+fn binary_volumes_are_baked_by_exact_rays() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let lattice = Lattice::aligned([20; 3], glam::DVec3::ZERO, glam::DVec3::ONE).unwrap();
+    let outside = |o: usize| lattice.ijk(o).iter().map(|&i| (i as f64 - 9.5).powi(2)).sum::<f64>() > 36.0;
+    let samples = Samples::U8((0..lattice.len()).map(|o| u8::from(outside(o))).collect());
+    Volume::new("cavity", lattice.clone(), samples).unwrap().write(dir.join("cavity.vti")).unwrap();
+    let bake =
+        ["bake", "cavity.vti", "--isovalues", ".25", ".75", "--box", "none", "--emission", "1", "--albedo", ".5"];
+    let more = ["--preset", "preview", "-o", "lit.vti"];
+    let lines = text(&ok(dir, &[&bake[..], &more].concat()).stderr);
+    assert!(lines.contains("engine  photon") && !lines.contains("warning"), "{lines}");
+    let file = VtiFile::read(&dir.join("lit.vti")).unwrap();
+    let of = |name: &str| &file.point_data.iter().find(|a| a.name == name).unwrap().samples;
+    let (Samples::F32(light), Samples::U8(mask)) = (of("radiance"), of("mask")) else { panic!("other types") };
+    let lit: Vec<f32> = light.chunks_exact(3).zip(mask).filter(|(_, m)| **m != 0).map(|(rgb, _)| rgb[0]).collect();
+    let mean = lit.iter().sum::<f32>() / lit.len() as f32;
+    assert!(lit.len() > 500 && (1.9..2.1).contains(&mean), "{mean} of {}", lit.len());
+    // Sweeps that are asked for say what they leave out; on a finer grid points lie within the sweep.
+    let dry = |more: &[&str]| text(&ok(dir, &[&bake[..], &["-o", "lit.vti", "--dry-run"], more].concat()).stderr);
+    let lines = dry(&["--engine", "sweep"]);
+    assert!(lines.contains("warning: samples jump over the whole sweep at 100 %"), "{lines}");
+    let lines = dry(&["--grid", "2x"]);
+    assert!(lines.contains("engine  sweep") && !lines.contains("warning"), "{lines}");
+}

@@ -1,0 +1,74 @@
+//! What is written where: never over an input, never twice, and into a pipe only while someone reads it.
+
+use super::{QUICK, isolume, ok, refused, text};
+use isolume::volume::vti::VtiFile;
+use std::fs;
+use std::process::Command;
+
+#[test]
+fn a_second_bake_never_harms_the_first_unless_it_finishes() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    fs::write(dir.join("keep.vti"), "precious").unwrap();
+    ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
+    let output = isolume(dir, &["bake", "b.vti", "-o", "keep.vti", "--isovalues", "500", "600"]);
+    assert_eq!(output.status.code(), Some(2));
+    assert_eq!(fs::read(dir.join("keep.vti")).unwrap(), b"precious");
+    let mut bake = vec!["bake", "b.vti", "-o", "keep.vti", "--isovalues", "3.6", "95", "-q"];
+    bake.extend(QUICK);
+    assert_eq!(text(&ok(dir, &bake).stderr), "", "--quiet is quiet");
+    assert!(VtiFile::read(&dir.join("keep.vti")).is_ok());
+}
+
+/// Whatever a verb reads is as it was, and nothing is written twice.
+#[test]
+fn no_output_takes_the_place_of_an_input() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
+    let mut bake = vec!["bake", "b.vti", "-o", "lit.vti", "--isovalues", "3.6", "95", "-q"];
+    bake.extend(QUICK);
+    ok(dir, &bake);
+    let reference = ["--isovalue", "47", "--samples", "2", "--batches", "2", "-q"];
+    ok(dir, &[&["reference", "b.vti", "--isovalues", "3.6", "95", "-o", "r.ply"], &reference[..]].concat());
+    fs::create_dir(dir.join("series")).unwrap();
+    for n in 0..3 {
+        fs::copy(dir.join("b.vti"), dir.join(format!("series/rho_{n:04}.vti"))).unwrap();
+    }
+    fs::write(dir.join("room.obj"), "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").unwrap();
+    let scene = "isovalues = [3.6, 95]\n[volume]\nfile = \"b.vti\"\n[[context]]\nfile = \"room.obj\"\n";
+    fs::write(dir.join("scene.toml"), scene).unwrap();
+    let all = || {
+        let files =
+            ["b.vti", "lit.vti", "r.ply", "room.obj", "scene.toml", "series/rho_0000.vti", "series/rho_0002.vti"];
+        files.map(|name| fs::read(dir.join(name)).unwrap())
+    };
+    let before = all();
+    let taken = |args: &[&str], words: &[&str]| refused(dir, args, words);
+    taken(&["bake", "b.vti", "-o", "b.vti"], &["b.vti", "is an input"]);
+    taken(&["bake", "scene.toml", "-o", "./b.vti"], &["b.vti", "is an input"]);
+    taken(&["bake", "b.vti", "-o", "new.vti", "--report", "b.vti"], &["b.vti", "is an input"]);
+    taken(&["bake", "b.vti", "-o", "new.vti", "--report", "new.vti"], &["new.vti", "two outputs"]);
+    taken(&["bake", "b.vti", "-o", "new.vti", "--checkpoint", "new.vti"], &["new.vti", "two outputs"]);
+    taken(&["bake", "series/rho_%04d.vti", "-o", "series/rho.vti"], &["rho_%04d.vti", "would be a frame"]);
+    let two = "isovalues = [3.6, 95]\n[[volume]]\nname = \"a\"\nfile = \"b.vti\"\n[[volume]]\nname = \"b\"\nfile = \"b-a.vti\"\n";
+    fs::write(dir.join("two.toml"), two).unwrap();
+    fs::copy(dir.join("b.vti"), dir.join("b-a.vti")).unwrap();
+    taken(&["bake", "two.toml", "-o", "b.vtm"], &["b-a.vti", "is an input"]);
+    taken(&["compare", "lit.vti", "r.ply", "-o", "r.ply"], &["r.ply", "is an input"]);
+    taken(&["export", "lit.vti", "-o", "lit.vti"], &["lit.vti", "is an input"]);
+    taken(&["extract", "scene.toml", "--isovalue", "47", "-o", "room.obj"], &["room.obj", "is an input"]);
+    assert!(all() == before && !dir.join("new.vti").exists());
+}
+
+#[test]
+fn a_pipe_that_nobody_reads_is_no_fault() {
+    let dir = tempfile::tempdir().unwrap();
+    ok(dir.path(), &["generate", "bumps", "--size", "9", "-o", "b.vti"]);
+    let mut command = Command::new(env!("CARGO_BIN_EXE_isolume"));
+    command.current_dir(dir.path()).args(["info", "b.vti", "--json"]);
+    let mut child = command.stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::piped()).spawn().unwrap();
+    drop(child.stdout.take());
+    let output = child.wait_with_output().unwrap();
+    assert!(output.status.success() && output.stderr.is_empty(), "{}", text(&output.stderr));
+}

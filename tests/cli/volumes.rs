@@ -1,0 +1,155 @@
+//! Volumes of every kind from file to file: simulated, on an offset, without a header, with axes that mean something,
+//! several in a scene.
+
+use super::{QUICK, ok, refused, text};
+use isolume::volume::vti::VtiFile;
+use isolume::volume::{Samples, Volume};
+use std::fs;
+
+#[test]
+fn simulations_write_one_file_per_field() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let small = ["--size", "13", "--steps", "20", "--particles", "400", "--density", "0.05"];
+    let with = |args: &[&'static str]| [args, &small[..]].concat();
+    ok(dir, &with(&["generate", "pasta", "--species", "both", "-o", "p.vti"]));
+    ok(dir, &with(&["generate", "pasta", "-o", "p.nrrd"]));
+    ok(dir, &with(&["generate", "fluid", "-o", "f.vti"]));
+    assert!(!dir.join("p.vti").exists());
+    let [protons, neutrons, all] =
+        ["p-proton.vti", "p-neutron.vti", "p.nrrd"].map(|f| Volume::open(dir.join(f)).unwrap());
+    for o in 0..all.lattice.len() {
+        assert!((protons.value(o) + neutrons.value(o) - all.value(o)).abs() < 1e-6, "sample {o}");
+    }
+    let edge = all.lattice.world_volume().cbrt();
+    assert!((edge - 20.0).abs() < 1e-9, "400 nucleons at 0.05 per fm³: {edge}");
+    assert!(Volume::open(dir.join("f.vti")).unwrap().range().unwrap().1 > 0.0);
+    assert!(text(&fs::read(dir.join("p-proton.vti")).unwrap()[..4096]).contains("generator"), "provenance");
+    // A volume's notes are not a bake's description of itself.
+    let (lo, hi) = Volume::open(dir.join("f.vti")).unwrap().range().unwrap();
+    ok(dir, &["extract", "f.vti", "--isovalue", &(0.5 * (lo + hi)).to_string(), "-o", "f.ply"]);
+    refused(dir, &["generate", "pasta", "--particles", "9", "-o", "out.vti"], &["--particles 9"]);
+    refused(dir, &["generate", "fluid", "--species", "proton", "-o", "out.vti"], &["--species"]);
+    refused(dir, &["generate", "bumps", "--seed", "2", "-o", "out.vti"], &["bumps", "pasta"]);
+}
+
+/// Bumps on an offset a thousand million times their range: the bake has the isosurfaces of its volume, which are those without it.
+#[test]
+fn bakes_of_data_on_an_offset_hold_their_isosurfaces() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "13", "-o", "b.vti", "-q"]);
+    let bumps = Volume::open(dir.join("b.vti")).unwrap();
+    let raised = (0..bumps.lattice.len()).map(|o| 1e9 + 0.01 * bumps.value(o)).collect();
+    Volume::new("raised", bumps.lattice.clone(), Samples::F64(raised)).unwrap().write(dir.join("raised.vti")).unwrap();
+    let bake = |volume: &str, output: &str, sweep: [&str; 2], more: &[&str]| {
+        let given = ["bake", volume, "-o", output, "--preset", "preview", "-q", "--isovalues", sweep[0], sweep[1]];
+        ok(dir, &[&given[..], more].concat());
+    };
+    let surface = |bake: &str, isovalue: &str| {
+        ok(dir, &["extract", bake, "--isovalue", isovalue, "-o", "s.ply", "-q"]);
+        let mesh = isolume::export::ply::read(dir.join("s.ply")).unwrap();
+        mesh.triple(["x", "y", "z"]).unwrap()
+    };
+    for grid in ["1x", "2x"] {
+        bake("b.vti", "lit.vti", ["5", "95"], &["--grid", grid]);
+        bake("raised.vti", "high.vti", ["1000000000.05", "1000000000.95"], &["--grid", grid]);
+        let (plain, raised) = (surface("lit.vti", "47"), surface("high.vti", "1000000000.47"));
+        assert!(plain.len() == raised.len() && plain.len() > 100, "{grid}: {} {}", plain.len(), raised.len());
+        let off =
+            plain.iter().zip(&raised).flat_map(|(a, b)| [0, 1, 2].map(|x| (a[x] - b[x]).abs())).fold(0.0, f32::max);
+        let size = bumps.lattice.spacing().max_element();
+        assert!(f64::from(off) < 1e-3 * size, "{grid}: {off} of {size}");
+    }
+    let stored = |name: &str| {
+        let file = VtiFile::read(&dir.join(name)).unwrap();
+        matches!(file.point_data.iter().find(|a| a.name == "value").unwrap().samples, Samples::F32(_))
+    };
+    assert!(stored("lit.vti") && !stored("high.vti"), "no more bytes than are needed");
+}
+
+#[test]
+fn a_headerless_file_may_have_flipped_axes() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    fs::write(dir.join("r.raw"), (0..12).collect::<Vec<u8>>()).unwrap();
+    let place = ["--raw-dims", "3,2,2", "--raw-spacing", "-1,2,-3", "--raw-origin", "-7,0,1"];
+    let info = ok(dir, &[&["info", "r.raw", "--json"], &place[..]].concat());
+    let json: serde_json::Value = serde_json::from_slice(&info.stdout).unwrap();
+    assert_eq!(json["axes"], serde_json::json!([[-1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, -3.0]]));
+    assert_eq!(json["origin"], serde_json::json!([-7.0, 0.0, 1.0]));
+}
+
+/// What Slicer draws mirrored if it is lost.
+#[test]
+fn what_the_axes_mean_goes_from_file_to_file() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.nrrd", "--quiet"]);
+    ok(dir, &["export", "b.nrrd", "--space", "ras", "-o", "b.vti", "--quiet"]);
+    let mut bake = vec!["bake", "b.vti", "--isovalues", "3.6", "95", "-o", "lit.vti", "--quiet"];
+    bake.extend(QUICK);
+    ok(dir, &bake);
+    for input in ["b.vti", "lit.vti"] {
+        ok(dir, &["export", input, "-o", "e.nrrd", "--quiet"]);
+        let head = text(&fs::read(dir.join("e.nrrd")).unwrap());
+        assert!(head.contains("\nspace: right-anterior-superior\n"), "{input}");
+    }
+}
+
+/// Two volumes: a file each and one that names them; every verb that should takes them.
+#[test]
+fn several_volumes_in_one_scene() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let scene = "[[volume]]\nname = \"a\"\ngenerator = \"bumps\"\nsize = 13\nisovalues = [10, 90]\n\
+        [[volume]]\nname = \"b\"\ngenerator = \"sphere\"\nsize = 9\norigin = [0.05, 0.1, 0.02]\nscale = 0.3\n\
+        isovalues = [0.02, 0.2]\nalbedo = [0.8, 0.1, 0.1]\noutside = \"higher\"\n";
+    fs::write(dir.join("two.toml"), scene).unwrap();
+    refused(dir, &["bake", "two.toml", "-o", "two.vti"], &["two.vti", ".vtm", "2"]);
+    refused(dir, &["bake", "two.toml", "-o", "two.vtm", "--engine", "sweep"], &["sweep", "photon"]);
+    refused(dir, &["bake", "two.toml", "-o", "two.vtm", "--albedo", "1"], &["--albedo", "[[volume]]"]);
+    // At once: before a line about the scene.
+    fs::create_dir(dir.join("two-b.vti")).unwrap();
+    refused(dir, &["bake", "two.toml", "-o", "two.vtm"], &["two-b.vti", "is a folder"]);
+    fs::remove_dir(dir.join("two-b.vti")).unwrap();
+    let bake = |seed: &str| {
+        let mut args = vec!["bake", "two.toml", "-o", "two.vtm", "-q", "--seed", seed, "--report", "two.json"];
+        args.extend(QUICK);
+        ok(dir, &args);
+    };
+    bake("1");
+    let report: serde_json::Value = serde_json::from_slice(&fs::read(dir.join("two.json")).unwrap()).unwrap();
+    assert_eq!((report["a"]["grid"][0].as_u64(), report["b"]["grid"][0].as_u64()), (Some(13), Some(9)));
+    let file = VtiFile::read(&dir.join("two-b.vti")).unwrap();
+    let array = |name: &str| file.point_data.iter().find(|a| a.name == name).unwrap().samples.clone();
+    let (Samples::F32(s), Samples::F32(value)) = (array("s"), array("value")) else { panic!("floats") };
+    assert!(s.iter().zip(&value).all(|(s, v)| (s - (v - 0.02) / 0.18).abs() < 1e-5), "s is the shared parameter");
+    let index = text(&fs::read(dir.join("two.vtm")).unwrap());
+    assert!(index.contains("vtkMultiBlockDataSet") && index.contains("file=\"two-a.vti\""), "{index}");
+
+    // The same s, whichever volume the isovalue speaks of: 50 of [10, 90] is 0.11 of [0.02, 0.2].
+    let render =
+        |args: &[&str]| ok(dir, &[&["render", "two.vtm", "--height", "40", "--samples", "2", "-q"], args].concat());
+    render(&["--isovalue", "50", "-o", "a.png"]);
+    render(&["--isovalue", "0.11", "--field", "b", "-o", "b.png"]);
+    assert_eq!(fs::read(dir.join("a.png")).unwrap(), fs::read(dir.join("b.png")).unwrap());
+    // One alone is another picture.
+    ok(dir, &["render", "two-a.vti", "--height", "40", "--samples", "2", "-q", "--isovalue", "50", "-o", "alone.png"]);
+    assert_ne!(fs::read(dir.join("a.png")).unwrap(), fs::read(dir.join("alone.png")).unwrap());
+    ok(dir, &["extract", "two.vtm", "--field", "b", "--isovalue", "0.11", "-o", "b.ply", "-q"]);
+    ok(dir, &["extract", "two-b.vti", "--isovalue", "0.11", "-o", "own.ply", "-q"]);
+    assert_eq!(fs::read(dir.join("b.ply")).unwrap(), fs::read(dir.join("own.ply")).unwrap());
+    let reference = ["reference", "--field", "b", "--isovalue", "0.11", "--samples", "16", "--vertices", "20", "-q"];
+    ok(dir, &[&reference[..], &["two.toml", "-o", "r.ply"]].concat());
+    ok(dir, &["compare", "two-b.vti", "r.ply", "--json"]);
+    refused(dir, &[&reference[..2], &["c", "two.toml", "--isovalue", "0.11", "-o", "r.ply"]].concat(), &["a, b"]);
+    refused(dir, &["view", "two.vtm", "-o", "two.html"], &["two.vtm", "several"]);
+    refused(dir, &["render", "two.vtm", "--isovalue", "5", "--field", "b", "-o", "c.png"], &["'b'", "0.02"]);
+
+    let first = fs::read(dir.join("two-a.vti")).unwrap();
+    bake("2");
+    assert_ne!(fs::read(dir.join("two-a.vti")).unwrap(), first);
+    fs::remove_file(dir.join("two-b.vti")).unwrap();
+    refused(dir, &["render", "two.vtm", "--isovalue", "50", "-o", "c.png"], &["two-b.vti"]);
+}
