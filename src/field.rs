@@ -6,6 +6,7 @@ mod rows;
 pub use rows::{FieldRows, GradientRow};
 
 use crate::error::{Error, Result};
+use crate::neighbourhood::neighbourhood;
 use crate::volume::{Lattice, Volume};
 use glam::DVec3;
 use rayon::prelude::*;
@@ -199,14 +200,10 @@ impl Field {
 
     /// Least and greatest sample of the cells around node `o`; infinities of the wrong order if none is finite.
     pub fn range_around(&self, o: usize) -> [f32; 2] {
-        let ([i, j, k], dims) = (self.lattice.ijk(o), self.lattice.dims());
         let (mut lo, mut hi) = (f32::INFINITY, f32::NEG_INFINITY);
-        for z in k.saturating_sub(1)..=(k + 1).min(dims[2] - 1) {
-            for y in j.saturating_sub(1)..=(j + 1).min(dims[1] - 1) {
-                let row = self.lattice.offset(0, y, z);
-                for &s in &self.samples[row + i.saturating_sub(1)..=row + (i + 1).min(dims[0] - 1)] {
-                    (lo, hi) = (lo.min(s), hi.max(s));
-                }
+        for run in neighbourhood(self.lattice.dims(), o) {
+            for &s in &self.samples[run] {
+                (lo, hi) = (lo.min(s), hi.max(s));
             }
         }
         [lo, hi]

@@ -17,6 +17,7 @@ pub mod warp;
 pub mod cubic;
 pub mod nearest;
 pub mod node_set;
+mod neighbourhood;
 pub mod linear_fit;
 pub mod progress;
 pub mod checkpoint;

@@ -1,6 +1,7 @@
 //! Which points of a lattice over Ω the sweep's surfaces need, and points of the graph that can stand for them.
 
 use crate::field::{Field, FieldRows, GradientRow, has_direction};
+use crate::neighbourhood::neighbourhood;
 use crate::rng::{Rng, Stage};
 use crate::volume::Lattice;
 use glam::DVec3;
@@ -122,12 +123,7 @@ pub fn unknown_share(field: &Field, lattice: &Lattice) -> f64 {
     let masks = masks(field, lattice);
     let own = own_light(field, lattice, &masks, true);
     let own: Vec<bool> = (0..masks.len()).into_par_iter().with_min_len(1 << 12).map(own).collect();
-    let [nx, ny, nz] = lattice.dims();
-    let known = |&o: &usize| {
-        let [i, j, k] = lattice.ijk(o);
-        let around = |i: usize, n: usize| i.saturating_sub(1)..(i + 2).min(n);
-        around(k, nz).any(|z| around(j, ny).any(|y| around(i, nx).any(|x| own[lattice.offset(x, y, z)])))
-    };
+    let known = |&o: &usize| neighbourhood(lattice.dims(), o).any(|run| own[run].contains(&true));
     let needed = || (0..masks.len()).into_par_iter().with_min_len(1 << 12).filter(|&o| masks[o] != Mask::Empty);
     1.0 - needed().filter(known).count() as f64 / needed().count().max(1) as f64
 }

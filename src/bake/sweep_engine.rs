@@ -13,6 +13,7 @@ use crate::error::Result;
 use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, local_position};
+use crate::neighbourhood::neighbourhood;
 use crate::polygon::Polygon;
 use crate::progress::{Clock, Progress};
 use crate::radiance::{Indirect, Sampler, sample_places};
@@ -162,23 +163,16 @@ fn whiten(lit: &[bool], irradiance: &mut [[f32; 3]]) {
 
 /// Unknown nodes beside known ones become their mean, so that lookups in cells at the sweep's ends find something.
 fn widened(lattice: &Lattice, masks: &[Mask], nodes: &[[f32; 3]]) -> Vec<[f32; 3]> {
-    let [nx, ny, nz] = lattice.dims();
     (0..nodes.len())
         .into_par_iter()
         .map(|o| {
             if masks[o] != Mask::Filled || !nodes[o][0].is_nan() {
                 return nodes[o];
             }
-            let [i, j, k] = lattice.ijk(o);
             let (mut sum, mut n) = (Vec3::ZERO, 0.0);
-            for z in k.saturating_sub(1)..=(k + 1).min(nz - 1) {
-                for y in j.saturating_sub(1)..=(j + 1).min(ny - 1) {
-                    for x in i.saturating_sub(1)..=(i + 1).min(nx - 1) {
-                        let v = Vec3::from_array(nodes[lattice.offset(x, y, z)]);
-                        if !v.x.is_nan() {
-                            (sum, n) = (sum + v, n + 1.0);
-                        }
-                    }
+            for run in neighbourhood(lattice.dims(), o) {
+                for v in nodes[run].iter().filter(|v| !v[0].is_nan()) {
+                    (sum, n) = (sum + Vec3::from_array(*v), n + 1.0);
                 }
             }
             if n > 0.0 { (sum / n).to_array() } else { [f32::NAN; 3] }

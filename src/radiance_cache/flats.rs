@@ -7,6 +7,7 @@ use crate::direct::{Receiver, direct_irradiance};
 use crate::field::Field;
 use crate::flat::{self, Flat, FlatTexture, Texel};
 use crate::flattened::{Side, split_face};
+use crate::neighbourhood::neighbourhood;
 use crate::photon::FlatPhoton;
 use crate::polygon::Polygon;
 use crate::rng::Stage;
@@ -199,7 +200,7 @@ impl Open {
                 (share, central(&open))
             })
             .unzip();
-        let outer = |i: usize| around(i, [nu, nv, nc]).any(|j| shares[j] > 0.0);
+        let outer = |i: usize| neighbourhood([nu, nv, nc], i).any(|run| shares[run].iter().any(|s| *s > 0.0));
         let outer = (0..shares.len()).map(outer).collect();
         shares.iter().any(|&s| s < 1.0).then_some(Self { shares, at, outer })
     }
@@ -305,21 +306,13 @@ fn smooth_twice(image: &[DVec3], shares: &[f64], dims: [usize; 3], passes: [usiz
     once.iter().zip(&lost).map(|(s, l)| *s + *l).collect()
 }
 
-/// Texel `i` and those around it.
-fn around(i: usize, [nu, nv, nc]: [usize; 3]) -> impl Iterator<Item = usize> {
-    let beside = |i: usize, n: usize| i.saturating_sub(1)..(i + 2).min(n);
-    let (u, v, c) = (beside(i % nu, nu), beside(i / nu % nv, nv), beside(i / (nu * nv), nc));
-    c.flat_map(move |c| {
-        let u = u.clone();
-        v.clone().flat_map(move |v| u.clone().map(move |u| (c * nv + v) * nu + u))
-    })
-}
-
 /// Unknown texels become the mean of the `outer` ones around them that are known, or black.
 fn widened(image: &[Option<DVec3>], dims: [usize; 3], outer: &(dyn Fn(usize) -> bool + Sync)) -> Vec<DVec3> {
     let mean = |i: usize| {
-        let known = around(i, dims).filter(|&j| outer(j)).filter_map(|j| image[j]);
-        let (sum, count) = known.fold((DVec3::ZERO, 0.0), |(sum, n), x| (sum + x, n + 1.0));
+        let (sum, count) = neighbourhood(dims, i).fold((DVec3::ZERO, 0.0), |known, run| {
+            let more = run.filter(|&j| outer(j)).filter_map(|j| image[j]);
+            more.fold(known, |(sum, n), x| (sum + x, n + 1.0))
+        });
         if count > 0.0 { sum / count } else { DVec3::ZERO }
     };
     (0..image.len()).into_par_iter().with_min_len(1024).map(|i| image[i].unwrap_or_else(|| mean(i))).collect()

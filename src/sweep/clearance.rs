@@ -1,6 +1,7 @@
 //! How far away what reaches the sweep is, so that segments step over what is below it.
 
-use super::grid::{Geometry, neighbours};
+use super::grid::Geometry;
+use crate::neighbourhood::neighbourhood;
 
 /// The distance of every block of nodes to the nearest that a surface of the sweep may pass, as a number of slices.
 pub(super) struct Clearance {
@@ -40,8 +41,7 @@ impl Clearance {
         // Twice over all blocks, forwards and backwards, finds how many steps to neighbours lead to the nearest. [RP68]
         let all = 0..distance.len();
         for at in all.clone().chain(all.rev()) {
-            let mut nearest = u8::MAX;
-            neighbours(dims, at, |n| nearest = nearest.min(distance[n]));
+            let nearest = neighbourhood(dims, at).flat_map(|run| &distance[run]).fold(u8::MAX, |n, d| n.min(*d));
             distance[at] = distance[at].min(nearest.saturating_add(1));
         }
         // From the last node of a block, or the first, to the first node of another.

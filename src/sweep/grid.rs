@@ -8,6 +8,7 @@ use super::planes::{Planes, Spare, transpose, transposed};
 use crate::field::{Field, FieldRows, GradientRow};
 use crate::flattened::Side;
 use crate::mask::{lights_itself, may_light_itself};
+use crate::neighbourhood::neighbourhood;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
@@ -306,7 +307,6 @@ impl<'a> Geometry<'a> {
     /// interpolation near the sweep's ends meets no black.
     pub(super) fn fill(&self, b: &mut [Half4]) {
         let mut known = self.all_lit();
-        let [nx, ny, nz] = self.dims;
         for ring in &self.rings {
             let known_before = &known;
             let old = &*b;
@@ -315,12 +315,12 @@ impl<'a> Geometry<'a> {
                 .with_min_len(1 << 10)
                 .map(|&at| {
                     let (mut sum, mut count) = ([0f32; 3], 0f32);
-                    neighbours([nx, ny, nz], at as usize, |n| {
-                        if known_before[n] {
+                    for run in neighbourhood(self.dims, at as usize) {
+                        for n in run.filter(|n| known_before[*n]) {
                             (0..3).for_each(|c| sum[c] += decode(old[n][c]));
                             count += 1.0;
                         }
-                    });
+                    }
                     let [r, g, b] = sum.map(|s| encode(s / count.max(1.0)));
                     [r, g, b, 0]
                 })
@@ -329,18 +329,6 @@ impl<'a> Geometry<'a> {
                 b[at as usize] = v;
             }
             ring.iter().for_each(|&at| known[at as usize] = true);
-        }
-    }
-}
-
-/// Visits a node and all that share a cell with it.
-pub(super) fn neighbours([nx, ny, nz]: [usize; 3], at: usize, mut visit: impl FnMut(usize)) {
-    let (i, j, k) = (at % nx, at / nx % ny, at / (nx * ny));
-    for z in k.saturating_sub(1)..(k + 2).min(nz) {
-        for y in j.saturating_sub(1)..(j + 2).min(ny) {
-            for x in i.saturating_sub(1)..(i + 2).min(nx) {
-                visit((z * ny + y) * nx + x);
-            }
         }
     }
 }

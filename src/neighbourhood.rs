@@ -1,0 +1,33 @@
+//! The points of a lattice that share a cell with one of them, itself included.
+
+use std::ops::Range;
+
+/// Runs of memory, in its order, that hold the neighbourhood of point `at` of a lattice, x fastest.
+#[inline]
+pub(crate) fn neighbourhood([nx, ny, nz]: [usize; 3], at: usize) -> impl Iterator<Item = Range<usize>> {
+    let beside = |i: usize, n: usize| i.saturating_sub(1)..(i + 2).min(n);
+    let (x, y, z) = (beside(at % nx, nx), beside(at / nx % ny, ny), beside(at / (nx * ny), nz));
+    z.flat_map(move |z| {
+        let x = x.clone();
+        y.clone().map(move |y| (z * ny + y) * nx).map(move |row| row + x.start..row + x.end)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_point_within_a_step_once_and_in_order() {
+        for dims in [[5, 4, 3], [2, 2, 2], [1, 3, 1]] {
+            let [nx, ny, nz] = dims;
+            let place = |o: usize| [o % nx, o / nx % ny, o / (nx * ny)];
+            let all = 0..nx * ny * nz;
+            for at in all.clone() {
+                let near = |o: &usize| (0..3).all(|a| place(*o)[a].abs_diff(place(at)[a]) <= 1);
+                let expected: Vec<usize> = all.clone().filter(near).collect();
+                assert_eq!(neighbourhood(dims, at).flatten().collect::<Vec<_>>(), expected, "{dims:?}: {at}");
+            }
+        }
+    }
+}
