@@ -205,6 +205,7 @@ fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
         let word = |at: usize| {
             words.get(at).ok_or_else(|| Error::Invalid(format!("`{}`: too few words behind {key}", words.join(" "))))
         };
+        let mut pass_over = |n: usize| cursor.array(word(1)?, word(2)?, count(n)?).map(drop);
         match key.as_str() {
             "SCALARS" => {
                 let n = components(&words, 3)?;
@@ -234,19 +235,11 @@ fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
                     return Ok((lattice, samples));
                 }
             }
-            "VECTORS" | "NORMALS" => {
-                cursor.array(word(1)?, word(2)?, count(3)?)?;
-            }
-            "TENSORS" => {
-                cursor.array(word(1)?, word(2)?, count(9)?)?;
-            }
-            "TENSORS6" => {
-                cursor.array(word(1)?, word(2)?, count(6)?)?;
-            }
+            "VECTORS" | "NORMALS" => pass_over(3)?,
+            "TENSORS" => pass_over(9)?,
+            "TENSORS6" => pass_over(6)?,
             // Numbers and marks of the points or cells are no samples.
-            "GLOBAL_IDS" | "PEDIGREE_IDS" | "EDGE_FLAGS" => {
-                cursor.array(word(1)?, word(2)?, count(1)?)?;
-            }
+            "GLOBAL_IDS" | "PEDIGREE_IDS" | "EDGE_FLAGS" => pass_over(1)?,
             "TEXTURE_COORDINATES" => {
                 let n = components(&words, 2)?;
                 cursor.array(word(1)?, word(3)?, count(n)?)?;
