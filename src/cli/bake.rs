@@ -188,7 +188,9 @@ impl Bake {
             if loaded.scene.luminaires().is_empty() && dark {
                 say!("warning: nothing emits light; everything will be black");
             }
+            // Sweeps that nobody asked for were chosen because they leave out nothing to speak of.
             if settings.engine == Engine::Sweep
+                && !options.leaves_engine()
                 && let Some(share) = left_out(&loaded.scene, &settings.grid)?
             {
                 say!(
