@@ -168,17 +168,14 @@ pub fn stand_ins<const N: usize>(field: &Field, lattice: &Lattice, o: usize, see
     }
     let cell = field.lattice().far() / lattice.far();
     let mut rng = Rng::stream(seed, Stage::Cache, o as u64);
-    let around = |rng: &mut Rng| {
-        let p = centre + (DVec3::new(rng.unit(), rng.unit(), rng.unit()) * 2.0 - 1.0) * cell;
-        p.clamp(DVec3::ZERO, field.lattice().far())
-    };
+    let place = |steps: DVec3| (centre + steps * cell).clamp(DVec3::ZERO, field.lattice().far());
+    let around = |rng: &mut Rng| place(DVec3::new(rng.unit(), rng.unit(), rng.unit()) * 2.0 - 1.0);
     let tries = (0..16 * N).map(|_| around(&mut rng));
     found.iter_mut().zip(tries.filter(usable)).for_each(|(place, p)| *place = Some(p));
     if found[0].is_none() {
         // A sweep that is a thin slice of its cells lies on the way from anywhere to one of their corners.
-        let corners =
-            (0..27).map(|n| centre + (DVec3::new((n % 3) as f64, (n / 3 % 3) as f64, (n / 9) as f64) - 1.0) * cell);
-        let corners = corners.map(|p| p.clamp(DVec3::ZERO, field.lattice().far())).map(|p| (field.value(p), p));
+        let corner = |n: i32| place(DVec3::from_array([n % 3, n / 3 % 3, n / 9].map(f64::from)) - 1.0);
+        let corners = (0..27).map(corner).map(|p| (field.value(p), p));
         let corners: Vec<(f64, DVec3)> = corners.filter(|(h, _)| h.is_finite()).collect();
         let lowest = corners.iter().min_by(|a, b| a.0.total_cmp(&b.0));
         let highest = corners.iter().max_by(|a, b| a.0.total_cmp(&b.0));
@@ -190,6 +187,13 @@ pub fn stand_ins<const N: usize>(field: &Field, lattice: &Lattice, o: usize, see
     found
 }
 
+/// Halvings after which f32 tells no more places apart: 24 divide two cells into its steps between 1 and 2, and there are
+/// finer ones near 0.
+const HALVINGS: usize = 32;
+/// The most that h may rise over a step of f32, as a part of the sweep. Where steps are coarser some places are in the
+/// sweep by luck, beside many that are not: sweeps of 10⁻⁷ and 10⁻⁹ of their isovalues had a few, and holes.
+const COARSEST: f64 = 0.25;
+
 /// A place of f32 where h is in the sweep, around `isovalue`, on the way from `p` to the one of two places with h at them that lies
 /// on the other side; `None` if there is none.
 fn between(field: &Field, p: DVec3, [lowest, highest]: [(f64, DVec3); 2], isovalue: f64) -> Option<DVec3> {
@@ -198,15 +202,13 @@ fn between(field: &Field, p: DVec3, [lowest, highest]: [(f64, DVec3); 2], isoval
         return None;
     }
     let (mut low, mut high) = if h < isovalue { (p, highest.1) } else { (lowest.1, p) };
-    // Until f32 tells no more places apart.
-    for _ in 0..32 {
+    for _ in 0..HALVINGS {
         let middle = (0.5 * (low + high)).as_vec3().as_dvec3();
         let h = field.value(middle);
         if (0.0..=1.0).contains(&h) {
-            // Not by luck, beside many that f32 has no places for: a step of f32 is a small part of the sweep.
             let step = f64::from(f32::EPSILON) * middle.max_element();
             let rise = field.value_and_gradient(middle).1.abs().element_sum() * step;
-            return (rise < 0.25).then_some(middle);
+            return (rise < COARSEST).then_some(middle);
         }
         if h < isovalue {
             low = middle;
