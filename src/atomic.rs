@@ -57,8 +57,8 @@ impl AtomicFile {
         }
     }
 
-    /// Flushes to the disk and closes: what is missing is the name. Of files that belong together all are completed before the
-    /// first is committed.
+    /// Flushes to the disk and closes: what is missing is the name. Of files that belong together all are completed
+    /// before the first is committed.
     ///
     /// # Errors
     /// `Io`, for example on a full disk; the temporary file is then removed and the old content stays.

@@ -273,8 +273,8 @@ fn can_sweep(scene: &Scene) -> Result<()> {
 /// What sweeps may not know of the points that surfaces need. Real volumes have 0.1 % at most, binary ones all.
 const UNKNOWN: f64 = 0.05;
 
-/// The share of the points that surfaces need where sweeps leave out what is reflected, because samples jump over the whole
-/// sweep there, as in binary volumes; `None` if that is none to speak of.
+/// The share of the points that surfaces need where sweeps leave out what is reflected, because samples jump over the
+/// whole sweep there, as in binary volumes; `None` if that is none to speak of.
 ///
 /// # Errors
 /// `Invalid` if the grid has too many points.

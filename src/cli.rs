@@ -224,7 +224,8 @@ fn writable(path: &Path) -> Result<()> {
     crate::atomic::AtomicFile::create(path).map(drop)
 }
 
-/// Fails now if one of `outputs` could not be written later, is another of them, or would take the place of one of `inputs`.
+/// Fails now if one of `outputs` could not be written later, is another of them, or would take the place of one of
+/// `inputs`.
 fn outputs<'p>(outputs: impl IntoIterator<Item = &'p Path>, inputs: &Inputs) -> Result<()> {
     let outputs: Vec<&Path> = outputs.into_iter().collect();
     for (n, output) in outputs.iter().enumerate() {

@@ -4,8 +4,8 @@ use crate::error::{Error, Result};
 use glam::DVec3;
 use std::ops::RangeInclusive;
 
-/// Of the brightest channel. Light is stored in 32-bit floats, and so are the squares that its standard errors come from: within
-/// this range all results scale with the emission.
+/// Of the brightest channel. Light is stored in 32-bit floats, and so are the squares that its standard errors come
+/// from: within this range all results scale with the emission.
 const RANGE: RangeInclusive<f64> = 1e-15..=1e18;
 
 /// Whether `emission` can be emitted.

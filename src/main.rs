@@ -16,7 +16,8 @@ fn main() -> ExitCode {
     }
 }
 
-/// `isolume info … | head` closes the pipe early, and `println!` panics when it does: that is no fault to report. A full disk is.
+/// `isolume info … | head` closes the pipe early, and `println!` panics when it does: that is no fault to report. A
+/// full disk is.
 fn end_quietly_when_nobody_reads() {
     let report = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |panic| {

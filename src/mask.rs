@@ -117,8 +117,8 @@ pub fn own_light<'a>(
     }
 }
 
-/// Of the points that the sweep's surfaces need, the share with none beside them that holds light of its own level set: where
-/// samples jump over the sweep, as in binary volumes. Nothing but rays knows what surfaces reflect there.
+/// Of the points that the sweep's surfaces need, the share with none beside them that holds light of its own level set:
+/// where samples jump over the sweep, as in binary volumes. Nothing but rays knows what surfaces reflect there.
 pub fn unknown_share(field: &Field, lattice: &Lattice) -> f64 {
     let masks = masks(field, lattice);
     let own = own_light(field, lattice, &masks, true);
@@ -187,15 +187,15 @@ pub fn stand_ins<const N: usize>(field: &Field, lattice: &Lattice, o: usize, see
     found
 }
 
-/// Halvings after which f32 tells no more places apart: 24 divide two cells into its steps between 1 and 2, and there are
-/// finer ones near 0.
+/// Halvings after which f32 tells no more places apart: 24 divide two cells into its steps between 1 and 2, and there
+/// are finer ones near 0.
 const HALVINGS: usize = 32;
 /// The most that h may rise over a step of f32, as a part of the sweep. Where steps are coarser some places are in the
 /// sweep by luck, beside many that are not: sweeps of 10⁻⁷ and 10⁻⁹ of their isovalues had a few, and holes.
 const COARSEST: f64 = 0.25;
 
-/// A place of f32 where h is in the sweep, around `isovalue`, on the way from `p` to the one of two places with h at them that lies
-/// on the other side; `None` if there is none.
+/// A place of f32 where h is in the sweep, around `isovalue`, on the way from `p` to the one of two places with h at
+/// them that lies on the other side; `None` if there is none.
 fn between(field: &Field, p: DVec3, [lowest, highest]: [(f64, DVec3); 2], isovalue: f64) -> Option<DVec3> {
     let h = field.value(p);
     if !(h.is_finite() && lowest.0 <= isovalue && highest.0 >= isovalue) {

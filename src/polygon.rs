@@ -32,7 +32,8 @@ pub struct Polygon {
 }
 
 impl Polygon {
-    /// A polygon of at least three vertices; `albedo` in [0, 1], `emission` as [`emission::check`] takes it. Emitters block light from both sides.
+    /// A polygon of at least three vertices; `albedo` in [0, 1], `emission` as [`emission::check`] takes it. Emitters
+    /// block light from both sides.
     ///
     /// # Errors
     /// `Invalid` if it has no area, is not planar (1e-5 of its size), not convex, or a coefficient is out of range.

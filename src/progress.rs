@@ -6,7 +6,8 @@ use std::io::IsTerminal;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-/// Prints a line to standard error. Where nobody reads it nothing else is lost; the library's own macro would end the work.
+/// Prints a line to standard error. Where nobody reads it nothing else is lost; the library's own macro would end the
+/// work.
 macro_rules! say {
     ($($line:tt)*) => {{
         use std::io::Write;

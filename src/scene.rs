@@ -124,8 +124,8 @@ impl Scene {
     /// Puts a scene together; polygons that emit are its luminaires. Luminaires are numbered first.
     ///
     /// # Errors
-    /// `Invalid` for an albedo outside [0, 1], an emission out of range, too many polygons, capped faces that touch a wall, or cells
-    /// narrower than 10⁻¹⁶ or wider than 10¹⁶.
+    /// `Invalid` for an albedo outside [0, 1], an emission out of range, too many polygons, capped faces that touch a
+    /// wall, or cells narrower than 10⁻¹⁶ or wider than 10¹⁶.
     pub fn new(
         field: impl Into<Arc<Field>>,
         surface: Surface,

@@ -440,7 +440,8 @@ fn too_little_memory_is_told_for_the_engine_that_needs_less() {
     }
 }
 
-/// Lines that nobody reads, on a full disk or a pipe that was closed, cost no work; output that is wanted is another matter.
+/// Lines that nobody reads, on a full disk or a pipe that was closed, cost no work; output that is wanted is another
+/// matter.
 #[test]
 fn standard_error_that_takes_nothing_ends_no_bake() {
     let folder = tempfile::tempdir().unwrap();

@@ -183,7 +183,8 @@ fn it_is_dark_behind_a_luminaire() {
     }
 }
 
-/// Where a sample that is not finite hides at which isovalue a point meets its wall, the point keeps the light that it had.
+/// Where a sample that is not finite hides at which isovalue a point meets its wall, the point keeps the light that it
+/// had.
 #[test]
 fn contacts_beside_a_hole_keep_their_light() {
     let hole = [1, 20, 32];

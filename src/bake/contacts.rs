@@ -119,9 +119,10 @@ impl<'a> Contacts<'a> {
         total
     }
 
-    /// What a white surface would reflect at point `o` on `wall`, the `n`th of its walls, if it would reflect `white` with that wall as its
-    /// texture shows it, and the variance that this adds to the luminance that leaves. `None` where ∇h vanishes, or where a sample that is
-    /// not finite hides the isovalue at which the wall is met: what cannot be told corrects nothing.
+    /// What a white surface would reflect at point `o` on `wall`, the `n`th of its walls, if it would reflect `white`
+    /// with that wall as its texture shows it, and the variance that this adds to the luminance that leaves. `None`
+    /// where ∇h vanishes, or where a sample that is not finite hides the isovalue at which the wall is met: what cannot
+    /// be told corrects nothing.
     #[allow(clippy::cast_possible_truncation, reason = "positions and isovalues are f32")]
     fn meet<T: Tracer>(
         &self,

@@ -85,7 +85,8 @@ pub struct BakeOptions {
     /// Amount of work: preview (seconds), standard (minutes) or reference
     #[arg(long)]
     pub preset: Option<Preset>,
-    /// How light is computed (default: sweep, or photon for scenes that cannot be swept, for binary volumes, and with options that are its own)
+    /// How light is computed (default: sweep, or photon for scenes that cannot be swept, for binary volumes, and with
+    /// options that are its own)
     #[arg(long)]
     pub engine: Option<Engine>,
     /// Sweep engine: directions per pass and replicate (a power of two)

@@ -113,8 +113,8 @@ impl TimeEstimate {
     }
 }
 
-/// Seconds that `pilot` takes for walls of so many texels across, if need be from fewer: their work grows with `texels`, and
-/// what half as many across take less tells how fast.
+/// Seconds that `pilot` takes for walls of so many texels across, if need be from fewer: their work grows with
+/// `texels`, and what half as many across take less tells how fast.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a part of a length")]
 fn with_texels(walls: usize, texels: &dyn Fn(usize) -> f64, pilot: &dyn Fn(usize) -> Result<f64>) -> Result<f64> {
     let part = (MOST_TEXELS / texels(walls).max(1.0)).sqrt().min(1.0);

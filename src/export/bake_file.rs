@@ -80,8 +80,8 @@ fn suffix(i: usize) -> &'static str {
 
 /// Writes the bakes of a scene's fields: one as `.vti` ([`write()`]); several as `.vtm` at `path` and beside it a `.vti` for
 /// each, `NAME-FIELD.vti`, which stands for itself and also holds `s`, the parameter that the fields share: a contour of it
-/// in all blocks shows all fields of one hyperplane. All are complete before the first has its name, so that what fails leaves
-/// the old set.
+/// in all blocks shows all fields of one hyperplane. All are complete before the first has its name, so that what fails
+/// leaves the old set.
 ///
 /// # Errors
 /// `Io`.
@@ -109,9 +109,10 @@ pub fn field_file(path: &Path, name: &str) -> PathBuf {
 /// Steps of f32 this large, in sweeps, are steps to be seen in a surface.
 const COARSE: f64 = 1e-5;
 
-/// Writes a bake. Point data: `value` (source units, active scalars; in f64 where the sweep is narrow for its isovalues' size), `radiance` (linear RGB), `rgb` (exposed, clamped,
-/// sRGB-encoded), `std_error` (of luminance), `mask` ([`Mask`]); with both sides also `radiance_inside` and so on. Field
-/// data: `wall_<name>` radiance over (u, v, isovalue), `context` the same of all context geometry, exposure, every number of the report, and all of it as JSON.
+/// Writes a bake. Point data: `value` (source units, active scalars; in f64 where the sweep is narrow for its
+/// isovalues' size), `radiance` (linear RGB), `rgb` (exposed, clamped, sRGB-encoded), `std_error` (of luminance),
+/// `mask` ([`Mask`]); with both sides also `radiance_inside` and so on. Field data: `wall_<name>` radiance over (u, v,
+/// isovalue), `context` the same of all context geometry, exposure, every number of the report, and all of it as JSON.
 ///
 /// # Errors
 /// `Io` if the file cannot be written.

@@ -6,7 +6,8 @@ use std::path::Path;
 /// Statements of a colour.
 const COLOURS: [&str; 4] = ["Ka", "Kd", "Ks", "Ke"];
 
-/// The text of the library at `path`, such that tobj takes it: a colour of one number gets its other two, which are the same.
+/// The text of the library at `path`, such that tobj takes it: a colour of one number gets its other two, which are the
+/// same.
 ///
 /// # Errors
 /// `Io`; `Invalid` with file and line for what is malformed.

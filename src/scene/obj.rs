@@ -13,8 +13,8 @@ use std::path::Path;
 /// material is white as the default box's walls.
 ///
 /// # Errors
-/// `Io` if the OBJ or its MTL cannot be read, `Invalid` for faces that are no planar convex polygons and for malformed lines of the
-/// MTL; messages name the file and the face or line.
+/// `Io` if the OBJ or its MTL cannot be read, `Invalid` for faces that are no planar convex polygons and for malformed
+/// lines of the MTL; messages name the file and the face or line.
 pub fn read_obj(path: &Path) -> Result<Vec<Polygon>> {
     let mut polygons = Vec::new();
     for face in faces(path)? {
@@ -50,8 +50,8 @@ impl Default for Placement {
 /// triangles; those without an area are left out.
 ///
 /// # Errors
-/// `Io` if the OBJ or its MTL cannot be read; `Invalid` if no face has an area, for coordinates that are not finite, for
-/// an albedo or emission out of range, and for malformed lines of the MTL.
+/// `Io` if the OBJ or its MTL cannot be read; `Invalid` if no face has an area, for coordinates that are not finite,
+/// for an albedo or emission out of range, and for malformed lines of the MTL.
 pub fn read_context(path: &Path, placement: &Placement) -> Result<Vec<Polygon>> {
     let Placement { scale, rotate, translate, .. } = *placement;
     let [x, y, z] = rotate.to_array().map(f64::to_radians);

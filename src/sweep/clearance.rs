@@ -5,8 +5,8 @@ use crate::neighbourhood::neighbourhood;
 
 /// The distance of every block of nodes to the nearest that a surface of the sweep may pass, as a number of slices.
 pub(super) struct Clearance {
-    /// Per block, how many slices on, along any axis and with slopes up to 1, the next one is that may reach the sweep; x
-    /// fastest, and behind them as much as makes words of bytes.
+    /// Per block, how many slices on, along any axis and with slopes up to 1, the next one is that may reach the sweep;
+    /// x fastest, and behind them as much as makes words of bytes.
     pub slices: Vec<u8>,
 }
 

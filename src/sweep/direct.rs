@@ -21,8 +21,8 @@ use crate::scene::Scene;
 use glam::DVec3;
 use rayon::prelude::*;
 
-/// How far segments to flats may step: from the lower side what is below the sweep hides nothing, however far below. `None` where
-/// flats are seen from inside solids, too.
+/// How far segments to flats may step: from the lower side what is below the sweep hides nothing, however far below.
+/// `None` where flats are seen from inside solids, too.
 pub(super) fn clearance(scene: &Scene, geometry: &Geometry, sides: &[Side]) -> Option<Clearance> {
     let inside = sides.contains(&Side::Higher) && !capped(scene);
     (!inside).then(|| Clearance::new(geometry))

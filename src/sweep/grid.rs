@@ -235,7 +235,8 @@ impl<'a> Geometry<'a> {
         blocks.meets(blocks.rows[k * self.dims[1] + j], i, i + 1)
     }
 
-    /// The nodes of row `row` along x within one of those that may reach the sweep from below, from first to behind last.
+    /// The nodes of row `row` along x within one of those that may reach the sweep from below, from first to behind
+    /// last.
     pub(super) fn reaching(&self, row: usize) -> impl Iterator<Item = (usize, usize)> {
         self.awake[Side::Lower.index()][0].each(row, self.dims[0])
     }

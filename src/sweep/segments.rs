@@ -131,8 +131,9 @@ impl Segments {
         (self.first[lane], self.way[lane]) = if BEFORE && d[axis] > 0.0 { (end, -1) } else { (first, 1) };
     }
 
-    /// Takes h of all slices into the extrema, bilinear in each, or of as many as a lane needs to find enough; NaN counts nothing.
-    /// `h`: the samples of the fields of [`Segments::set`]. With `clearance`, where h is below the sweep some slices are left out.
+    /// Takes h of all slices into the extrema, bilinear in each, or of as many as a lane needs to find enough; NaN
+    /// counts nothing. `h`: the samples of the fields of [`Segments::set`]. With `clearance`, where h is below the
+    /// sweep some slices are left out.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
     pub(super) fn march(&mut self, h: &[f32], clearance: Option<&Clearance>) {
         for lane in 0..LANES {

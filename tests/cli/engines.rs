@@ -42,8 +42,8 @@ fn scene_and_options_choose_the_engine() {
     assert!(report["sweep_queries"].as_u64() > Some(50_000) && report["photons"]["emitted"] == 0, "{report}");
 }
 
-/// A cavity in a volume of zeros and ones: no grid point holds light of its own level set, and what sweeps know of it is its emission.
-/// Its walls emit 1 and reflect half: 2 comes from everywhere.
+/// A cavity in a volume of zeros and ones: no grid point holds light of its own level set, and what sweeps know of it
+/// is its emission. Its walls emit 1 and reflect half: 2 comes from everywhere.
 #[test]
 fn binary_volumes_are_baked_by_exact_rays() {
     let dir = tempfile::tempdir().unwrap();

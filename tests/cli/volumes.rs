@@ -33,7 +33,8 @@ fn simulations_write_one_file_per_field() {
     refused(dir, &["generate", "bumps", "--seed", "2", "-o", "out.vti"], &["bumps", "pasta"]);
 }
 
-/// Bumps on an offset a thousand million times their range: the bake has the isosurfaces of its volume, which are those without it.
+/// Bumps on an offset a thousand million times their range: the bake has the isosurfaces of its volume, which are those
+/// without it.
 #[test]
 fn bakes_of_data_on_an_offset_hold_their_isosurfaces() {
     let dir = tempfile::tempdir().unwrap();
