@@ -41,6 +41,11 @@ impl Subject {
         self.scene.field.sweep().from_unit(fraction)
     }
 
+    /// Whether a bake can be compared with references at an isovalue (source units): there is a surface.
+    fn has_surface(&self, isovalue: f64) -> bool {
+        SurfaceMesh::extract(&self.scene, self.scene.field.sweep().isovalue(isovalue), 1).is_ok()
+    }
+
     /// The isovalue reported first.
     pub fn main_isovalue(&self) -> f64 {
         self.isovalue.unwrap_or_else(|| self.at((47.0 - 3.6) / 91.4))

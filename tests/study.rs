@@ -71,3 +71,32 @@ fn what_another_scene_or_other_settings_left_is_refused_and_the_same_study_adds_
     assert!(other.status.success());
     refused(&["sa/s.toml"], &[], &["datasets.csv", "'s'", "another folder"]);
 }
+
+#[test]
+fn strategies_are_not_baked_again_where_there_is_no_surface_to_compare() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    assert!(isolume(dir, &["generate", "bumps", "--size", "8", "-o", "b.vti", "-q"]).status.success());
+    let study = |range: &str| {
+        let text = format!("isovalues = [{range}]\n[volume]\nfile = \"b.vti\"\n");
+        fs::write(dir.join("s.toml"), text).unwrap();
+        let common = ["-o", "st", "--quick", "--photons", "2000", "--gather", "2", "--wall-resolution", "4"];
+        let output = isolume(dir, &[&["study", "strategies", "s.toml"][..], &common].concat());
+        (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+    };
+    // The upper half of the sweep lies above all samples.
+    let bakes = |said: &str| said.lines().filter(|l| l.contains("samples, ")).count();
+    let (code, said) = study("3.6, 190");
+    assert_eq!((code, bakes(&said)), (Some(0), 8), "{said}");
+    let table = fs::read_to_string(dir.join("st/strategies.csv")).unwrap();
+    let rows = table.lines().count() - 1;
+    assert!(rows > 0 && rows % 8 == 0 && rows < 7 * 8, "{table}");
+    let (code, said) = study("3.6, 190");
+    assert_eq!((code, bakes(&said)), (Some(0), 0), "{said}");
+    assert_eq!(fs::read_to_string(dir.join("st/strategies.csv")).unwrap(), table);
+
+    // No isovalue that is compared has a surface.
+    fs::remove_dir_all(dir.join("st")).unwrap();
+    let (code, said) = study("-1e6, 1e6");
+    assert!(code == Some(2) && said.contains("'s' has no surface") && bakes(&said) == 0, "{code:?} {said}");
+}

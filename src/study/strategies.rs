@@ -3,7 +3,7 @@
 use super::figure6::figure6;
 use super::{Effort, Study, Subject, Table, accuracy_of, exactly, provenance};
 use crate::bake::{BakeOptions, BakeSettings, Engine, StrategyName};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::illumination_grid::GridSize;
 use crate::mask::{Mask, masks};
 use crate::plot::{Plot, Series};
@@ -37,27 +37,34 @@ const STRATEGIES: [(StrategyName, &str); 4] = [
 /// at the points of a grid as fine as they allow; the others interpolate onto the volume's lattice.
 ///
 /// # Errors
-/// As bakes, references and tables.
+/// `Invalid` if a subject has no surface at any isovalue that is compared; as bakes, references and tables.
 pub fn strategies(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Result<()> {
     let mut table = Table::open(study.folder.join("strategies.csv"), &COLUMNS, 4)?;
     let counts: &[u64] = if study.quick { &[20_000, 100_000] } else { &[100_000, 1_000_000, 10_000_000] };
     let jobs = study.jobs(&table, subjects, base)?;
+    let isovalues = subjects.iter().map(|s| isovalues(study, s)).collect::<Result<Vec<_>>>()?;
+    let works: Vec<Work> = subjects
+        .iter()
+        .zip(jobs)
+        .zip(isovalues)
+        .map(|((subject, job), isovalues)| Work { subject, job, isovalues })
+        .collect();
     // Plots of what is there, also after an interrupt.
-    let measured = measure(study, subjects, &jobs, base, counts, &mut table);
+    let measured = measure(study, &works, base, counts, &mut table);
     summarise(study, subjects, &table, counts)?;
     measured
 }
 
-fn measure(
-    study: &Study,
-    subjects: &[Subject],
-    jobs: &[String],
-    base: &BakeOptions,
-    counts: &[u64],
-    table: &mut Table,
-) -> Result<()> {
-    for (subject, job) in subjects.iter().zip(jobs) {
-        let isovalues = isovalues(study, subject);
+/// What is measured of a subject.
+struct Work<'a> {
+    subject: &'a Subject,
+    job: String,
+    /// Where bakes are compared, source units.
+    isovalues: Vec<f64>,
+}
+
+fn measure(study: &Study, works: &[Work], base: &BakeOptions, counts: &[u64], table: &mut Table) -> Result<()> {
+    for Work { subject, job, isovalues } in works {
         for &count in counts {
             for (strategy, name) in STRATEGIES {
                 let key = |c: f64| vec![subject.name.clone(), count.to_string(), name.to_owned(), exactly(c)];
@@ -75,7 +82,7 @@ fn measure(
                     options.grid = Some(grid_of(subject, count)?);
                 }
                 let (bake, seconds) = study.bake(subject, &BakeSettings::new(&options.or(base), &subject.scene)?)?;
-                for &c in &isovalues {
+                for &c in isovalues {
                     if table.has(&key(c)) {
                         continue;
                     }
@@ -141,9 +148,12 @@ fn is_in_table(subject: &Subject, isovalue: f64) -> bool {
     [35.0, 47.0, 80.0].iter().any(|c| subject.at((c - 3.6) / 91.4) == isovalue)
 }
 
-/// Level sets of strategy 1, the middles between them, 35, 47 and 80 of [3.6, 95], and a regular comb; source units,
-/// increasing.
-fn isovalues(study: &Study, subject: &Subject) -> Vec<f64> {
+/// Level sets of strategy 1, the middles between them, 35, 47 and 80 of [3.6, 95], and a regular comb, where there is a surface;
+/// source units, increasing.
+///
+/// # Errors
+/// `Invalid` if there is none.
+fn isovalues(study: &Study, subject: &Subject) -> Result<Vec<f64>> {
     let mut fractions: Vec<f64> = level_sets();
     if !study.quick {
         fractions.extend(level_sets().windows(2).map(|w| 0.5 * (w[0] + w[1])));
@@ -154,7 +164,20 @@ fn isovalues(study: &Study, subject: &Subject) -> Vec<f64> {
     fractions.extend(if study.quick { &main[1..2] } else { &main[..] });
     fractions.sort_by(f64::total_cmp);
     fractions.dedup_by(|a, b| (*a - *b).abs() < 0.008);
-    fractions.into_iter().map(|f| subject.at(f)).collect()
+    // Elsewhere no row ever says that a bake was compared.
+    let all: Vec<f64> = fractions.into_iter().map(|f| subject.at(f)).collect();
+    let there: Vec<f64> = all.iter().copied().filter(|&c| subject.has_surface(c)).collect();
+    if there.is_empty() {
+        return Err(Error::Invalid(format!(
+            "'{}' has no surface at any of the {} isovalues from {:.4} to {:.4} that strategies are compared at; narrow its \
+             isovalues to where it has surfaces",
+            subject.name,
+            all.len(),
+            all[0],
+            all[all.len() - 1]
+        )));
+    }
+    Ok(there)
 }
 
 /// BB09's level sets 39.0 + 17.7 k of the sweep [3.6, 95], as fractions.
