@@ -70,3 +70,30 @@ fn binary_volumes_are_baked_by_exact_rays() {
     let lines = dry(&["--grid", "2x"]);
     assert!(lines.contains("engine  sweep") && !lines.contains("warning"), "{lines}");
 }
+
+/// A closed room whose surfaces absorb nothing, and its walls a half or a thousandth: where bounces end before light has settled, a bake
+/// says so.
+#[test]
+fn light_that_has_not_settled_is_warned_of() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "13", "-o", "b.vti", "-q"]);
+    let corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nv 0 0 1\nv 1 0 1\nv 0 1 1\nv 1 1 1\n";
+    let faces = "f 1 2 4 3\nf 5 7 8 6\nf 1 5 6 2\nf 3 4 8 7\nf 1 3 7 5\nf 2 6 8 4\n";
+    fs::write(dir.join("room.obj"), format!("mtllib room.mtl\n{corners}usemtl w\n{faces}")).unwrap();
+    let bake = ["bake", "b.vti", "--isovalues", "3.6", "95", "--box", "room.obj", "--albedo", "1", "-o", "lit.vti"];
+    let settles = |walls: f64| {
+        let (kd, ke) = (walls, 1.0 - walls);
+        fs::write(dir.join("room.mtl"), format!("newmtl w\nKd {kd} {kd} {kd}\nKe {ke} {ke} {ke}\n")).unwrap();
+        let more = ["--engine", "sweep", "--preset", "preview", "--report", "r.json"];
+        let lines = text(&ok(dir, &[&bake[..], &more].concat()).stderr);
+        let report: serde_json::Value = serde_json::from_slice(&fs::read(dir.join("r.json")).unwrap()).unwrap();
+        let (share, bounces) = (report["unsettled"].as_f64().unwrap(), report["sweep_bounces"].as_u64().unwrap());
+        println!("{walls}: {share} may be missing after {bounces} bounces");
+        (lines.contains("warning: light has not settled"), share, bounces)
+    };
+    let (warned, share, bounces) = settles(0.5);
+    assert!(!warned && share > 0.0 && share < 0.004 && bounces < 64, "{share} {bounces}");
+    let (warned, share, bounces) = settles(0.999);
+    assert!(warned && share > 0.02 && bounces > 500, "{share} {bounces}");
+}
