@@ -116,8 +116,7 @@ impl Study {
     }
 
     /// Two independent references on a fixed subset of the vertices of the isosurface at `isovalue` (source units), from
-    /// the cache or computed; `None` if there is no surface. The cache tells them apart by scene, settings and
-    /// isovalue.
+    /// the cache or computed; `None` if there is no surface. The cache tells them apart by scene, settings and isovalue.
     ///
     /// # Errors
     /// As `reference()`, or from reading the cache.

@@ -1,5 +1,5 @@
-//! Studies as users meet them: what an earlier run left is taken up if it is of the same scene, settings and volume,
-//! and refused otherwise.
+//! Studies as users meet them: what an earlier run left is taken up if it is of the same scene, settings and volume, and
+//! refused otherwise.
 
 use std::fs;
 use std::path::Path;
@@ -90,7 +90,7 @@ fn strategies_are_not_baked_again_where_there_is_no_surface_to_compare() {
     assert_eq!((code, bakes(&said)), (Some(0), 8), "{said}");
     let table = fs::read_to_string(dir.join("st/strategies.csv")).unwrap();
     let rows = table.lines().count() - 1;
-    assert!(rows > 0 && rows % 8 == 0 && rows < 7 * 8, "{table}");
+    assert!(rows > 0 && rows.is_multiple_of(8) && rows < 7 * 8, "{table}");
     let (code, said) = study("3.6, 190");
     assert_eq!((code, bakes(&said)), (Some(0), 0), "{said}");
     assert_eq!(fs::read_to_string(dir.join("st/strategies.csv")).unwrap(), table);
