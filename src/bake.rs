@@ -73,7 +73,8 @@ pub struct BakeReport {
     pub sweep_queries: u64,
     /// Bounces of sweeps, 0 by photons.
     pub sweep_bounces: usize,
-    /// The share of indirect light that further bounces of sweeps would change, as far as that is known; NaN where it is not.
+    /// The share of all indirect light, up to 1, that further bounces of sweeps would bring or take, as far as that is
+    /// known; NaN where it is not.
     pub unsettled: f64,
     /// Rays and queries per second of the stages that trace them.
     pub rays_per_second: f64,

@@ -116,8 +116,8 @@ pub struct SweepResult {
     pub flats: Vec<Option<FlatTexture>>,
     /// Indirect bounces of the replicate that took the most.
     pub bounces: usize,
-    /// The share of indirect light that later bounces would change, as far as their decay is known; NaN where bounces were cut
-    /// before it was.
+    /// The share of all indirect light, up to 1, that later bounces would bring or take, as far as their decay is known; NaN
+    /// where bounces were cut before it was.
     pub residual: f64,
     /// Whether `tick` stopped the work.
     pub stopped: bool,

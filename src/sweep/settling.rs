@@ -30,13 +30,13 @@ pub(super) struct Settling {
 const KNOWN: usize = 3;
 /// The greatest r that is believed, of the slowest light and of all other.
 const MOST: f64 = 0.98;
-/// The same of the level of a bright room, once two passes after each other tell nearly the same.
-const LEVEL: f64 = 0.9998;
-/// Nearly the same: as a share of 1 − r.
-const STEADY: f64 = 0.05;
-/// One sign: |Σ(y − x)| as a share of Σ|y − x|.
-const ONE_SIGN: f64 = 0.9;
 const OTHERS: f64 = 0.93;
+/// The greatest r of a bright room's level that is told from none.
+const LEVEL: f64 = 0.9998;
+/// A level is known once two passes after each other tell it alike: this near, as a share of 1 − r.
+const STEADY: f64 = 0.05;
+/// What changes in one way only: |Σ(y − x)| as a share of Σ|y − x|.
+const ONE_SIGN: f64 = 0.9;
 /// The greatest r that ω is for: few directions make noise, too, whose eigenvalues are not all real.
 const RELAXED: f64 = 0.95;
 /// Changes this much greater than the least tell that ω drives light apart.
@@ -129,10 +129,11 @@ impl Settling {
                 self.radius[c] = self.radius[c].max(lambda.min(MOST));
             }
             let one_sign = self.drift[c] > ONE_SIGN * self.share[c];
-            let slow = if one_sign && lambda < LEVEL { lambda } else { 0.0 };
+            let slow = if one_sign { lambda.min(LEVEL) } else { 0.0 };
             let before = std::mem::replace(&mut self.slow[c], slow);
-            if slow > MOST && (slow - before).abs() < STEADY * (1.0 - slow) {
-                self.radius[c] = slow;
+            let steady = slow > RELAXED && (slow - before).abs() < STEADY * (1.0 - slow);
+            if steady && self.radius[c] >= MOST {
+                self.radius[c] = slow.max(MOST);
             }
             self.least[c] = self.least[c].min(new);
             let r2 = self.radius[c].min(RELAXED).powi(2);

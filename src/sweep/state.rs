@@ -76,7 +76,8 @@ impl State {
         let missing = match passes.settling.missing(0) {
             // From the light of replicates before.
             None if passes.late > 0 => 0.0,
-            missing => missing.unwrap_or(f64::NAN),
+            // Of all there will be, not of what there is.
+            missing => missing.map_or(f64::NAN, |m| m / (1.0 + m)),
         };
         // f64::max passes over NaN.
         if missing.is_nan() || missing > self.residual {
