@@ -318,30 +318,29 @@ fn widened(image: &[Option<DVec3>], dims: [usize; 3], outer: &(dyn Fn(usize) -> 
     (0..image.len()).into_par_iter().with_min_len(1024).map(|i| image[i].unwrap_or_else(|| mean(i))).collect()
 }
 
-/// Passes of ¼ ½ ¼ along each axis.
+/// Passes of ¼ ½ ¼ along each axis, to and fro between two images: where they are large, new memory for each takes as long as
+/// the pass.
 fn smooth(mut image: Vec<DVec3>, dims: [usize; 3], passes: [usize; 3]) -> Vec<DVec3> {
+    let mut next = vec![DVec3::ZERO; image.len()];
     for (axis, &count) in passes.iter().enumerate() {
         for _ in 0..count {
-            image = smooth_along(&image, dims, axis);
+            smooth_along(&image, &mut next, dims, axis);
+            std::mem::swap(&mut image, &mut next);
         }
     }
     image
 }
 
-/// ¼ ½ ¼ along one axis, the missing quarter folded back at the ends (flux is kept).
-fn smooth_along(image: &[DVec3], dims: [usize; 3], axis: usize) -> Vec<DVec3> {
+/// ¼ ½ ¼ along one axis into `out`, the missing quarter folded back at the ends (flux is kept).
+fn smooth_along(image: &[DVec3], out: &mut [DVec3], dims: [usize; 3], axis: usize) {
     let stride = [1, dims[0], dims[0] * dims[1]][axis];
     let n = dims[axis];
-    (0..image.len())
-        .into_par_iter()
-        .with_min_len(4096)
-        .map(|i| {
-            let at = i / stride % n;
-            let before = if at > 0 { image[i - stride] } else { image[i] };
-            let after = if at + 1 < n { image[i + stride] } else { image[i] };
-            0.25 * before + 0.5 * image[i] + 0.25 * after
-        })
-        .collect()
+    out.par_iter_mut().enumerate().with_min_len(4096).for_each(|(i, out)| {
+        let at = i / stride % n;
+        let before = if at > 0 { image[i - stride] } else { image[i] };
+        let after = if at + 1 < n { image[i + stride] } else { image[i] };
+        *out = 0.25 * before + 0.5 * image[i] + 0.25 * after;
+    });
 }
 
 #[cfg(test)]
