@@ -15,7 +15,7 @@ use crate::node_set::NodeSet;
 use crate::photon::{PhotonSettings, trace_photons};
 use crate::progress::{Clock, Progress, interrupted};
 use crate::radiance::{BLOCK, Indirect, RadianceSample, Sampler, sample_places};
-use crate::radiance_cache::{CacheSettings, NodePhotons, RadianceCache};
+use crate::radiance_cache::{NodePhotons, RadianceCache};
 use crate::sampling::{Strategy, positions};
 use crate::scene::Scene;
 use crate::volume::Lattice;
@@ -69,13 +69,7 @@ pub(super) fn light(
     // The walls' light of all isovalues; what the nodes take from photons.
     let clock = Clock::start();
     let stage = progress.stage("walls", 0);
-    let cache_settings = CacheSettings {
-        node_shadow_rays: settings.cache_shadow_rays,
-        flat_shadow_rays: settings.wall_shadow_rays,
-        flat_resolution: settings.wall_resolution,
-        isovalue_resolution: settings.wall_isovalues,
-        seed: settings.seed,
-    };
+    let cache_settings = settings.cache();
     let estimate = settings.estimate();
     let gather = settings.gather_rays > 0;
     let unsaved = [checkpoint::Stage::UNSAVED; 2];

@@ -4,6 +4,7 @@ use super::{can_sweep, left_out};
 use crate::error::{Error, Result};
 use crate::illumination_grid::GridSize;
 use crate::photon_map::{EstimateSettings, Estimator, Normalisation};
+use crate::radiance_cache::CacheSettings;
 use crate::sampling::Strategy;
 use crate::scene::Scene;
 use crate::sweep::SweepSettings;
@@ -407,6 +408,16 @@ impl BakeSettings {
             flat_resolution: (self.wall_resolution, self.wall_isovalues),
             seed: self.seed,
             ..SweepSettings::default()
+        }
+    }
+
+    pub(super) fn cache(&self) -> CacheSettings {
+        CacheSettings {
+            node_shadow_rays: self.cache_shadow_rays,
+            flat_shadow_rays: self.wall_shadow_rays,
+            flat_resolution: self.wall_resolution,
+            isovalue_resolution: self.wall_isovalues,
+            seed: self.seed,
         }
     }
 

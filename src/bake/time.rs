@@ -13,7 +13,7 @@ use crate::nearest::Neighbours;
 use crate::photon::{PhotonSettings, Photons, trace_photons};
 use crate::photon_map::PhotonMap;
 use crate::radiance::{Indirect, sample_radiance};
-use crate::radiance_cache::RadianceCache;
+use crate::radiance_cache::{CacheSettings, RadianceCache};
 use crate::rng::Stage;
 use crate::sampling::{Strategy, positions};
 use crate::scene::Scene;
@@ -26,15 +26,28 @@ use std::time::Instant;
 const PHOTONS: u64 = 1 << 15;
 const SAMPLES: u64 = 1 << 12;
 
-/// Directions and points of each luminaire that a sweep is tried with.
+/// Directions and replicates that a sweep is tried with. The second one tells what a pass takes besides its directions,
+/// and what walls take when their memory is no longer new.
 const DIRECTIONS: usize = 16;
-const LIGHT_POINTS: usize = 4;
+const REPLICATES: usize = 2;
+
+/// A trial is repeated up to so many times while that takes no more than this many seconds.
+const MOST_TRIES: usize = 5;
+const SHORT: f64 = 0.2;
+
+/// Luminaire points that a sweep is tried with, and the fewest of each luminaire. Walls look at sixteen of one together.
+const LIGHT_POINTS: usize = 16;
+const FEWEST_POINTS: usize = 4;
 
 /// Lattices of more points than this are tried on a coarse copy of the field.
 const MOST_POINTS: f64 = (1u64 << 21) as f64;
 
 /// A sweep is tried with at most about this many texels, of 100 bytes: the walls of the standard preset.
 const MOST_TEXELS: f64 = (1u64 << 20) as f64;
+
+/// Photons' walls are tried with at most about this many texels, and with no fewer across than this.
+const MOST_SHADOWED: f64 = (1u64 << 16) as f64;
+const LEAST_ACROSS: usize = 8;
 
 /// Estimated wall seconds of a bake, stage by stage, on as many threads as it will have.
 #[derive(Clone, Debug, PartialEq)]
@@ -68,11 +81,12 @@ impl TimeEstimate {
             let tried = GridSize::Points(grid.dims().map(shrunk)).lattice(&grid)?;
             let lit = lit.resampled(&tried);
             let pilot = |across: usize| {
+                let points = (LIGHT_POINTS / lit.luminaires().len().max(1)).max(FEWEST_POINTS);
                 let pilot = SweepSettings {
                     directions: settings.directions.min(DIRECTIONS),
-                    light_points: settings.light_points.min(LIGHT_POINTS),
-                    max_bounces: settings.sweep().max_bounces.min(1),
-                    replicates: 1,
+                    light_points: settings.light_points.min(points),
+                    max_bounces: 1,
+                    replicates: REPLICATES,
                     flat_resolution: (across, settings.wall_isovalues),
                     ..settings.sweep()
                 };
@@ -95,16 +109,14 @@ impl TimeEstimate {
         let begun = Instant::now();
         let photons = trace_photons(scene, &tracer, &pilot, &|_| true);
         let all = begun.elapsed().as_secs_f64() * settings.photons as f64 / count.max(1) as f64;
-        let (mut cache, mut samples, mut per_ray) = (0.0, 0.0, 0.0);
+        let (mut cache, mut samples) = (walls_seconds(scene, &tracer, &photons, settings), 0.0);
         for number in 0..scene.fields() {
             let seen = scene.seen_from(number);
             let tracer = GraphTracer::with_pyramids(device, &seen, &pyramids)?;
-            let [nodes, sampled, ray] = field_seconds(&seen, &tracer, &photons, settings)?;
-            (cache, samples, per_ray) = (cache + nodes, samples + sampled, ray);
+            let [nodes, sampled] = field_seconds(&seen, &tracer, &photons, settings)?;
+            (cache, samples) = (cache + nodes, samples + sampled);
         }
-        let texels = flat::texels(scene, settings.wall_resolution, settings.wall_isovalues);
-        let walls = texels as f64 * f64::from(settings.wall_shadow_rays) * per_ray;
-        Ok(Self { stages: vec![("photons", all), ("cache", cache + walls), ("samples", samples)] })
+        Ok(Self { stages: vec![("photons", all), ("cache", cache), ("samples", samples)] })
     }
 
     /// All stages together, seconds.
@@ -130,39 +142,135 @@ fn with_texels(walls: usize, texels: &dyn Fn(usize) -> f64, pilot: &dyn Fn(usize
     Ok(seconds + per_texel * (texels(walls) - texels(across)))
 }
 
-/// Estimated seconds of a sweep, of which `pilot` does a small part.
+/// Estimated seconds of a sweep, of which `pilot` does a small part: several times if that is short, since whatever else
+/// the machine does adds to some of its parts only.
 fn sweep_seconds(scene: &Scene, pilot: &SweepSettings, settings: &SweepSettings) -> Result<f64> {
+    let mut parts = timed_sweep(scene, pilot)?;
     let begun = Instant::now();
-    // Ends of the first and the last luminaire point.
-    let direct = Mutex::new(Vec::new());
+    for _ in 1..MOST_TRIES {
+        if begun.elapsed().as_secs_f64() + parts.total() > SHORT {
+            break;
+        }
+        parts = parts.least(&timed_sweep(scene, pilot)?);
+    }
+    Ok(parts.seconds(pilot, settings))
+}
+
+/// The parts of a sweep, measured.
+fn timed_sweep(scene: &Scene, pilot: &SweepSettings) -> Result<SweepParts> {
+    let begun = Instant::now();
+    // When luminaire points and families of lines began.
+    let begins = Mutex::new([Vec::new(), Vec::new()]);
     sweep::sweep(scene, pilot, &|fraction| {
-        if fraction <= sweep::DIRECT_SHARE
-            && let Ok(mut ends) = direct.lock()
-        {
-            ends.push(begun.elapsed().as_secs_f64());
+        if let Ok(mut begins) = begins.lock() {
+            begins[usize::from(fraction > sweep::DIRECT_SHARE)].push(begun.elapsed().as_secs_f64());
         }
         true
     })?;
     let end = begun.elapsed().as_secs_f64();
-    let ends = direct.into_inner().unwrap_or_default();
-    let [first, last] = [ends.first(), ends.last()].map(|e| e.copied().unwrap_or(0.0));
-    // Reading the field comes before the first point, once.
-    let per_point = if ends.len() > 1 { (last - first) / (ends.len() - 1) as f64 } else { first };
-    let points = settings.light_points * ends.len() / pilot.light_points.max(1);
-    let per_direction = (end - last) / pilot.directions.max(1) as f64;
-    let replicates = settings.replicates.max(1) as f64;
-    let bounces = if pilot.max_bounces > 0 { settings.expected_directions() as f64 * per_direction } else { 0.0 };
-    Ok((first - per_point).max(0.0) + replicates * points as f64 * per_point + bounces)
+    let [points, families] = begins.into_inner().unwrap_or_default();
+    Ok(SweepParts::new(&points, &families, end))
 }
 
-/// Estimated seconds of the cache's nodes and of the samples of the scene's own field, and seconds per ray.
+/// Seconds of the parts of a sweep. Most of what walls take does not grow with directions.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct SweepParts {
+    /// Once: reading the field before, and writing the result behind.
+    once: f64,
+    /// A replicate's luminaire points on the lattice,
+    points: f64,
+    /// and on walls.
+    walls: f64,
+    /// A pass without its directions; what goes before the first one is about the same.
+    pass: f64,
+    /// The directions of a pass.
+    directions: f64,
+}
+
+impl SweepParts {
+    /// From when the points and the families of [`REPLICATES`] of one bounce began, and when the last one ended.
+    fn new(points: &[f64], families: &[f64], end: f64) -> Self {
+        let first = points.first().copied().unwrap_or(0.0);
+        // From one step to the next, as a rule: what turns a lattice round, or the first steps from new memory, are
+        // others.
+        let step = |all: &[f64]| {
+            let parts = all.chunks_exact((all.len() / REPLICATES).max(1));
+            let mut steps: Vec<f64> = parts.flat_map(|part| part.windows(2).map(|w| w[1] - w[0])).collect();
+            steps.sort_by(f64::total_cmp);
+            steps.get(steps.len() / 2).copied().unwrap_or(0.0)
+        };
+        let (each, lit) = (families.len() / REPLICATES, points.len() / REPLICATES);
+        if each == 0 || lit == 0 {
+            return Self { once: end, ..Self::default() };
+        }
+        let (per_point, per_family) = (step(points), step(families));
+        let directions = each as f64 * per_family;
+        let pass = (families[each] - families[0] - directions).max(0.0);
+        let new_walls = points[lit] - points[lit - 1] - per_point;
+        let walls = (families[0] - points[points.len() - 1] - per_point - pass).max(0.0);
+        let written = end - families[families.len() - 1] - per_family - pass;
+        Self {
+            once: first + (new_walls - walls).max(0.0) + written.max(0.0),
+            points: lit as f64 * per_point,
+            walls,
+            pass,
+            directions,
+        }
+    }
+
+    /// All parts of two replicates.
+    fn total(&self) -> f64 {
+        self.once + REPLICATES as f64 * (self.points + self.walls + self.pass + self.directions)
+    }
+
+    /// Of each part the shorter one.
+    fn least(&self, other: &Self) -> Self {
+        Self {
+            once: self.once.min(other.once),
+            points: self.points.min(other.points),
+            walls: self.walls.min(other.walls),
+            pass: self.pass.min(other.pass),
+            directions: self.directions.min(other.directions),
+        }
+    }
+
+    /// All of a sweep, by the parts of its `pilot`.
+    fn seconds(&self, pilot: &SweepSettings, settings: &SweepSettings) -> f64 {
+        let ratio = |a: usize, b: usize| a as f64 / b.max(1) as f64;
+        let points = ratio(settings.light_points, pilot.light_points);
+        let packs = ratio(settings.light_points.max(LIGHT_POINTS), pilot.light_points.max(LIGHT_POINTS));
+        let directions = ratio(settings.expected_directions(), pilot.directions);
+        let replicates = settings.replicates.max(1);
+        let direct = points * self.points + packs * self.walls;
+        let passes = 1 + settings.expected_passes();
+        self.once + replicates as f64 * direct + passes as f64 * self.pass + directions * self.directions
+    }
+}
+
+/// Estimated seconds of the walls that photons light, from some of their texels: as few as photons are fewer, which leaves
+/// as many to each.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a part of a length")]
+fn walls_seconds(scene: &Scene, tracer: &GraphTracer<'_>, photons: &Photons, settings: &BakeSettings) -> f64 {
+    let walls = settings.wall_resolution;
+    let texels = |across: usize| flat::texels(scene, across, settings.wall_isovalues) as f64;
+    let all = texels(walls);
+    let share = (photons.emitted as f64 / settings.photons.max(1) as f64).min(MOST_SHADOWED / all.max(1.0));
+    let across = ((walls as f64 * share.sqrt()) as usize).clamp(walls.min(LEAST_ACROSS), walls);
+    let tried = CacheSettings { flat_resolution: across, ..settings.cache() };
+    let unsaved = [checkpoint::Stage::UNSAVED; 2];
+    let begun = Instant::now();
+    RadianceCache::new(scene, tracer, photons, settings.estimate(), &tried, false, unsaved, &|_| true);
+    begun.elapsed().as_secs_f64() * all / texels(across).max(1.0)
+}
+
+/// Estimated seconds of the cache's nodes and of the samples of the scene's own field.
 #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
 fn field_seconds(
     scene: &Scene,
     tracer: &GraphTracer<'_>,
     photons: &Photons,
     settings: &BakeSettings,
-) -> Result<[f64; 3]> {
+) -> Result<[f64; 2]> {
     let own = scene.lattice();
     let needed = masks(&scene.field, own).iter().filter(|&&m| m != Mask::Empty).count() as f64;
     let side = scene.surface.outside;
@@ -170,20 +278,15 @@ fn field_seconds(
     let tried = at.len().max(1) as f64;
     let map = PhotonMap::new(scene, &photons.surface, side, |p| p.bounces > 0, settings.estimate());
     let begun = Instant::now();
-    let rays: u64 = at
-        .par_iter()
-        .enumerate()
-        .with_min_len(64)
-        .map_init(Neighbours::default, |scratch, (i, &position)| {
-            let p = position.as_dvec3();
-            let isovalue = scene.field.value(p) as f32;
-            let Some(normal) = scene.normal(p, side) else { return 0 };
-            map.irradiance(p, f64::from(isovalue), scratch);
-            let receiver = Receiver { position, normal, isovalue, departure: Departure::Surface(side) };
-            let key = (settings.seed, Stage::Cache, i as u64);
-            direct_irradiance(scene, tracer, &receiver, settings.cache_shadow_rays, key).rays
-        })
-        .sum();
+    at.par_iter().enumerate().with_min_len(64).for_each_init(Neighbours::default, |scratch, (i, &position)| {
+        let p = position.as_dvec3();
+        let isovalue = scene.field.value(p) as f32;
+        let Some(normal) = scene.normal(p, side) else { return };
+        map.irradiance(p, f64::from(isovalue), scratch);
+        let receiver = Receiver { position, normal, isovalue, departure: Departure::Surface(side) };
+        let key = (settings.seed, Stage::Cache, i as u64);
+        direct_irradiance(scene, tracer, &receiver, settings.cache_shadow_rays, key);
+    });
     let per_node = begun.elapsed().as_secs_f64() / tried;
     // Light reaches the other side of most surfaces, too.
     let sides = if photons.surface.iter().any(|p| p.side != side) { 2.0 } else { 1.0 };
@@ -197,7 +300,7 @@ fn field_seconds(
     };
     let unsaved = checkpoint::Stage::UNSAVED;
     let (shadow, seed) = (settings.shadow_rays, settings.seed);
-    let sampled = sample_radiance(scene, tracer, &indirect, &at, side, shadow, seed, unsaved, &|_| true);
+    sample_radiance(scene, tracer, &indirect, &at, side, shadow, seed, unsaved, &|_| true);
     let seconds = begun.elapsed().as_secs_f64();
     // A finer grid needs about the same share of its points, and its masks may need more memory than there is.
     let points = needed * settings.grid.lattice(own)?.len() as f64 / own.len() as f64;
@@ -205,9 +308,8 @@ fn field_seconds(
         StrategyName::Nodes => points,
         _ => settings.samples.map_or(points * settings.samples_per_point, |n| n as f64),
     };
-    let per_ray = seconds / (sampled.rays + rays).max(1) as f64;
     let per_sample = seconds / tried * scene.surface.stored_sides().len() as f64;
-    Ok([per_node * nodes, per_sample * samples, per_ray])
+    Ok([per_node * nodes, per_sample * samples])
 }
 
 impl std::fmt::Display for TimeEstimate {
@@ -258,6 +360,29 @@ mod tests {
             let estimate = with_texels(500, &texels, &pilot).unwrap();
             assert!((3.0..=3.0 * texels(500) / texels(72)).contains(&estimate), "{noise}: {estimate}");
         }
+    }
+
+    /// A pilot of known parts, on a clock of its own: a sweep of other settings is their sum.
+    #[test]
+    fn a_sweep_is_the_sum_of_its_parts_as_often_as_it_has_them() {
+        let parts = SweepParts { once: 7.0, points: 16.0 * 0.25, walls: 3.0, pass: 2.0, directions: 8.0 * 0.5 };
+        // Walls take 2 longer at first.
+        let points: Vec<f64> = (0..32).map(|n| 4.0 + 0.25 * f64::from(n) + f64::from(n / 16) * 5.0).collect();
+        let gather = 4.0 + 2.0 * (4.0 + 3.0) + 2.0 + 2.0;
+        let families: Vec<f64> = (0..16).map(|n| gather + 0.5 * f64::from(n) + 2.0 * f64::from(n / 8)).collect();
+        let pilot =
+            SweepSettings { directions: 16, light_points: 16, replicates: 2, max_bounces: 1, ..Default::default() };
+        let end = gather + 2.0 * (4.0 + 2.0) + 1.0;
+        assert_eq!(SweepParts::new(&points, &families, end), parts);
+        assert_eq!(parts.seconds(&pilot, &pilot), end);
+        let more = SweepSettings { directions: 64, light_points: 32, replicates: 4, max_bounces: 3, ..pilot };
+        // Four times 32 points and walls, 4 × 3 passes of four times the directions.
+        let seconds = 7.0 + 4.0 * (8.0 + 6.0) + 13.0 * 2.0 + 12.0 * 4.0 * 4.0;
+        assert_eq!(parts.seconds(&pilot, &more), seconds);
+        // Nothing is less than nothing, whatever noise says.
+        let noise = SweepParts::new(&[1.0, 2.0, 2.1, 2.2], &[2.3, 2.4, 2.4, 2.5], 2.5);
+        assert!([noise.once, noise.points, noise.walls, noise.pass, noise.directions].iter().all(|&x| x >= 0.0));
+        assert_eq!(SweepParts::new(&[], &[], 2.0).seconds(&pilot, &pilot), 2.0);
     }
 
     /// Directions along lines and back, of one side, that a sweep took.

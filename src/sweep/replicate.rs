@@ -65,6 +65,12 @@ impl SweepSettings {
         SETTLING * coarse + late + (replicates - 1) * self.directions
     }
 
+    /// The passes that take them.
+    pub(crate) fn expected_passes(&self) -> usize {
+        let replicates = self.replicates.max(1);
+        if self.settles() { SETTLING + LATE + replicates - 1 } else { replicates * self.max_bounces }
+    }
+
     /// Whether bounces go on until what is left out is small, not to a small number.
     fn settles(&self) -> bool {
         self.max_bounces >= 6
