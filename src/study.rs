@@ -41,9 +41,23 @@ impl Subject {
         self.scene.field.sweep().from_unit(fraction)
     }
 
-    /// Whether a bake can be compared with references at an isovalue (source units): there is a surface.
-    fn has_surface(&self, isovalue: f64) -> bool {
-        SurfaceMesh::extract(&self.scene, self.scene.field.sweep().isovalue(isovalue), 1).is_ok()
+    /// Those of some isovalues (source units, increasing) where a bake can be compared with references: there is a surface.
+    ///
+    /// # Errors
+    /// `Invalid` if there is none, since no error is known then.
+    fn with_surfaces(&self, isovalues: &[f64]) -> Result<Vec<f64>> {
+        let sweep = self.scene.field.sweep();
+        let there = |c: &f64| SurfaceMesh::extract(&self.scene, sweep.isovalue(*c), 1).is_ok();
+        let there: Vec<f64> = isovalues.iter().copied().filter(there).collect();
+        if let ([], [first, .., last] | [first @ last]) = (&there[..], isovalues) {
+            return Err(Error::Invalid(format!(
+                "'{}' has no surface at any isovalue at which bakes are compared ({} from {first:.4} to {last:.4}); narrow its \
+                 isovalues to where it has surfaces",
+                self.name,
+                isovalues.len(),
+            )));
+        }
+        Ok(there)
     }
 
     /// The isovalue reported first.

@@ -100,3 +100,23 @@ fn strategies_are_not_baked_again_where_there_is_no_surface_to_compare() {
     let (code, said) = study("-1e6, 1e6");
     assert!(code == Some(2) && said.contains("'s' has no surface") && bakes(&said) == 0, "{code:?} {said}");
 }
+
+#[test]
+fn curves_are_refused_where_no_error_would_be_known() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    assert!(isolume(dir, &["generate", "bumps", "--size", "8", "-o", "b.vti", "-q"]).status.success());
+    let text = |range: &str| format!("isovalues = [{range}]\n[volume]\nfile = \"b.vti\"\n");
+    fs::write(dir.join("good.toml"), text("3.6, 95")).unwrap();
+    fs::write(dir.join("bad.toml"), text("-1e6, 1e6")).unwrap();
+    let common = ["-o", "st", "--quick", "--wall-resolution", "4", "--limit", "0"];
+    let study = |scenes: &[&str]| {
+        let output = isolume(dir, &[&["study", "curve"], scenes, &common].concat());
+        (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+    };
+    // Before any of them is begun.
+    let (code, said) = study(&["good.toml", "bad.toml"]);
+    assert!(code == Some(2) && said.contains("'bad' has no surface") && !said.contains("good"), "{code:?} {said}");
+    let (code, said) = study(&["good.toml"]);
+    assert!(code == Some(0) && said.contains("good"), "{code:?} {said}");
+}

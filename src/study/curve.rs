@@ -66,19 +66,21 @@ fn candidates(quick: bool) -> Vec<Candidate> {
     out
 }
 
-/// Bakes in many ways, those that are estimated to take at most `limit` wall seconds; the error is the RMS over five
-/// isovalues of the sweep.
+/// Bakes in many ways, those that are estimated to take at most `limit` wall seconds; the error is the RMS over those
+/// of five isovalues of the sweep that have a surface.
 ///
 /// # Errors
-/// As bakes, references and tables.
+/// As bakes, references and tables; `Invalid` if no such isovalue has a surface.
 pub fn curve(study: &Study, subjects: &[Subject], base: &BakeOptions, limit: Option<f64>) -> Result<()> {
     let mut table = Table::open(study.folder.join("curve.csv"), &COLUMNS, 7)?;
     let jobs = study.jobs(&table, subjects, base)?;
-    for (subject, job) in subjects.iter().zip(&jobs) {
-        let fractions: &[f64] = if study.quick { &[0.475] } else { &[0.18, 0.344, 0.475, 0.617, 0.836] };
+    let fractions: &[f64] = if study.quick { &[0.475] } else { &[0.18, 0.344, 0.475, 0.617, 0.836] };
+    let compared = |s: &Subject| s.with_surfaces(&fractions.iter().map(|&f| s.at(f)).collect::<Vec<f64>>());
+    let compared: Vec<Vec<f64>> = subjects.iter().map(compared).collect::<Result<_>>()?;
+    for ((subject, job), isovalues) in subjects.iter().zip(&jobs).zip(&compared) {
         let mut references = Vec::new();
-        for &f in fractions {
-            references.extend(study.references(subject, subject.at(f), Effort::Curve)?);
+        for &c in isovalues {
+            references.extend(study.references(subject, c, Effort::Curve)?);
         }
         for Candidate { name, options } in candidates(study.quick) {
             let number = |n: Option<u64>| n.map_or_else(|| "-".to_owned(), |n| n.to_string());

@@ -3,7 +3,7 @@
 use super::figure6::figure6;
 use super::{Effort, Study, Subject, Table, accuracy_of, exactly, provenance};
 use crate::bake::{BakeOptions, BakeSettings, Engine, StrategyName};
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::illumination_grid::GridSize;
 use crate::mask::{Mask, masks};
 use crate::plot::{Plot, Series};
@@ -166,18 +166,7 @@ fn isovalues(study: &Study, subject: &Subject) -> Result<Vec<f64>> {
     fractions.dedup_by(|a, b| (*a - *b).abs() < 0.008);
     // Elsewhere no row ever says that a bake was compared.
     let all: Vec<f64> = fractions.into_iter().map(|f| subject.at(f)).collect();
-    let there: Vec<f64> = all.iter().copied().filter(|&c| subject.has_surface(c)).collect();
-    if there.is_empty() {
-        return Err(Error::Invalid(format!(
-            "'{}' has no surface at any of the {} isovalues from {:.4} to {:.4} that strategies are compared at; narrow its \
-             isovalues to where it has surfaces",
-            subject.name,
-            all.len(),
-            all[0],
-            all[all.len() - 1]
-        )));
-    }
-    Ok(there)
+    subject.with_surfaces(&all)
 }
 
 /// BB09's level sets 39.0 + 17.7 k of the sweep [3.6, 95], as fractions.
