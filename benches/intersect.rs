@@ -1,14 +1,15 @@
 //! Isovalue rays beside Embree's triangle rays: how fast every isosurface is traced, against one extracted isosurface.
 //!
-//! `cargo bench --bench intersect [-- --data DIR] [--quick]`; DIR holds ch2.nii.gz, engine.vti and pasta-proton.vti, which
-//! `isolume generate pasta --species both -o DIR/pasta.vti` makes; files that are not there are left out.
+//! `cargo bench --bench intersect [-- --data DIR] [--quick]`; DIR holds ch2.nii.gz, engine.vti and pasta-proton.vti,
+//! which `isolume generate pasta --species both -o DIR/pasta.vti` makes; files that are not there are left out.
 //!
 //! "fixed c": cosine-hemisphere rays leave vertices of the isosurface that was extracted; the same rays go to its
 //! triangles in Embree (quality HIGH, the faster of single rays and packets: rtcIntersect16, or rtcIntersect8 twice
 //! where Embree takes sixteen apart). "any c": they leave random points x of Ω with c = h(x), over the whole sweep.
-//! "random": every ray from another place; "gather64": 64 rays per place, places in Morton order. Two threads; medians of interleaved repetitions, since machines are shared: only the
-//! ratios mean anything. The isovalue rays pay for the set-up, spread over 10 M rays; the triangle rays do not. At random
-//! places with any c every instruction set of the machine is compared with plain code.
+//! "random": every ray from another place; "gather64": 64 rays per place, places in Morton order. Two threads; medians
+//! of interleaved repetitions, since machines are shared: only the ratios mean anything. The isovalue rays pay for the
+//! set-up, spread over 10 M rays; the triangle rays do not. At random places with any c every instruction set of the
+//! machine is compared with plain code.
 
 use glam::DVec3;
 use isolume::embree::{

@@ -1,5 +1,5 @@
-//! Photons traced per second, and irradiance estimated from them: rate and error of every estimator over the photons per
-//! estimate, against a gather of many rays. Then the reference's paths. Rates are per CPU second of all threads.
+//! Photons traced per second, and irradiance estimated from them: rate and error of every estimator over the photons
+//! per estimate, against a gather of many rays. Then the reference's paths. Rates are per CPU second of all threads.
 
 use glam::DVec3;
 use isolume::checkpoint;

@@ -1,7 +1,7 @@
-//! Each long stage on one thread and on two, interleaved: wall seconds at the quietest of several turns, and CPU seconds,
-//! which other work on the machine hardly changes. Two threads that share a stage well need half the wall seconds; if they
-//! need more CPU seconds than one, they get into each other's way. With `growth SIZE…` instead: CPU seconds of the stages of a
-//! bake against the size of the lattice, and the exponents between sizes.
+//! Each long stage on one thread and on two, interleaved: wall seconds at the quietest of several turns, and CPU
+//! seconds, which other work on the machine hardly changes. Two threads that share a stage well need half the wall
+//! seconds; if they need more CPU seconds than one, they get into each other's way. With `growth SIZE…` instead: CPU
+//! seconds of the stages of a bake against the size of the lattice, and the exponents between sizes.
 
 use glam::Vec3;
 use isolume::bake::{BakeOptions, BakeSettings, Engine, Preset, bake};

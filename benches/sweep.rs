@@ -1,9 +1,9 @@
 //! Gather rays of the sweep engine (RGB lookup, cosine, accumulation and walls included) against Embree's rays on the
 //! triangles of one extracted isosurface; per CPU second, medians of interleaved repetitions of one run.
 //!
-//! `cargo bench --bench sweep [-- --full] [--data DIR]`. "bumps" leaves two thirds of its nodes outside the sweep, "foam"
-//! (300 blobs, every node in the sweep) none. DIR holds pasta-proton.vti, fluid.vti, neuron.mha, ch2.nii.gz; files that are
-//! not there are left out. `--full` adds the growth with the lattice.
+//! `cargo bench --bench sweep [-- --full] [--data DIR]`. "bumps" leaves two thirds of its nodes outside the sweep,
+//! "foam" (300 blobs, every node in the sweep) none. DIR holds pasta-proton.vti, fluid.vti, neuron.mha, ch2.nii.gz;
+//! files that are not there are left out. `--full` adds the growth with the lattice.
 
 use glam::{DVec3, Vec3};
 use isolume::embree::{Device, Ray, RayHit, Scene as Bvh, SceneBuilder};

@@ -1,6 +1,6 @@
 //! What each way of sampling direct and gathered light is worth: 1 / (variance × CPU seconds), relative to independent
-//! random points, over receivers all over bumps 101³. Variances are over repetitions with other seeds, averaged over the
-//! receivers.
+//! random points, over receivers all over bumps 101³. Variances are over repetitions with other seeds, averaged over
+//! the receivers.
 
 use glam::{DVec3, Vec3};
 use isolume::direct::{Receiver, direct_irradiance};

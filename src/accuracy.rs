@@ -1,8 +1,8 @@
 //! How far a bake is from references: percent RMS as BB09 measured it. \[BB09 §3\]
 //!
-//! Colours are linear, rgb = L π / (ρ_max E₀) clamped to [0, 1]. BB09 print the squared vertex error as |Δ|, without the
-//! square; read as a squared Euclidean norm, `percent_rms = 100 √⟨|rgb_tex − rgb_ref|²⟩` is what this crate reports, and
-//! that / √3, the RMS per channel, beside it.
+//! Colours are linear, rgb = L π / (ρ_max E₀) clamped to [0, 1]. BB09 print the squared vertex error as |Δ|, without
+//! the square; read as a squared Euclidean norm, `percent_rms = 100 √⟨|rgb_tex − rgb_ref|²⟩` is what this crate
+//! reports, and that / √3, the RMS per channel, beside it.
 
 mod floor;
 
@@ -30,7 +30,8 @@ pub struct ReferenceMesh {
 }
 
 impl ReferenceMesh {
-    /// From the properties that `isolume reference` writes; variance 0 and all vertices sampled where those are missing.
+    /// From the properties that `isolume reference` writes; variance 0 and all vertices sampled where those are
+    /// missing.
     ///
     /// # Errors
     /// `Invalid` if positions or radiance are missing.

@@ -13,8 +13,9 @@ const MOST_LINKS: usize = 40;
 /// A file under a temporary name beside its own; [`AtomicFile::commit`] renames it.
 ///
 /// Whoever reads the file's own name sees the old content or the complete new one, never a part. Dropped without
-/// commit, the temporary file is removed and the old content stays; only a killed process leaves it behind (hidden, named
-/// `.<name>.<process>-<count>.tmp`). A symbolic link is followed: the file it names is replaced, or made, not the link.
+/// commit, the temporary file is removed and the old content stays; only a killed process leaves it behind (hidden,
+/// named `.<name>.<process>-<count>.tmp`). A symbolic link is followed: the file it names is replaced, or made, not the
+/// link.
 #[derive(Debug)]
 pub struct AtomicFile {
     /// `None` once closed.

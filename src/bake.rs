@@ -86,9 +86,11 @@ pub struct BakeReport {
     pub samples_without_gradient: u64,
     /// Grid points without radiance of their own: outside the sweep, without gradient, or not finite.
     pub masked: u64,
-    /// Those of them that hold light all the same: of their own level set closely outside the sweep, else fitted to samples nearby.
+    /// Those of them that hold light all the same: of their own level set closely outside the sweep, else fitted to
+    /// samples nearby.
     pub filled: u64,
-    /// Gather rays that landed where the cache held nothing: those of points just outside the sweep, far off what is in it.
+    /// Gather rays that landed where the cache held nothing: those of points just outside the sweep, far off what is in
+    /// it.
     pub misses: u64,
     /// Grid points whose radiance or standard error was not finite, set to 0 and masked.
     pub non_finite: u64,
@@ -175,8 +177,8 @@ pub fn bake(scene: &Scene, settings: &BakeSettings, device: &Device, progress: P
     bake_resumable(scene, settings, device, progress, None)
 }
 
-/// As [`bake`], keeping finished blocks of the long stages (radiance cache, radiance samples) in `checkpoint` and taking
-/// from there what a run of the same [`job`] finished: with the same bits, counts included.
+/// As [`bake`], keeping finished blocks of the long stages (radiance cache, radiance samples) in `checkpoint` and
+/// taking from there what a run of the same [`job`] finished: with the same bits, counts included.
 ///
 /// # Errors
 /// As [`bake`].

@@ -58,7 +58,8 @@ impl Cell {
 
     /// Whether h ≥ c at (u, v) on the face across `axis` at its near (`far` = false) or far end; u and v run along the
     /// next two axes in cyclic order. Bit for bit the same from both cells that share the face: it uses the face's own
-    /// corners only, and equal signs of all four decide without arithmetic. The same bits as [`Cell::value`] on the face.
+    /// corners only, and equal signs of all four decide without arithmetic. The same bits as [`Cell::value`] on the
+    /// face.
     #[inline(always)]
     pub fn face_inside(&self, axis: usize, far: bool, c: f64, u: f64, v: f64) -> bool {
         let (b, d) = (1 << ((axis + 1) % 3), 1 << ((axis + 2) % 3));

@@ -1,9 +1,9 @@
 //! Checkpoints of long work: finished blocks of its long stages, in one file that is always whole.
 //!
-//! A stage is cut into numbered blocks whose bits depend on nothing but the job. Finished ones are appended to the file every
-//! now and then and leave memory; each has a checksum, and what a killed process wrote half is cut off by the next. A file
-//! that is mostly blocks since replaced is written anew under a temporary name. Who resumes gets the same bits, since blocks
-//! are either read back whole or computed anew.
+//! A stage is cut into numbered blocks whose bits depend on nothing but the job. Finished ones are appended to the file
+//! every now and then and leave memory; each has a checksum, and what a killed process wrote half is cut off by the
+//! next. A file that is mostly blocks since replaced is written anew under a temporary name. Who resumes gets the same
+//! bits, since blocks are either read back whole or computed anew.
 
 use crate::atomic;
 use crate::error::{Error, Result};
@@ -21,8 +21,8 @@ const MAGIC: &[u8] = b"isolume checkpoint 9\n";
 /// What the magic of any version starts with.
 const ANY_MAGIC: &[u8] = b"isolume checkpoint ";
 
-/// Bytes that may wait to be written beside the largest block, however long ago the last writing was. The largest was whole in
-/// memory anyway.
+/// Bytes that may wait to be written beside the largest block, however long ago the last writing was. The largest was
+/// whole in memory anyway.
 pub const MOST_WAITING: usize = 128 << 20;
 
 /// Writing may take this share of the time.
@@ -126,8 +126,8 @@ impl Checkpoint {
         Ok(Self { path: path.to_path_buf(), job, every, state: Mutex::new(state) })
     }
 
-    /// Reads the blocks that an interrupted run of the same job left. False if there is no file. Half-written files of killed
-    /// runs are removed.
+    /// Reads the blocks that an interrupted run of the same job left. False if there is no file. Half-written files of
+    /// killed runs are removed.
     ///
     /// # Errors
     /// `Io`; `Invalid` if the file is damaged or of another job; the message names the first difference.

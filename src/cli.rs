@@ -132,8 +132,8 @@ struct Render {
     /// The isosurface to draw, in the volume's units
     #[arg(long, value_name = "C", allow_negative_numbers = true)]
     isovalue: f64,
-    /// Of several volumes, the one that --isovalue speaks of: its name (default: the first). The others are drawn at the
-    /// same share of their own ranges
+    /// Of several volumes, the one that --isovalue speaks of: its name (default: the first). The others are drawn at
+    /// the same share of their own ranges
     #[arg(long, value_name = "NAME")]
     field: Option<String>,
     /// Output: .png (exposed, sRGB) or .exr (linear radiance)

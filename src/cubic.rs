@@ -1,7 +1,7 @@
 //! Cubics in f64: where one first changes sign on an interval, by signs that the caller owns.
 //!
-//! A trilinear cell restricted to a ray is a cubic \[Parker99\]. Neighbouring cells must agree whether a ray crosses the
-//! level set, so the signs at the ends come from outside (the shared faces), and the solver only has to say where.
+//! A trilinear cell restricted to a ray is a cubic \[Parker99\]. Neighbouring cells must agree whether a ray crosses
+//! the level set, so the signs at the ends come from outside (the shared faces), and the solver only has to say where.
 
 /// c0 + c1 t + c2 t² + c3 t³.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -69,9 +69,9 @@ impl Cubic {
     }
 
     /// The root in [lo, hi] on which the caller insists, `inside_lo` being the state at lo ≥ 0: Newton kept inside a
-    /// shrinking bracket; where its steps do not halve (a triple root, a root far below the bracket's length) the bracket
-    /// is halved instead, in bits, so that a root of any size is met. Ends when the bracket is as small as f64 allows
-    /// or the value is 0; at most 128 steps.
+    /// shrinking bracket; where its steps do not halve (a triple root, a root far below the bracket's length) the
+    /// bracket is halved instead, in bits, so that a root of any size is met. Ends when the bracket is as small as f64
+    /// allows or the value is 0; at most 128 steps.
     #[inline(never)]
     fn bracketed_root(&self, mut lo: f64, mut hi: f64, inside_lo: bool) -> f64 {
         let middle = |lo: f64, hi: f64| f64::from_bits(lo.to_bits() + hi.to_bits().saturating_sub(lo.to_bits()) / 2);

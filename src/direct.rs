@@ -64,8 +64,8 @@ pub fn open_irradiance(scene: &Scene, p: DVec3, n: DVec3) -> DVec3 {
 /// No budget is cut below this.
 const LEAST_RAYS: u32 = 8;
 
-/// Shadow rays for a receiver that may get the irradiance `open` (luminance), of at most `shadow_rays`: all from half the
-/// scene's E₀ on, and down to an eighth where there is less to get, so that light is equally certain everywhere.
+/// Shadow rays for a receiver that may get the irradiance `open` (luminance), of at most `shadow_rays`: all from half
+/// the scene's E₀ on, and down to an eighth where there is less to get, so that light is equally certain everywhere.
 fn budget(scene: &Scene, open: f64, shadow_rays: u32) -> u32 {
     let mut rays = shadow_rays;
     let mut full = 0.5 * scene.reference_irradiance();
@@ -76,12 +76,12 @@ fn budget(scene: &Scene, open: f64, shadow_rays: u32) -> u32 {
 }
 
 /// Irradiance from all luminaires: for each, Lambert's closed form × Σ V_i g_i / Σ g_i over at most `shadow_rays`
-/// low-discrepancy points y_i of its part above the horizon, with g = cos θ cos θ′/r²; next to a rectangle uniform over its
-/// solid angle, with g = cos θ, since of points spread over the area hardly any lies where a receiver there looks. Exact
-/// where all or none are visible: there a quarter of the points settles it; the rest is spent in penumbras. Receivers that
-/// could get less than half of E₀ ([`Scene::reference_irradiance`]) get fewer rays, in proportion down to an eighth. The
-/// ratio's bias falls with 1/shadow_rays; light or shadow below about 4 E₀/shadow_rays may be missed. The point set is keyed
-/// by (seed, stage, index).
+/// low-discrepancy points y_i of its part above the horizon, with g = cos θ cos θ′/r²; next to a rectangle uniform over
+/// its solid angle, with g = cos θ, since of points spread over the area hardly any lies where a receiver there looks.
+/// Exact where all or none are visible: there a quarter of the points settles it; the rest is spent in penumbras.
+/// Receivers that could get less than half of E₀ ([`Scene::reference_irradiance`]) get fewer rays, in proportion down
+/// to an eighth. The ratio's bias falls with 1/shadow_rays; light or shadow below about 4 E₀/shadow_rays may be missed.
+/// The point set is keyed by (seed, stage, index).
 pub fn direct_irradiance<T: Tracer>(
     scene: &Scene,
     tracer: &T,

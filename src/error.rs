@@ -60,7 +60,8 @@ impl Error {
         }
     }
 
-    /// The exit code of the command line: 2 for bad usage or input (paths that cannot be read or written among it), 130 when interrupted, 1 for the rest.
+    /// The exit code of the command line: 2 for bad usage or input (paths that cannot be read or written among it), 130
+    /// when interrupted, 1 for the rest.
     pub fn exit_code(&self) -> u8 {
         use std::io::ErrorKind as K;
         match self {

@@ -1,5 +1,5 @@
-//! Writers of what users take away: textured meshes, pictures and stacks of slices. Every file appears under its name only when it is
-//! complete.
+//! Writers of what users take away: textured meshes, pictures and stacks of slices. Every file appears under its name
+//! only when it is complete.
 
 pub mod bake_file;
 pub mod glb;

@@ -75,12 +75,13 @@ pub struct Field {
     coarse: Option<Arc<Field>>,
 }
 
-/// Samples are stored up to this: so far from the sweep only the side counts, and sums and differences of a few stay finite.
+/// Samples are stored up to this: so far from the sweep only the side counts, and sums and differences of a few stay
+/// finite.
 const FARTHEST: f32 = f32::MAX / 16.0;
 
 impl Field {
-    /// Maps a volume's samples to the sweep's units, in f64, and stores f32. Non-finite samples become NaN; those 2·10³⁷ times the
-    /// sweep and more away are stored as that.
+    /// Maps a volume's samples to the sweep's units, in f64, and stores f32. Non-finite samples become NaN; those
+    /// 2·10³⁷ times the sweep and more away are stored as that.
     ///
     /// # Errors
     /// `Invalid` if no sample is finite, if the sweep does not overlap the data, or if the samples in units of the
@@ -447,7 +448,8 @@ mod tests {
         assert!((fine.node_gradient([3, 2, 5]) - f.receiver_gradient(DVec3::new(1.5, 1.0, 2.5))).length() < 1e-12);
     }
 
-    /// A lattice whose points lie in cells and on nodes, the field's own, and those of a finer copy; gaps in the samples.
+    /// A lattice whose points lie in cells and on nodes, the field's own, and those of a finer copy; gaps in the
+    /// samples.
     #[test]
     fn rows_hold_what_points_do() {
         let mut f = oblique(|x| (3.0 * x.x).sin() + (x.y * x.z * 0.002).cos());

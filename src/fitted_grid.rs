@@ -2,9 +2,10 @@
 //! blended at the nodes.
 //!
 //! What a viewer shows is the interpolation of node values on isosurfaces. By the coarea formula a surface point of any
-//! isovalue stands for |∇h| dV, so the fit minimises Σ_j |∇h_j| (Σ_n φ_n(x_j) R_n − r_j)² over the samples: steep edges,
-//! where isosurfaces crowd, count, and the noise of nearly flat regions beside them does not. A pull towards Shepard's
-//! values holds nodes that few samples see, and noise. Solved by conjugate gradients from Shepard's values, matrix-free.
+//! isovalue stands for |∇h| dV, so the fit minimises Σ_j |∇h_j| (Σ_n φ_n(x_j) R_n − r_j)² over the samples: steep
+//! edges, where isosurfaces crowd, count, and the noise of nearly flat regions beside them does not. A pull towards
+//! Shepard's values holds nodes that few samples see, and noise. Solved by conjugate gradients from Shepard's values,
+//! matrix-free.
 
 use crate::field::Field;
 use crate::illumination_grid::IlluminationGrid;
@@ -64,9 +65,9 @@ impl Placed {
     }
 }
 
-/// Improves `start` (Shepard's grid on `lattice`, say) by the least-squares fit described above at the nodes that `free`
-/// holds; the others stay as they are. `pull` as [`PULL`]. The result does not depend on the number of threads. Beside the grid it
-/// takes 84 bytes per free node and 110 per sample.
+/// Improves `start` (Shepard's grid on `lattice`, say) by the least-squares fit described above at the nodes that
+/// `free` holds; the others stay as they are. `pull` as [`PULL`]. The result does not depend on the number of threads.
+/// Beside the grid it takes 84 bytes per free node and 110 per sample.
 pub fn fit(
     field: &Field,
     lattice: &Lattice,
@@ -169,8 +170,8 @@ impl Sorted {
         Self { starts, samples: placed, dims }
     }
 
-    /// Σ φ_n · `term` of every sample around each node n of `free`: each node gathers from its up to eight cells in a fixed
-    /// order, so nothing is shared between threads.
+    /// Σ φ_n · `term` of every sample around each node n of `free`: each node gathers from its up to eight cells in a
+    /// fixed order, so nothing is shared between threads.
     fn gather(&self, free: &NodeSet, term: impl Fn(usize) -> Vec3 + Sync) -> Vec<Vec3> {
         let [nx, ny, _] = self.dims;
         let mut out = vec![Vec3::ZERO; free.len()];

@@ -1,9 +1,9 @@
 //! n = 2: light on height fields, where BB09's idea shows in one picture. \[BB09 §2–2.2\]
 //!
-//! h₂: R² → R has a surface in R³ for a graph. *Flattened*, light stays in horizontal planes: the plane at height c holds
-//! the level curve L(h, c), the walls and the luminaire as segments, and a point reflects by f♭ = ρ/2. *Ordinary*, the
-//! same surface is lit as a surface in R³, by f = ρ/π, between the walls and the luminaire extruded upright over the
-//! sweep. Both go through [`crate::tracer::Tracer`], and everything above it is one code.
+//! h₂: R² → R has a surface in R³ for a graph. *Flattened*, light stays in horizontal planes: the plane at height c
+//! holds the level curve L(h, c), the walls and the luminaire as segments, and a point reflects by f♭ = ρ/2.
+//! *Ordinary*, the same surface is lit as a surface in R³, by f = ρ/π, between the walls and the luminaire extruded
+//! upright over the sweep. Both go through [`crate::tracer::Tracer`], and everything above it is one code.
 //!
 //! It is a second solver as well: an n = 2 field extruded along z must look to the n = 3 pipeline as it looks here.
 

@@ -43,7 +43,8 @@ pub enum Departure {
     Polygon(u32),
     /// A cap, by face, leaving into `Side`. The origin counts as on the face whatever its f32 coordinates.
     Cap(u8, Side),
-    /// The level set of companion number n ([`crate::scene::Companion`]), leaving into `Side`: as `Surface` for that field.
+    /// The level set of companion number n ([`crate::scene::Companion`]), leaving into `Side`: as `Surface` for that
+    /// field.
     Companion(u8, Side),
 }
 
@@ -89,8 +90,8 @@ impl FlattenedRay {
         Self { origin, direction, isovalue, reach: f32::INFINITY, departure: Departure::Free, target: None }
     }
 
-    /// Departure and target in 32 bits, for the spare word of an Embree ray: 2 bits of kind, 18 of polygon, of side and face, or of side and
-    /// companion + 1, 12 of target + 1.
+    /// Departure and target in 32 bits, for the spare word of an Embree ray: 2 bits of kind, 18 of polygon, of side and
+    /// face, or of side and companion + 1, 12 of target + 1.
     #[inline]
     pub fn pack_ends(&self) -> u32 {
         let departure = match self.departure {
@@ -133,8 +134,8 @@ impl FlattenedRay {
 pub enum Target {
     /// The level set, from `Side`.
     Surface(Side),
-    /// A face of Ω with h ≥ c behind it, seen from outside or inside ([`crate::scene::Boundary::Capped`] only): the face
-    /// ([`face_of`]), and the side it was met from.
+    /// A face of Ω with h ≥ c behind it, seen from outside or inside ([`crate::scene::Boundary::Capped`] only): the
+    /// face ([`face_of`]), and the side it was met from.
     Cap(u8, Side),
     /// A polygon's front, or a luminaire's back.
     Polygon(u32),

@@ -1,4 +1,5 @@
-//! Final gather: one bounce of rays into the radiance cache, more where surfaces of several fields cross. \[Jensen01; Christensen99\]
+//! Final gather: one bounce of rays into the radiance cache, more where surfaces of several fields cross. \[Jensen01;
+//! Christensen99\]
 
 use crate::direct::{Estimate, Receiver, direct_once, luminance};
 use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Target};
@@ -17,25 +18,27 @@ use std::f64::consts::PI;
 pub struct Gathered {
     /// Of all rays.
     pub estimate: Estimate,
-    /// Means of the first and the second half of the rays, well distributed each; both the mean of all if there is but one.
+    /// Means of the first and the second half of the rays, well distributed each; both the mean of all if there is but
+    /// one.
     pub halves: [DVec3; 2],
 }
 
-/// Hits on another field nearer than this many of its cells: surfaces of several fields cross, and light changes within a cell
-/// of the cache where they do. Such hits find their own light, from the luminaires and along one ray more. A field's own
-/// level sets never cross, so that the cache holds their light up close: the same errors at a tenth less time.
+/// Hits on another field nearer than this many of its cells: surfaces of several fields cross, and light changes within
+/// a cell of the cache where they do. Such hits find their own light, from the luminaires and along one ray more. A
+/// field's own level sets never cross, so that the cache holds their light up close: the same errors at a tenth less
+/// time.
 const NEAR: f64 = 1.0;
 /// Such hits in a row at most.
 const CORNERS: usize = 4;
-/// One of so many of a receiver's rays that land so goes on, for all of them: it corrects what the cache says, which is the
-/// mean of the rays that it stands for but for a part that light in corners adds. \[Arvo90\]
+/// One of so many of a receiver's rays that land so goes on, for all of them: it corrects what the cache says, which is
+/// the mean of the rays that it stands for but for a part that light in corners adds. \[Arvo90\]
 const SHARE: u64 = 8;
 /// Fewest rays that show a receiver to be sealed off from all light.
 const PILOT: u32 = 16;
 
 /// Indirect irradiance at `receiver`: π/M Σ L over `rays` cosine-distributed directions. Luminaires count 0, since
-/// direct light is counted apart; what leaves everything carries nothing. \[BB09 Eq. 2\] A receiver that sees nothing but dark
-/// surfaces all around, as inside another field's solid, is known to be dark after a quarter of its rays.
+/// direct light is counted apart; what leaves everything carries nothing. \[BB09 Eq. 2\] A receiver that sees nothing
+/// but dark surfaces all around, as inside another field's solid, is known to be dark after a quarter of its rays.
 pub fn gathered_irradiance<T: Tracer>(
     scene: &Scene,
     tracer: &T,
@@ -109,8 +112,8 @@ struct Corners<'a, T> {
 }
 
 impl<T: Tracer> Corners<'_, T> {
-    /// Radiance that arrives along `ray` from its `hit`: that of the cache if it is far away or nothing around it is lit, else
-    /// on a path until it is. `rng` makes the random numbers of the path.
+    /// Radiance that arrives along `ray` from its `hit`: that of the cache if it is far away or nothing around it is
+    /// lit, else on a path until it is. `rng` makes the random numbers of the path.
     #[inline]
     fn radiance(
         &mut self,

@@ -80,8 +80,8 @@ pub struct IlluminationGrid {
 }
 
 impl IlluminationGrid {
-    /// Radiance at index coordinates `p` of its `lattice`, as a 3D texture gives it: trilinear over the points of the cell
-    /// that hold something; 0 where none does.
+    /// Radiance at index coordinates `p` of its `lattice`, as a 3D texture gives it: trilinear over the points of the
+    /// cell that hold something; 0 where none does.
     pub fn interpolate(&self, lattice: &Lattice, p: DVec3) -> DVec3 {
         let far = lattice.far();
         let p = p.clamp(DVec3::ZERO, far);
@@ -140,8 +140,9 @@ pub(crate) fn point_grid(field: &Field, samples: &[RadianceSample]) -> PointGrid
     PointGrid::new(&places, 2.0)
 }
 
-/// A grid of what `value` says of each point that `masks` say holds light, radiance and standard error, from its number, its place
-/// as in [`point_grid`], and the so many samples nearest to it, as (squared distance, slot). `tick` as in [`shepard`].
+/// A grid of what `value` says of each point that `masks` say holds light, radiance and standard error, from its
+/// number, its place as in [`point_grid`], and the so many samples nearest to it, as (squared distance, slot). `tick`
+/// as in [`shepard`].
 pub(crate) fn from_nearest(
     lattice: &Lattice,
     masks: &[Mask],

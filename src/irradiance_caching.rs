@@ -1,10 +1,10 @@
 //! Scattered samples onto a grid as irradiance caching does it: what changes slowly is interpolated, what is known in
 //! closed form is not. \[Ward88\]
 //!
-//! Direct light at a grid point is what the luminaires would give its place and normal without obstacles, times the visible
-//! share, which the samples around know. Indirect light comes from samples that face nearly where the point does. Both are
-//! linear functions of place fitted to the samples \[Loader99\]. A mean of radiances, as Shepard's, blends lit and
-//! turned-away samples wherever a surface bends within their distance, and flattens gradients.
+//! Direct light at a grid point is what the luminaires would give its place and normal without obstacles, times the
+//! visible share, which the samples around know. Indirect light comes from samples that face nearly where the point
+//! does. Both are linear functions of place fitted to the samples \[Loader99\]. A mean of radiances, as Shepard's,
+//! blends lit and turned-away samples wherever a surface bends within their distance, and flattens gradients.
 
 use crate::brdf::reflected;
 use crate::direct::{luminance, open_irradiance};
@@ -45,10 +45,11 @@ struct Known {
     variance: f32,
 }
 
-/// The grid over `lattice` of `side`'s samples, from the `neighbours` nearest of them at each point that `masks` say holds
-/// light, or from as many as lie within a step of the lattice on average if these are more. Points where ∇h vanishes take direct light as the samples have it. With several luminaires one share stands for
-/// all. `tick(n)` reports n points done; returning false stops early. The same bits on any number of threads. Takes about 100
-/// bytes per sample.
+/// The grid over `lattice` of `side`'s samples, from the `neighbours` nearest of them at each point that `masks` say
+/// holds light, or from as many as lie within a step of the lattice on average if these are more. Points where ∇h
+/// vanishes take direct light as the samples have it. With several luminaires one share stands for all. `tick(n)`
+/// reports n points done; returning false stops early. The same bits on any number of threads. Takes about 100 bytes
+/// per sample.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "storage is f32, counts are positive")]
 pub fn interpolate(
     scene: &Scene,

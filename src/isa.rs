@@ -31,8 +31,8 @@ impl Isa {
     /// Names of all there are, whether or not this machine has them.
     pub const NAMES: [&str; 3] = ["plain", "avx2", "avx512"];
 
-    /// All that this machine has, from plain code to the widest. `avx2` comes with FMA, F16C and BMI 1 and 2, `avx512` is F,
-    /// BW, DQ and VL with these.
+    /// All that this machine has, from plain code to the widest. `avx2` comes with FMA, F16C and BMI 1 and 2, `avx512`
+    /// is F, BW, DQ and VL with these.
     #[must_use]
     pub fn found() -> Vec<Self> {
         #[allow(unused_mut, reason = "there may be no other")]
@@ -74,7 +74,8 @@ impl Isa {
         Self::chosen().or_else(|| Self::found().pop()).unwrap_or(Self::PLAIN)
     }
 
-    /// Uses this one from now on, for scenes and sweeps that are built later; Embree, opened later, is told not to exceed it.
+    /// Uses this one from now on, for scenes and sweeps that are built later; Embree, opened later, is told not to
+    /// exceed it.
     pub fn choose(self) {
         CHOSEN.store(self.0 as u8 + 1, Ordering::Relaxed);
     }

@@ -1,12 +1,13 @@
 //! Isosurfaces: the level set {h = c} as an indexed triangle mesh, by marching cubes in index space.
 //!
 //! * Inside is h ≥ c. Vertices stand on the edges of the lattice (of the refined lattice, for [`extract_refined`]),
-//!   where trilinear is linear: they lie on the trilinear level set up to rounding. Triangles approximate it in between.
+//!   where trilinear is linear: they lie on the trilinear level set up to rounding. Triangles approximate it in
+//!   between.
 //! * One vertex per crossed edge, named by its edge, not by its place. So the mesh is closed and manifold **by index**
 //!   for every input: each side of a triangle belongs to exactly two triangles, in opposite senses, except on the
-//!   boundary of Ω and of the non-finite region, where it belongs to one. When c equals lattice values, several vertices
-//!   of one sample coincide and some triangles have no area. They are kept: dropping them would open the mesh, and
-//!   merging their vertices can join more than two triangles in an edge. [`Isosurface::degenerate`] counts them.
+//!   boundary of Ω and of the non-finite region, where it belongs to one. When c equals lattice values, several
+//!   vertices of one sample coincide and some triangles have no area. They are kept: dropping them would open the mesh,
+//!   and merging their vertices can join more than two triangles in an edge. [`Isosurface::degenerate`] counts them.
 //! * Faces with two inside corners on a diagonal are resolved by separating the inside, as VTK's marching cubes do. The
 //!   trilinear level set itself may join them: refinement, not a case table, follows it there.
 //! * A cell that touches a NaN or an infinite sample holds no surface.
@@ -258,8 +259,8 @@ fn usable_cells(source: &impl Source, words: usize) -> Vec<u64> {
     usable
 }
 
-/// Where the vertices and triangles of each row begin. A row (j, k) owns the edges that leave its samples, those along x
-/// first, then y, then z, and the triangles of the cells above it.
+/// Where the vertices and triangles of each row begin. A row (j, k) owns the edges that leave its samples, those along
+/// x first, then y, then z, and the triangles of the cells above it.
 struct Starts {
     /// First vertex along x, y and z of each row, then a last entry with the total.
     vertices: Vec<[u32; 3]>,
@@ -378,8 +379,8 @@ fn join_vertices<'a>(
 ) {
     let ny = bits.dims[1];
     let row = |y: usize, z: usize| (k + z) * ny + j + y;
-    // The vertices on the cell's edges, in the order of EDGES. Edges at x = 0 count the crossed ones passed so far; every
-    // crossed edge belongs to a visited cell, so stepping over the other cells misses none.
+    // The vertices on the cell's edges, in the order of EDGES. Edges at x = 0 count the crossed ones passed so far;
+    // every crossed edge belongs to a visited cell, so stepping over the other cells misses none.
     let along = |axis: usize, y, z| starts.vertices[row(y, z)][axis];
     let mut next_x = [along(0, 0, 0), along(0, 1, 0), along(0, 0, 1), along(0, 1, 1)];
     let mut next_y = [along(1, 0, 0), along(1, 0, 1)];

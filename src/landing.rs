@@ -5,8 +5,8 @@ use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target};
 use crate::scene::Scene;
 use glam::DVec3;
 
-/// What stands at a hit: a receiver, its albedo, and its emission unless it is a luminaire, whose light counts as direct.
-/// `None` where ∇h vanishes.
+/// What stands at a hit: a receiver, its albedo, and its emission unless it is a luminaire, whose light counts as
+/// direct. `None` where ∇h vanishes.
 #[inline]
 pub fn landing(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> Option<(Receiver, DVec3, DVec3)> {
     let position = ray.at(hit.t).as_vec3();

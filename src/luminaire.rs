@@ -42,8 +42,8 @@ pub fn unoccluded(polygon: &Polygon, x: DVec3, n: DVec3) -> f64 {
     (-0.5 * sum).max(0.0)
 }
 
-/// The part of `polygon` above the horizon of `x` with normal `n`, as vertices of a convex polygon; `None` if that is all
-/// of it. Fewer than three vertices: nothing is above.
+/// The part of `polygon` above the horizon of `x` with normal `n`, as vertices of a convex polygon; `None` if that is
+/// all of it. Fewer than three vertices: nothing is above.
 fn above_horizon(polygon: &Polygon, x: DVec3, n: DVec3) -> Option<Vec<DVec3>> {
     let v = polygon.vertices();
     let height = |p: DVec3| (p - x).dot(n);

@@ -69,12 +69,13 @@ pub fn masks(field: &Field, lattice: &Lattice) -> Vec<Mask> {
 
 /// Points this far outside the sweep, in its units, may hold light of their own,
 const OVERSHOOT: f64 = 0.25;
-/// and if h bends less than this there: level sets on a plateau beside a steep edge are dark, and no end to interpolate from.
+/// and if h bends less than this there: level sets on a plateau beside a steep edge are dark, and no end to interpolate
+/// from.
 const BEND: f64 = 0.8;
 
-/// Whether light on its own level set makes a filled point a better end to interpolate from than what fits the light around it:
-/// closely outside the sweep, where h goes on as it does within. Its second differences over the first ones between both
-/// neighbours, summed over the axes, are 1 where a plateau ends.
+/// Whether light on its own level set makes a filled point a better end to interpolate from than what fits the light
+/// around it: closely outside the sweep, where h goes on as it does within. Its second differences over the first ones
+/// between both neighbours, summed over the axes, are 1 where a plateau ends.
 pub fn lights_itself(field: &Field, lattice: &Lattice, o: usize) -> bool {
     let own = lattice == field.lattice();
     let value = |o: usize| match own {
@@ -102,8 +103,8 @@ pub(crate) fn may_light_itself(h: f64) -> bool {
     (-OVERSHOOT..=1.0 + OVERSHOOT).contains(&h)
 }
 
-/// Tells which points are to hold light of their own level set: the valid ones, and with `beyond` those just outside the sweep
-/// that [`lights_itself`] picks.
+/// Tells which points are to hold light of their own level set: the valid ones, and with `beyond` those just outside
+/// the sweep that [`lights_itself`] picks.
 pub fn own_light<'a>(
     field: &'a Field,
     lattice: &'a Lattice,
@@ -156,8 +157,8 @@ fn extrema(plane: &[f32], nx: usize) -> Vec<[f32; 2]> {
     (0..plane.len()).map(across).collect()
 }
 
-/// Points of the graph that stand for lattice point `o`: itself if a level set of the sweep passes through it, else up to
-/// `N` points of the cells around it where one does (keyed by `seed`); none where none is found.
+/// Points of the graph that stand for lattice point `o`: itself if a level set of the sweep passes through it, else up
+/// to `N` points of the cells around it where one does (keyed by `seed`); none where none is found.
 pub fn stand_ins<const N: usize>(field: &Field, lattice: &Lattice, o: usize, seed: u64) -> [Option<DVec3>; N] {
     let centre = local_position(field, lattice, o);
     let usable = |p: &DVec3| (0.0..=1.0).contains(&field.value(*p)) && field.falling_normal(*p).is_some();

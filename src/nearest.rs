@@ -91,7 +91,8 @@ impl PointGrid {
         grid
     }
 
-    /// Counting sort in two steps, each of which stays in the cache: into slabs of cells by runs of points, then within each slab.
+    /// Counting sort in two steps, each of which stays in the cache: into slabs of cells by runs of points, then within
+    /// each slab.
     #[allow(clippy::cast_possible_truncation, reason = "points are numbered in 32 bits")]
     fn sort(&mut self, points: &[Vec3]) {
         const RUN: usize = 1 << 16;

@@ -20,8 +20,9 @@ pub struct SurfacePhoton {
     pub isovalue: f32,
     /// Power × isovalue per channel, before reflection.
     pub power: Vec3,
-    /// Cosine of its arrival to the receiver normal over that to the level set's own, over the share of light from everywhere
-    /// that arrives above both, at most 4: times `power` it is what the receiver normal would have taken up. \[Veach96\]
+    /// Cosine of its arrival to the receiver normal over that to the level set's own, over the share of light from
+    /// everywhere that arrives above both, at most 4: times `power` it is what the receiver normal would have taken up.
+    /// \[Veach96\]
     pub foreshortening: f32,
     /// The number of the field whose level set it is.
     pub field: u8,
@@ -185,7 +186,8 @@ pub fn trace_photons<T: Tracer>(
             })
             .collect()
     };
-    // Joined round by round, while the next one is traced: all of it and two rounds' parts are held, never everything twice.
+    // Joined round by round, while the next one is traced: all of it and two rounds' parts are held, never everything
+    // twice.
     let mut parts = trace(0);
     for next in (ROUND..chunks + ROUND).step_by(ROUND) {
         let ((), traced) = rayon::join(|| parts.iter().for_each(|part| all.append(part)), || trace(next));
@@ -332,9 +334,9 @@ fn trace_photon<T: Tracer>(
 
 /// See [`SurfacePhoton::foreshortening`]; 1 where there is no normal.
 ///
-/// What the receiver normal would take up from below the level set itself never arrives as photons. It is made up for as if
-/// light came alike from everywhere, so that this is 1 on average there: the hemispheres of normals at an angle θ share
-/// (1 + cos θ)/2 of what either takes up.
+/// What the receiver normal would take up from below the level set itself never arrives as photons. It is made up for
+/// as if light came alike from everywhere, so that this is 1 on average there: the hemispheres of normals at an angle θ
+/// share (1 + cos θ)/2 of what either takes up.
 #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
 fn foreshortening(receiver: Option<DVec3>, gradient: DVec3, direction: DVec3) -> f32 {
     let Some(n) = receiver else { return 1.0 };

@@ -59,8 +59,8 @@ pub enum Estimator {
     Nearest,
     /// All within one radius, the same everywhere.
     Radius,
-    /// Photons counted in bins of the lattice, and a linear function fitted to those around each, once; an estimate blends
-    /// these functions, so that its cost does not depend on the photons' number and a border does not bend it.
+    /// Photons counted in bins of the lattice, and a linear function fitted to those around each, once; an estimate
+    /// blends these functions, so that its cost does not depend on the photons' number and a border does not bend it.
     #[default]
     Splat,
 }

@@ -86,8 +86,8 @@ impl Polygon {
         })
     }
 
-    /// The polygon as its two faces, one after the other: seen, lit and, if it emits, light from both sides. They must stay
-    /// neighbours in that order.
+    /// The polygon as its two faces, one after the other: seen, lit and, if it emits, light from both sides. They must
+    /// stay neighbours in that order.
     #[must_use]
     pub fn both_faces(self) -> [Self; 2] {
         let front = Self { opaque_back: false, other_face: 1, ..self };
@@ -281,8 +281,8 @@ impl LocalPolygon {
     }
 
     /// t at which `ray` meets polygon number `id` (this one) with 0 ≤ t ≤ `reach`. Fronts only, unless the back is
-    /// opaque. A ray that departs from it or its other face, or ends on it, does not meet it; one that starts on the plane (within the
-    /// rounding of f32 coordinates) and goes into it meets it at 0.
+    /// opaque. A ray that departs from it or its other face, or ends on it, does not meet it; one that starts on the
+    /// plane (within the rounding of f32 coordinates) and goes into it meets it at 0.
     #[inline]
     pub fn intersect(&self, id: u32, ends: (Departure, Option<u32>), o: DVec3, d: DVec3, reach: f64) -> Option<f64> {
         let slope = self.normal.dot(d);
@@ -307,9 +307,9 @@ impl LocalPolygon {
         self.edges.iter().all(|&(e, offset)| e.dot(p) >= offset).then_some(t)
     }
 
-    /// If a ray from `o` along `d` that meets this polygon starts on its plane, within the rounding of f32 coordinates: how
-    /// fast it goes in, in the world. Where several walls meet, a start on their edge lies on all of them, and the one it
-    /// goes into fastest is the one that a ray from beside the edge meets first: the same wall in every frame.
+    /// If a ray from `o` along `d` that meets this polygon starts on its plane, within the rounding of f32 coordinates:
+    /// how fast it goes in, in the world. Where several walls meet, a start on their edge lies on all of them, and the
+    /// one it goes into fastest is the one that a ray from beside the edge meets first: the same wall in every frame.
     #[inline]
     pub fn starts_on(&self, o: DVec3, d: DVec3) -> Option<f64> {
         let on = (self.normal.dot(o) - self.offset).abs() <= self.slack;

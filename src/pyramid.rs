@@ -105,8 +105,9 @@ pub struct Pyramid {
     isa: Isa,
 }
 
-/// A monotone map of isovalues to 8 bits: half linear, half by the share of samples below, so that ranges stay narrow where
-/// h is flat. It goes on a quarter of the sweep beyond it, a quarter as finely; what is farther outside clamps, NaN is 0.
+/// A monotone map of isovalues to 8 bits: half linear, half by the share of samples below, so that ranges stay narrow
+/// where h is flat. It goes on a quarter of the sweep beyond it, a quarter as finely; what is farther outside clamps,
+/// NaN is 0.
 #[derive(Clone, Debug)]
 struct Ranks(Box<[u8; Ranks::BINS]>);
 

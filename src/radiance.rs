@@ -103,8 +103,8 @@ pub struct Sampler<'a, T> {
 }
 
 impl<T: Tracer> Sampler<'_, T> {
-    /// The sample at `position`, its random numbers keyed by `key`; `None` where ∇h vanishes, no light between a luminaire and the wall that
-    /// it covers ([`Scene::covers`]). Adds rays and misses to `counts`.
+    /// The sample at `position`, its random numbers keyed by `key`; `None` where ∇h vanishes, no light between a
+    /// luminaire and the wall that it covers ([`Scene::covers`]). Adds rays and misses to `counts`.
     #[allow(clippy::cast_possible_truncation, reason = "isovalues and storage are f32")]
     pub fn sample(
         &self,
@@ -201,8 +201,8 @@ pub fn sample_radiance<T: Tracer>(
     sample_places(&sampler, positions.len(), &|n| (n as u64, positions[n]), saved, 0, tick)
 }
 
-/// As [`sample_radiance`], at places given by number with the keys of their random numbers; `first` is the number of their
-/// first block.
+/// As [`sample_radiance`], at places given by number with the keys of their random numbers; `first` is the number of
+/// their first block.
 pub fn sample_places<T: Tracer>(
     sampler: &Sampler<'_, T>,
     count: usize,

@@ -1,5 +1,6 @@
 //! The radiance that a gather ray finds where it lands: reflected light cached at the lattice's nodes, per side, and on
-//! flats as (u, v, c) textures. Direct light by shadow rays plus photons without their first landings. \[Christensen99\]
+//! flats as (u, v, c) textures. Direct light by shadow rays plus photons without their first landings.
+//! \[Christensen99\]
 
 mod flats;
 mod pools;
@@ -53,8 +54,8 @@ struct FieldNodes {
     sides: Nodes,
 }
 
-/// From what a field's nodes are lit, besides luminaires: the photons that land later than first, per side (lower, higher);
-/// `None` where nothing looks.
+/// From what a field's nodes are lit, besides luminaires: the photons that land later than first, per side (lower,
+/// higher); `None` where nothing looks.
 pub struct NodePhotons<'a> {
     maps: [Option<PhotonMap<'a>>; 2],
     /// Of the field's lattice.
@@ -110,8 +111,8 @@ const MARGIN: f32 = 1e-4;
 
 /// Outgoing radiance (reflected and, for emitting level sets, emitted) wherever a gather ray can land.
 pub struct RadianceCache {
-    /// Per field and side (lower, higher): what a white surface would reflect at each node, NaN where neither the node nor
-    /// its surroundings hold a surface. The albedo is that of the hit: isovalues may differ much from node to node.
+    /// Per field and side (lower, higher): what a white surface would reflect at each node, NaN where neither the node
+    /// nor its surroundings hold a surface. The albedo is that of the hit: isovalues may differ much from node to node.
     nodes: Vec<Option<FieldNodes>>,
     /// What gather rays find: photons under the narrowest kernel, since many rays average their noise.
     flats: Vec<Option<FlatTexture>>,
@@ -123,8 +124,8 @@ pub struct RadianceCache {
 
 impl RadianceCache {
     /// Fills the cache: flats always, nodes if `with_nodes` (a gather needs them, pictures of walls do not). `tick(n)`
-    /// reports n nodes done; returning false stops early. `saved`: where the blocks of nodes of each side (lower, higher)
-    /// are kept and looked for.
+    /// reports n nodes done; returning false stops early. `saved`: where the blocks of nodes of each side (lower,
+    /// higher) are kept and looked for.
     #[allow(clippy::too_many_arguments, reason = "one call per bake")]
     pub fn new<T: Tracer>(
         scene: &Scene,
@@ -170,8 +171,8 @@ impl RadianceCache {
         self.fill_band(scene, tracer, &source, 0.0..=1.0, settings, saved, 0, tick);
     }
 
-    /// Fills the nodes that surfaces with isovalues in `band` need, and forgets the others; what was filled before is not
-    /// computed again. `first` is the number of the band's first block.
+    /// Fills the nodes that surfaces with isovalues in `band` need, and forgets the others; what was filled before is
+    /// not computed again. `first` is the number of the band's first block.
     #[allow(clippy::too_many_arguments, reason = "one call per band and field")]
     pub fn fill_band<T: Tracer>(
         &mut self,
@@ -307,8 +308,8 @@ impl RadianceCache {
     }
 }
 
-/// So many steps beside a cell without filled nodes some are looked for. (A fluid's points just outside the sweep send a few rays
-/// in a hundred beyond 2 steps, one in a hundred beyond 5.)
+/// So many steps beside a cell without filled nodes some are looked for. (A fluid's points just outside the sweep send
+/// a few rays in a hundred beyond 2 steps, one in a hundred beyond 5.)
 const BESIDE: usize = 5;
 
 /// Nodes of the lattice per block.

@@ -1,8 +1,8 @@
 //! The reference: one isosurface at a time, illuminated in ordinary 3D, with the variance of every number.
 //!
 //! Two integrators share the receivers (the vertices of the mesh, which lie on the trilinear level set, with the shared
-//! normal) and nothing of the bake's estimators: an unbiased path tracer, and a photon map on the mesh with final gather.
-//! Both run in independent batches; what is reported is the batches' mean and the variance of that mean.
+//! normal) and nothing of the bake's estimators: an unbiased path tracer, and a photon map on the mesh with final
+//! gather. Both run in independent batches; what is reported is the batches' mean and the variance of that mean.
 
 mod path;
 mod surface_map;

@@ -22,9 +22,9 @@ pub enum Strategy {
 const MAX_BATCHES: usize = 4096;
 
 /// `count` positions in the local frame. The level set through each is the one it samples; positions whose isovalue
-/// lies outside the sweep are left out, so the result may be shorter for level sets at the sweep's ends, and for planes of a
-/// sweep that fills less than about `count` / 4·10⁹ of Ω, or uniform samples of one that fills less of its cells. All strategies give `count` samples
-/// otherwise, so that they are compared at equal numbers.
+/// lies outside the sweep are left out, so the result may be shorter for level sets at the sweep's ends, and for planes
+/// of a sweep that fills less than about `count` / 4·10⁹ of Ω, or uniform samples of one that fills less of its cells.
+/// All strategies give `count` samples otherwise, so that they are compared at equal numbers.
 ///
 /// # Errors
 /// From extracting level sets.
@@ -147,8 +147,8 @@ mod tests {
     use crate::stats::{normal_quantile, sidak};
     use crate::volume::{Lattice, Samples, Volume};
 
-    /// Uniform samples of a sweep whose ends cut cells: as many in every block as its share of the sweep's volume, which
-    /// the midpoint rule knows; noise of random points is the most that is allowed.
+    /// Uniform samples of a sweep whose ends cut cells: as many in every block as its share of the sweep's volume,
+    /// which the midpoint rule knows; noise of random points is the most that is allowed.
     #[test]
     fn uniform_samples_fill_the_sweep_evenly() {
         let lattice = Lattice::aligned([9, 8, 7], DVec3::ZERO, DVec3::new(1.0, 2.0, 0.5)).unwrap();

@@ -211,8 +211,8 @@ impl Scene {
         FlattenedRay { departure, ..FlattenedRay::free(origin, direction, isovalue) }
     }
 
-    /// E₀: the unoccluded irradiance of a patch at the centre of the (first) volume that faces the strongest luminaire; the largest
-    /// channel of the sum over all luminaires. 0 without luminaires.
+    /// E₀: the unoccluded irradiance of a patch at the centre of the (first) volume that faces the strongest luminaire;
+    /// the largest channel of the sum over all luminaires. 0 without luminaires.
     pub fn reference_irradiance(&self) -> f64 {
         self.reference_irradiance
     }
@@ -228,7 +228,8 @@ impl Scene {
         lights().map(|p| p.emission * unoccluded(p, centre, n)).sum::<DVec3>().max_element()
     }
 
-    /// Display exposure: rgb = radiance × π / (ρ_max E₀), ρ_max over all channels and the sweep; 1 where that is undefined.
+    /// Display exposure: rgb = radiance × π / (ρ_max E₀), ρ_max over all channels and the sweep; 1 where that is
+    /// undefined.
     pub fn exposure(&self) -> f64 {
         let brightest = self.companions.iter().map(|c| c.member.surface.albedo.greatest().max_element());
         let brightest = brightest.fold(self.surface.albedo.greatest().max_element(), f64::max);

@@ -167,8 +167,8 @@ impl Tally {
     }
 }
 
-/// Runs `trial(index)` for all indices below `count` on all threads; `None` is no trial (a ray that starts outside, say). What
-/// is not begun after so many seconds is left out.
+/// Runs `trial(index)` for all indices below `count` on all threads; `None` is no trial (a ray that starts outside,
+/// say). What is not begun after so many seconds is left out.
 ///
 /// # Errors
 /// `Interrupted`.

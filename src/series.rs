@@ -35,8 +35,8 @@ impl Series {
         Ok(Self { times, files })
     }
 
-    /// The files that `pattern` stands for, such as `rho_%04d.vti`: `%d` is any number, `%04d` one of four digits or more.
-    /// Times are their numbers unless given. `None` if the name holds no `%d`.
+    /// The files that `pattern` stands for, such as `rho_%04d.vti`: `%d` is any number, `%04d` one of four digits or
+    /// more. Times are their numbers unless given. `None` if the name holds no `%d`.
     ///
     /// # Errors
     /// `Io` if the folder cannot be read, else as [`Series::new`].
@@ -86,8 +86,8 @@ impl Series {
         blend(&a, &b, weight)
     }
 
-    /// Reads every frame: they must share a lattice. Returns the sweep that holds each frame's suggested one, `None` if no
-    /// frame has any.
+    /// Reads every frame: they must share a lattice. Returns the sweep that holds each frame's suggested one, `None` if
+    /// no frame has any.
     ///
     /// # Errors
     /// `Invalid` with the first frame that stands elsewhere; what `read` meets.

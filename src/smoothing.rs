@@ -1,10 +1,10 @@
 //! Gathered light smoothed over neighbouring grid points, or over places scattered beside them.
 //!
-//! Each point's gather is unbiased and noisy, and its neighbours' know nearly the same light. A linear function fitted to
-//! those around a point, and what that leaves fitted once more, has a small part of the noise and a bias of fourth order in
-//! the radius \[Tukey77\]. How far to trust it is decided at each place by cross-validation: what half of the rays gives,
-//! smoothed by a share λ, is compared with the other half at the points around, whose noise is independent; the λ that
-//! predicts best wins. \[Rousselle12\]
+//! Each point's gather is unbiased and noisy, and its neighbours' know nearly the same light. A linear function fitted
+//! to those around a point, and what that leaves fitted once more, has a small part of the noise and a bias of fourth
+//! order in the radius \[Tukey77\]. How far to trust it is decided at each place by cross-validation: what half of the
+//! rays gives, smoothed by a share λ, is compared with the other half at the points around, whose noise is independent;
+//! the λ that predicts best wins. \[Rousselle12\]
 
 mod scattered;
 
@@ -50,7 +50,8 @@ pub type Halves = [Vec3; 2];
 trait Surroundings {
     type Place: Copy;
 
-    /// Calls `visit` for the places that share the light of one, itself among them, with their offset in radii and its square.
+    /// Calls `visit` for the places that share the light of one, itself among them, with their offset in radii and its
+    /// square.
     fn around(&self, at: Self::Place, visit: impl FnMut(Self::Place, Vec3, f32));
 
     /// What a linear fit of `values` around a place says there.

@@ -65,7 +65,8 @@ pub fn normal_quantile(p: f64) -> f64 {
     0.5 * (lo + hi)
 }
 
-/// The regularised lower incomplete gamma function P(a, x): series below a + 1, continued fraction above. \[DLMF 8.11, 8.9\]
+/// The regularised lower incomplete gamma function P(a, x): series below a + 1, continued fraction above. \[DLMF 8.11,
+/// 8.9\]
 fn lower_gamma(a: f64, x: f64) -> f64 {
     if x <= 0.0 {
         return 0.0;

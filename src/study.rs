@@ -41,7 +41,8 @@ impl Subject {
         self.scene.field.sweep().from_unit(fraction)
     }
 
-    /// Those of some isovalues (source units, increasing) where a bake can be compared with references: there is a surface.
+    /// Those of some isovalues (source units, increasing) where a bake can be compared with references: there is a
+    /// surface.
     ///
     /// # Errors
     /// `Invalid` if there is none, since no error is known then.
@@ -129,8 +130,9 @@ impl Study {
         Ok(jobs)
     }
 
-    /// Two independent references on a fixed subset of the vertices of the isosurface at `isovalue` (source units), from
-    /// the cache or computed; `None` if there is no surface. The cache tells them apart by scene, settings and isovalue.
+    /// Two independent references on a fixed subset of the vertices of the isosurface at `isovalue` (source units),
+    /// from the cache or computed; `None` if there is no surface. The cache tells them apart by scene, settings and
+    /// isovalue.
     ///
     /// # Errors
     /// As `reference()`, or from reading the cache.

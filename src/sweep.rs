@@ -68,8 +68,8 @@ pub struct SweepSettings {
     pub max_bounces: usize,
     /// The share of indirect light that may be missing when the bounces stop; rounding ends below 1e-4.
     pub target: f64,
-    /// Repetitions with random numbers of their own, averaged; 4 or more give a standard error. Their directions and luminaire
-    /// points are parts of one low-discrepancy set.
+    /// Repetitions with random numbers of their own, averaged; 4 or more give a standard error. Their directions and
+    /// luminaire points are parts of one low-discrepancy set.
     pub replicates: usize,
     /// Texels along the longer edge of a wall, and isovalues of its texture.
     pub flat_resolution: (usize, usize),
@@ -98,9 +98,9 @@ pub struct SweptSide {
     pub side: Side,
     /// Irradiance E (world, not divided by π), straight from luminaires and from everything else.
     pub irradiance: Vec<[f32; 3]>,
-    /// Standard error of the luminance of the reflected radiance ρE/π, from the spread of the replicates and how much better than
-    /// independent ones they are together (measured at one node in sixteen; a bound unless they are 4, 8, 16 …). Empty with fewer than 2.
-    /// What the grid cannot hold between its nodes is not part of it.
+    /// Standard error of the luminance of the reflected radiance ρE/π, from the spread of the replicates and how much
+    /// better than independent ones they are together (measured at one node in sixteen; a bound unless they are 4, 8,
+    /// 16 …). Empty with fewer than 2. What the grid cannot hold between its nodes is not part of it.
     pub std_error: Vec<f32>,
 }
 
@@ -109,15 +109,15 @@ pub struct SweptSide {
 pub struct SweepResult {
     /// The stored sides, in the order of [`crate::scene::Surface::stored_sides`].
     pub sides: Vec<SweptSide>,
-    /// Nodes with light: those with ∇h ≠ 0 that hold a surface of the sweep, and those beside one whose own lies less than
-    /// a quarter of the sweep outside it, unless h ends in a plateau there.
+    /// Nodes with light: those with ∇h ≠ 0 that hold a surface of the sweep, and those beside one whose own lies less
+    /// than a quarter of the sweep outside it, unless h ends in a plateau there.
     pub lit: Vec<bool>,
     /// Reflected radiance of walls, luminaires and caps, by flat number; `None` where nothing is reflected.
     pub flats: Vec<Option<FlatTexture>>,
     /// Indirect bounces of the replicate that took the most.
     pub bounces: usize,
-    /// The share of all indirect light, up to 1, that later bounces would bring or take, as far as their decay is known; NaN
-    /// where bounces were cut before it was.
+    /// The share of all indirect light, up to 1, that later bounces would bring or take, as far as their decay is
+    /// known; NaN where bounces were cut before it was.
     pub residual: f64,
     /// Whether `tick` stopped the work.
     pub stopped: bool,
@@ -186,18 +186,18 @@ fn numbered([nx, ny, nz]: [usize; 3]) -> bool {
     nx.saturating_mul(ny).saturating_mul(nz).saturating_add(stride.saturating_mul(16)) <= i32::MAX as usize
 }
 
-/// Lights every node of the lattice for every isovalue of the sweep. `tick` receives the fraction done (an estimate while
-/// bounces converge); returning false stops early with what there is.
+/// Lights every node of the lattice for every isovalue of the sweep. `tick` receives the fraction done (an estimate
+/// while bounces converge); returning false stops early with what there is.
 ///
 /// # Errors
-/// `NotSupported` for several fields that light each other, if a polygon that is not a luminaire stands inside the volume,
-/// if there are more than [`MOST_POLYGONS`], or about 2³¹ points or more: that needs the photon engine.
+/// `NotSupported` for several fields that light each other, if a polygon that is not a luminaire stands inside the
+/// volume, if there are more than [`MOST_POLYGONS`], or about 2³¹ points or more: that needs the photon engine.
 pub fn sweep(scene: &Scene, settings: &SweepSettings, tick: &(dyn Fn(f64) -> bool + Sync)) -> Result<SweepResult> {
     sweep_resumable(scene, settings, Stage::UNSAVED, tick)
 }
 
-/// As [`sweep`], keeping what is finished in `saved` (whole passes, whenever the checkpoint is due or `tick` ends the work)
-/// and going on from there: with the same bits.
+/// As [`sweep`], keeping what is finished in `saved` (whole passes, whenever the checkpoint is due or `tick` ends the
+/// work) and going on from there: with the same bits.
 ///
 /// # Errors
 /// As [`sweep`].
@@ -305,8 +305,8 @@ struct Run<'a> {
 }
 
 impl Run<'_> {
-    /// Direct light of all replicates, on the flats too: each has luminaire points of its own, and what bounces is their mean, so
-    /// that no replicate spreads the light of few points. False if `tick` stopped it.
+    /// Direct light of all replicates, on the flats too: each has luminaire points of its own, and what bounces is
+    /// their mean, so that no replicate spreads the light of few points. False if `tick` stopped it.
     fn direct(&self, state: &mut State, flats: &mut Flats, tick: &(dyn Fn(f64) -> bool + Sync)) -> bool {
         let s = self.settings;
         let replicates = s.replicates.max(1);

@@ -2,8 +2,9 @@
 
 use crate::flattened::{FlattenedHit, FlattenedRay};
 
-/// Nearest hits and visibility in the scene's local frame. `intersect` and `occluded` agree on every ray. Asking for many
-/// rays at once gives the same bits as asking for each, unless two things are met at the same t: then either may be named.
+/// Nearest hits and visibility in the scene's local frame. `intersect` and `occluded` agree on every ray. Asking for
+/// many rays at once gives the same bits as asking for each, unless two things are met at the same t: then either may
+/// be named.
 pub trait Tracer: Sync {
     /// The nearest thing the ray meets within its reach; `None` if it leaves everything.
     fn intersect(&self, ray: &FlattenedRay) -> Option<FlattenedHit>;

@@ -341,8 +341,8 @@ impl Samples {
     }
 }
 
-/// Where a patient's directions lie in the world: the first letter names what x grows towards, and so on. Coordinates are never
-/// turned from one to the other; formats that hold the name pass it on.
+/// Where a patient's directions lie in the world: the first letter names what x grows towards, and so on. Coordinates
+/// are never turned from one to the other; formats that hold the name pass it on.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Space {
     /// Left, posterior, superior: that of DICOM and ITK, which is meant where nothing is said.
@@ -447,8 +447,8 @@ impl Volume {
         }
     }
 
-    /// Writes a `.vti` (one point array `value`, active), a `.nrrd` or a `.npy` (without its place in the world), by the
-    /// extension. The file appears under its name only when it is complete.
+    /// Writes a `.vti` (one point array `value`, active), a `.nrrd` or a `.npy` (without its place in the world), by
+    /// the extension. The file appears under its name only when it is complete.
     ///
     /// # Errors
     /// `NotSupported` for another extension; `Io`.
@@ -456,8 +456,8 @@ impl Volume {
         self.write_with_notes(path, &[])
     }
 
-    /// [`Volume::write`] with texts by name, about where the volume comes from: field data of a `.vti`, key/value pairs of
-    /// a `.nrrd`.
+    /// [`Volume::write`] with texts by name, about where the volume comes from: field data of a `.vti`, key/value
+    /// pairs of a `.nrrd`.
     ///
     /// # Errors
     /// As [`Volume::write`].

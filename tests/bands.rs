@@ -10,7 +10,8 @@ use isolume::volume::generate::Generator;
 use isolume::volume::{Lattice, Samples, Volume};
 use std::process::Command;
 
-/// The bumps; or a ball whose edge is one step from below to above the sweep, with a slow slope through it on its sides.
+/// The bumps; or a ball whose edge is one step from below to above the sweep, with a slow slope through it on its
+/// sides.
 fn field(steep: bool, size: usize) -> Field {
     if !steep {
         let volume = Generator::from_name("bumps").unwrap().sample([size; 3]).unwrap();

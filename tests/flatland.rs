@@ -172,8 +172,8 @@ fn an_extruded_field_looks_to_n_3_as_to_n_2() {
     let slices = 11;
     const N: usize = 33;
     const PATHS: u32 = 2048;
-    // Near the ends of the sweep n = 3 interpolates points that no hyperplane lights and that were filled instead: it was
-    // measured 1 to 8 % low at isovalues below 0.12, on average 0.9 % over all points at albedo 0.8.
+    // Near the ends of the sweep n = 3 interpolates points that no hyperplane lights and that were filled instead: it
+    // was measured 1 to 8 % low at isovalues below 0.12, on average 0.9 % over all points at albedo 0.8.
     const AWAY_FROM_ENDS: std::ops::RangeInclusive<f64> = 0.15..=0.9;
     for albedo in [0.2, 0.5, 0.8] {
         let flat = smooth_bumps(N, albedo);
@@ -221,8 +221,8 @@ fn an_extruded_field_looks_to_n_3_as_to_n_2() {
             .collect();
         let count = points.len() as f64;
         let [two, three] = [points.iter().map(|p| p.0).sum::<f64>(), points.iter().map(|p| p.1).sum::<f64>()];
-        // What the stored radiance of 32 cells cannot hold is no noise, and shows at a few points near saddles and shadow
-        // edges; the total must agree to half a percent.
+        // What the stored radiance of 32 cells cannot hold is no noise, and shows at a few points near saddles and
+        // shadow edges; the total must agree to half a percent.
         let floor = 0.005 * two / count;
         let beyond = points.iter().filter(|(n2, n3, sigma)| (n3 - n2).abs() > 3.0 * sigma + floor).count();
         let rms = (points.iter().map(|(n2, n3, _)| (n3 - n2).powi(2)).sum::<f64>() / count).sqrt();
@@ -234,8 +234,8 @@ fn an_extruded_field_looks_to_n_3_as_to_n_2() {
             100.0 * (stored.lock().unwrap().iter().sum::<f64>() / two - 1.0),
         );
         assert!(count > 150.0);
-        // n = 2 is settled: its stored radiance and its paths agree to 0.04 %. What n = 3 is off is the photons' noise: at
-        // albedo 0.8, 2²¹ of them gave −0.58 %, 2²⁴ −0.04 %.
+        // n = 2 is settled: its stored radiance and its paths agree to 0.04 %. What n = 3 is off is the photons' noise:
+        // at albedo 0.8, 2²¹ of them gave −0.58 %, 2²⁴ −0.04 %.
         assert!((three / two - 1.0).abs() < 0.005, "albedo {albedo}: {three} against {two}");
         assert!((beyond as f64) < 0.06 * count, "albedo {albedo}: {beyond} of {count} beyond 3σ + 0.5 %");
     }

@@ -1,6 +1,6 @@
-//! Registration: a bake-shaped grid that holds (x, y, z) as its light is written in every format, read back by a reader of other
-//! authors (or written here from the format's definition), and looked up at the vertices of a contour. What comes out must be
-//! where the vertex is: half a voxel, a swapped axis, a flipped one or a wrong spacing would show.
+//! Registration: a bake-shaped grid that holds (x, y, z) as its light is written in every format, read back by a reader
+//! of other authors (or written here from the format's definition), and looked up at the vertices of a contour. What
+//! comes out must be where the vertex is: half a voxel, a swapped axis, a flipped one or a wrong spacing would show.
 
 use flate2::read::{GzDecoder, ZlibDecoder};
 use glam::{DMat3, DMat4, DVec3, Vec3};

@@ -1,4 +1,5 @@
-//! The structure that the design promises: pipeline order, the unsafe fence, no machine's paths.
+//! The structure that the design promises: pipeline order, the unsafe fence, no machine's paths, comments as wide as
+//! code.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -77,6 +78,24 @@ fn unsafe_stays_behind_its_fence() {
             assert!(fenced || !code.contains("unsafe "), "{name}:{}: {line}", n + 1);
         }
     }
+}
+
+/// The formatter minds code only.
+#[test]
+fn comments_are_no_wider_than_code() {
+    let rustfmt = fs::read_to_string(root().join("rustfmt.toml")).unwrap();
+    let width: usize = rustfmt.lines().find_map(|l| l.strip_prefix("max_width = ")).unwrap().parse().unwrap();
+    let mut files = Vec::new();
+    ["src", "tests", "benches"].iter().for_each(|folder| rust_files(&root().join(folder), &mut files));
+    let mut wrong = Vec::new();
+    for file in files {
+        let text = fs::read_to_string(&file).unwrap();
+        let wide = |l: &str| l.trim_start().starts_with("//") && l.chars().count() > width && l.contains(' ');
+        wrong.extend(
+            text.lines().enumerate().filter(|l| wide(l.1)).map(|(n, _)| format!("{}:{}", file.display(), n + 1)),
+        );
+    }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }
 
 #[test]

@@ -46,8 +46,8 @@ fn generated(name: &str, n: usize, [lo, hi]: [f64; 2]) -> Scene {
     Scene::new(field, Surface::default(), Boundary::Open, polygons).unwrap()
 }
 
-/// Rays from random points in random directions: (share with the same target, mean and worst distance between the hits of
-/// those that meet the surface at more than 20°, measured along the normal, in cells).
+/// Rays from random points in random directions: (share with the same target, mean and worst distance between the hits
+/// of those that meet the surface at more than 20°, measured along the normal, in cells).
 fn agreement(scene: &Scene, c: f32, refine: usize, rays: u64) -> (f64, f64, f64) {
     let device = device();
     let (triangles, graph) =
@@ -79,8 +79,8 @@ fn agreement(scene: &Scene, c: f32, refine: usize, rays: u64) -> (f64, f64, f64)
 
 #[test]
 fn triangles_and_the_trilinear_surface_are_hit_at_the_same_places() {
-    // A chord of a sphere of R cells leaves it by at most (√3)²/8R within a cell; a factor 4 for the ray's own slope and
-    // for saddles. Four times less with cells cut in two.
+    // A chord of a sphere of R cells leaves it by at most (√3)²/8R within a cell; a factor 4 for the ray's own slope
+    // and for saddles. Four times less with cells cut in two.
     let scene = balls(33, Surface::default(), Vec::new());
     let bound = |refine: f64| 4.0 * 3.0 / (8.0 * 0.8 * 16.0) / (refine * refine);
     for (refine, factor) in [(1, 1.0), (2, 2.0)] {
@@ -220,8 +220,8 @@ fn furnaces() {
 
 #[test]
 fn a_furnace_at_the_line_where_surface_and_walls_meet() {
-    // Above an oblique plane that cuts the walls, which reflect all: the radiance is 1 there, too. There is no floor, so
-    // that a path that starts below the plane is dark.
+    // Above an oblique plane that cuts the walls, which reflect all: the radiance is 1 there, too. There is no floor,
+    // so that a path that starts below the plane is dark.
     let rho = 0.5;
     let volume = Generator::from_name("linear:0.5,0.2,-1").unwrap().sample([17; 3]).unwrap();
     let field = Field::new(&volume, Sweep::new(-0.9, 0.6).unwrap()).unwrap();

@@ -1,5 +1,5 @@
-//! Studies as users meet them: what an earlier run left is taken up if it is of the same scene, settings and volume, and
-//! refused otherwise.
+//! Studies as users meet them: what an earlier run left is taken up if it is of the same scene, settings and volume,
+//! and refused otherwise.
 
 use std::fs;
 use std::path::Path;

@@ -88,8 +88,8 @@ fn ten_kills_of_a_sweep_leave_no_trace_in_the_result() {
     killed(10, &sweep, |found| assert!(found >= 1, "kills came too early to test anything"));
 }
 
-/// Kills a bake so many times, resumes it, and compares its bits with those of one that nobody killed. `check` receives the
-/// most finished blocks that a killed bake left.
+/// Kills a bake so many times, resumes it, and compares its bits with those of one that nobody killed. `check` receives
+/// the most finished blocks that a killed bake left.
 fn killed(kills: u32, more: &[&str], check: impl Fn(u64)) {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
@@ -349,8 +349,8 @@ fn memory(dir: &Path, more: &[&str]) -> (f64, f64) {
     (peak, number * unit)
 }
 
-/// What a bake by sweeps takes more for more points: 48 bytes a point of its own, 14 of the volume as read, its field, its pyramid
-/// and masks, and 14 of a checkpoint that is small enough to wait in memory. It was 79 before.
+/// What a bake by sweeps takes more for more points: 48 bytes a point of its own, 14 of the volume as read, its field,
+/// its pyramid and masks, and 14 of a checkpoint that is small enough to wait in memory. It was 79 before.
 #[test]
 fn sweeps_take_48_bytes_a_point() {
     let dir = tempfile::tempdir().unwrap();

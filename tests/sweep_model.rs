@@ -1,5 +1,5 @@
-//! The parts of the model that the line-sweep engine must get right: energy, isolation, walls, caps, oblique axes, holes in
-//! the data, several luminaires, and its own standard error.
+//! The parts of the model that the line-sweep engine must get right: energy, isolation, walls, caps, oblique axes,
+//! holes in the data, several luminaires, and its own standard error.
 
 use glam::{DMat3, DVec3};
 use isolume::embree::{Device, GraphTracer};
@@ -280,8 +280,8 @@ fn standard_errors_are_what_they_say() {
     };
     let truth = run(&scene, SweepSettings { replicates: 128, seed: 99, ..settings });
     let got = run(&scene, settings);
-    // In the mean over nodes the squared error is the variance that is claimed (the truth has 1/16 of it, or less). Node by node,
-    // few replicates beside shadows' edges see what others do not: there tails are longer than Student's.
+    // In the mean over nodes the squared error is the variance that is claimed (the truth has 1/16 of it, or less).
+    // Node by node, few replicates beside shadows' edges see what others do not: there tails are longer than Student's.
     let (mut squared, mut said, mut within, mut count) = (0.0, 0.0, 0.0, 0.0);
     for o in nodes(&scene, 1) {
         let error2 = (luminance(&got, o) - luminance(&truth, o)).powi(2);
@@ -297,7 +297,8 @@ fn standard_errors_are_what_they_say() {
 
 #[test]
 fn caps_close_level_sets() {
-    // A ramp in a furnace with a margin: level sets and Ω's faces bound a convex solid that shows its albedo everywhere.
+    // A ramp in a furnace with a margin: level sets and Ω's faces bound a convex solid that shows its albedo
+    // everywhere.
     let (rho, lattice) = (0.4, cube(25, 0.0, 1.0));
     let f = field(lattice, (0.2, 0.8), |x| x.x + 0.1 * x.y);
     let walls = closed_box(f.lattice(), 0.3, 0.0, 1.0);
@@ -372,8 +373,8 @@ fn luminaires_add_up() {
     assert!(mean.abs() < 0.005 * scale && rms < 0.03 * scale);
 }
 
-/// The floor of a solid x ≥ c: texels that it covers in part hold the light of the rest. (The lamp is in Ω's face; beyond that,
-/// light would reach the solid's inside, too.)
+/// The floor of a solid x ≥ c: texels that it covers in part hold the light of the rest. (The lamp is in Ω's face;
+/// beyond that, light would reach the solid's inside, too.)
 #[test]
 fn texels_that_solids_cover_in_part_are_as_bright_as_the_rest() {
     let polygon = |name: &str, v: [[f64; 3]; 4], albedo: f64, emission: f64| {

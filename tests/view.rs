@@ -134,8 +134,8 @@ impl Bytes {
         Self { size, rgb: rows.flat_map(|r| r.chunks_exact(4).map(|c| [c[0], c[1], c[2]])).collect() }
     }
 
-    /// Mean difference and the share of pixels that differ by more than 2 % of white, away from edges, where one ray per
-    /// pixel and sixteen must differ.
+    /// Mean difference and the share of pixels that differ by more than 2 % of white, away from edges, where one ray
+    /// per pixel and sixteen must differ.
     fn differences(&self, other: &Self) -> (f64, f64, f64) {
         let [w, h] = self.size;
         assert_eq!(self.size, other.size);

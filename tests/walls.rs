@@ -1,4 +1,5 @@
-//! Light next to walls, whose textures are coarser than the grid: bakes by both engines against path tracing at the grid's points.
+//! Light next to walls, whose textures are coarser than the grid: bakes by both engines against path tracing at the
+//! grid's points.
 
 use glam::DVec3;
 use isolume::bake::{Bake, BakeOptions, BakeSettings, Engine, bake};
@@ -78,8 +79,8 @@ fn errors(scene: &Scene, engine: Engine, stride: usize, paths: u32, chosen: impl
     Errors { points: light.len(), mean: mean / all, rms: square.sqrt() / all }
 }
 
-/// Surfaces 1.5 to 4 voxels from the luminaire, which hides a part of the ceiling's texels from everyone: with the hidden part in their
-/// means these were too dark.
+/// Surfaces 1.5 to 4 voxels from the luminaire, which hides a part of the ceiling's texels from everyone: with the
+/// hidden part in their means these were too dark.
 #[test]
 fn a_luminaire_does_not_darken_the_ceiling_around_it() {
     let scene = waves();
@@ -95,8 +96,8 @@ fn a_luminaire_does_not_darken_the_ceiling_around_it() {
     }
 }
 
-/// The ceiling itself within two voxels of the luminaire, at the middle isovalue: a texel is 2.5 voxels wide, so that most of these are hidden
-/// in part.
+/// The ceiling itself within two voxels of the luminaire, at the middle isovalue: a texel is 2.5 voxels wide, so that
+/// most of these are hidden in part.
 #[test]
 fn the_ceiling_is_bright_up_to_the_luminaire() {
     let scene = waves();
@@ -141,7 +142,8 @@ fn the_ceiling_is_bright_up_to_the_luminaire() {
     }
 }
 
-/// Where level sets meet walls at all angles, light on the face itself is that of the edge between the two, not of a texel's mean.
+/// Where level sets meet walls at all angles, light on the face itself is that of the edge between the two, not of a
+/// texel's mean.
 #[test]
 fn light_on_a_wall_is_that_of_the_edge() {
     let scene = waves();

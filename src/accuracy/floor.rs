@@ -16,8 +16,8 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 /// Exact direct light at the points of a grid `factor` times as fine as the volume's, interpolated linearly, against
-/// exact direct light at (a fixed subset of) the vertices of the isosurface at `isovalue` (units of the sweep). "Exact" is
-/// the closed form times the visible share of `shadow_rays` low-discrepancy points.
+/// exact direct light at (a fixed subset of) the vertices of the isosurface at `isovalue` (units of the sweep). "Exact"
+/// is the closed form times the visible share of `shadow_rays` low-discrepancy points.
 ///
 /// # Errors
 /// `Invalid` if the grid has too many points or no vertex has a normal.
@@ -58,8 +58,8 @@ pub fn interpolation_floor<T: Tracer>(
 }
 
 /// As [`interpolation_floor`] for all light: path-traced radiance at the grid's points (`paths` each), interpolated,
-/// against two independent references on the same vertices; percent RMS. Two independent sets of paths at the points make
-/// ⟨(t₁ − r₁)·(t₂ − r₂)⟩ free of the noise of both sides. 0 where that is negative.
+/// against two independent references on the same vertices; percent RMS. Two independent sets of paths at the points
+/// make ⟨(t₁ − r₁)·(t₂ − r₂)⟩ free of the noise of both sides. 0 where that is negative.
 ///
 /// # Errors
 /// `Invalid` if the grid has too many points.
@@ -95,8 +95,8 @@ pub fn total_floor<T: Tracer>(
 }
 
 /// Radiance at the vertices `chosen` of `mesh` as a grid `factor` times as fine as the volume's gives it if its points
-/// hold `value(receiver, index)`. Only points that the vertices' cells touch are asked for; those without a level set of
-/// their own are filled from their surroundings as bakes do. `None` where no point of a cell holds anything.
+/// hold `value(receiver, index)`. Only points that the vertices' cells touch are asked for; those without a level set
+/// of their own are filled from their surroundings as bakes do. `None` where no point of a cell holds anything.
 ///
 /// # Errors
 /// `Invalid` if the grid has too many points.

@@ -1,8 +1,9 @@
 //! Bands of isovalues, baked one after another so that the radiance cache never covers the whole sweep at once.
 //!
-//! Hyperplanes do not light each other. A ray of isovalue c lands in a cell that straddles c, so samples of a band need the
-//! cache at the nodes of the cells that straddle it. A node's cells span one interval of isovalues: bands in rising order need
-//! it one after another, and each takes over what the one before has. So the work, and the light, are those of one band.
+//! Hyperplanes do not light each other. A ray of isovalue c lands in a cell that straddles c, so samples of a band need
+//! the cache at the nodes of the cells that straddle it. A node's cells span one interval of isovalues: bands in rising
+//! order need it one after another, and each takes over what the one before has. So the work, and the light, are those
+//! of one band.
 
 use crate::field::Field;
 use crate::mask::Mask;

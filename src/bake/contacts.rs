@@ -1,10 +1,10 @@
-//! Grid points where level sets meet a wall on Ω's faces. Light falls like a power of the distance there, far below a texel of the wall,
-//! and a point on the face itself would see a texel's mean at its very own place.
+//! Grid points where level sets meet a wall on Ω's faces. Light falls like a power of the distance there, far below a
+//! texel of the wall, and a point on the face itself would see a texel's mean at its very own place.
 //!
-//! At the contact the hemisphere of either surface is cut in two: directions into the wedge between them, and directions that
-//! meet the other one at distance 0. With N the surface's normal, M the wall's, a share F = (1 − N·M)/2 of either irradiance comes from
-//! the other surface, so that E = D + F ρ_w E_w and E_w = D_w + F ρ E, D being what the wedge brings: two equations for E and E_w.
-//! \[Lambert1760\]
+//! At the contact the hemisphere of either surface is cut in two: directions into the wedge between them, and
+//! directions that meet the other one at distance 0. With N the surface's normal, M the wall's, a share F = (1 − N·M)/2
+//! of either irradiance comes from the other surface, so that E = D + F ρ_w E_w and E_w = D_w + F ρ E, D being what the
+//! wedge brings: two equations for E and E_w. \[Lambert1760\]
 
 use super::grid_points::{Counts, STAND_INS};
 use crate::direct::{Receiver, direct_irradiance, luminance};
@@ -83,9 +83,9 @@ impl<'a> Contacts<'a> {
         self.points.len()
     }
 
-    /// Solves for the light of `side` at all points. `white` holds what a white surface would reflect at every node of the lattice, with
-    /// walls as their textures show them, which is also what the cache of `wedge` holds; `std_error`, unless it is empty, the standard error of
-    /// the luminance that leaves.
+    /// Solves for the light of `side` at all points. `white` holds what a white surface would reflect at every node of
+    /// the lattice, with walls as their textures show them, which is also what the cache of `wedge` holds; `std_error`,
+    /// unless it is empty, the standard error of the luminance that leaves.
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     pub(super) fn solve<T: Tracer>(
         &self,

@@ -1,5 +1,5 @@
-//! Light at a grid's own points; where a point holds no level set of the sweep, at places around it, to which its value is
-//! fitted.
+//! Light at a grid's own points; where a point holds no level set of the sweep, at places around it, to which its value
+//! is fitted.
 
 use super::bands::Band;
 use crate::brdf::reflected;
@@ -235,8 +235,8 @@ impl<'a> GridPoints<'a> {
     }
 }
 
-/// The radiance at local position `p` with what was gathered there, in `halves`, replaced by what is `smoothed`; and the
-/// variance that this part of its luminance has.
+/// The radiance at local position `p` with what was gathered there, in `halves`, replaced by what is `smoothed`; and
+/// the variance that this part of its luminance has.
 #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
 fn smoothed_light(scene: &Scene, p: Vec3, radiance: Vec3, [a, b]: Halves, smoothed: Smoothed) -> (Vec3, f32) {
     let albedo = scene.surface.albedo.at(f64::from(scene.field.value(p.as_dvec3()) as f32));
@@ -346,8 +346,8 @@ impl<'a> Beside<'a> {
         Counts::from(&sampled)
     }
 
-    /// Smooths what was gathered over the places around ([`smooth_scattered`]): where little arrives, few rays bring it, and
-    /// the fit would show them as specks. Leaves all as it is if `tick` says stop.
+    /// Smooths what was gathered over the places around ([`smooth_scattered`]): where little arrives, few rays bring
+    /// it, and the fit would show them as specks. Leaves all as it is if `tick` says stop.
     pub(super) fn smooth(
         &self,
         scene: &Scene,
@@ -367,10 +367,10 @@ impl<'a> Beside<'a> {
         });
     }
 
-    /// Gives the points without a level set of their own what makes interpolation come nearest to the light in the cells
-    /// around them: between the points of a steep edge there may be none with one. Points around which no light was found
-    /// stay empty, which viewers and [`IlluminationGrid::interpolate`] leave out. Points beside which are no places stay as
-    /// they are.
+    /// Gives the points without a level set of their own what makes interpolation come nearest to the light in the
+    /// cells around them: between the points of a steep edge there may be none with one. Points around which no light
+    /// was found stay empty, which viewers and [`IlluminationGrid::interpolate`] leave out. Points beside which are no
+    /// places stay as they are.
     pub(super) fn fit(&self, mut grid: IlluminationGrid, light: &[BesideLight]) -> IlluminationGrid {
         let mut start = 0;
         for run in self.owners.chunk_by(|a, b| a == b) {

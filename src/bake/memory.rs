@@ -24,7 +24,8 @@ const PROGRAM: u64 = 24 << 20;
 /// Photons traced to learn how often they land.
 const PILOTS: u64 = 1 << 12;
 
-/// Bytes per mapped photon: its share of a bin (112 bytes while fitted, for 8 photons of the presets), or a photon in its cell.
+/// Bytes per mapped photon: its share of a bin (112 bytes while fitted, for 8 photons of the presets), or a photon in
+/// its cell.
 const MAP: f64 = 50.0;
 
 /// Bytes per point of gathers kept for smoothing; and per point of a slice while they are smoothed.
@@ -51,21 +52,21 @@ const SORTED: u64 = 40 + 40 + 12;
 const GRID: u64 = 17;
 const CACHED: u64 = 12;
 
-/// Bytes of the sweep engine per grid point (h turned over, normals, one plane of a pass turned over, bits per block), per point
-/// and swept side (direct light, what lines read, what a pass gathers), and per point and stored side (sums over replicates
-/// and their spread). Direct light takes less: 44 and what its lines see.
+/// Bytes of the sweep engine per grid point (h turned over, normals, one plane of a pass turned over, bits per block),
+/// per point and swept side (direct light, what lines read, what a pass gathers), and per point and stored side (sums
+/// over replicates and their spread). Direct light takes less: 44 and what its lines see.
 const SWEPT: u64 = 13;
 const SWEPT_SIDE: u64 = 26;
 const SUMMED_SIDE: u64 = 9;
-/// Per point and swept side while light settles, before there are such sums: what lines read a pass before, here and in a checkpoint;
-/// and of the sums' bytes those of the spread.
+/// Per point and swept side while light settles, before there are such sums: what lines read a pass before, here and in
+/// a checkpoint; and of the sums' bytes those of the spread.
 const SETTLING_SIDE: u64 = 14;
 const SPREAD_SIDE: u64 = 3;
 /// The same where the level of light may be corrected: what few directions lack, here and in a checkpoint.
 const LEVEL_SIDE: u64 = 12;
 
-/// Bytes per point and side that its checkpoint holds while a replicate is under way, besides the sums; and per stored side,
-/// when all are done.
+/// Bytes per point and side that its checkpoint holds while a replicate is under way, besides the sums; and per stored
+/// side, when all are done.
 const KEPT_SIDE: u64 = 12;
 const DONE_SIDE: u64 = 15;
 
@@ -83,8 +84,8 @@ pub struct MemoryEstimate {
 }
 
 impl MemoryEstimate {
-    /// The estimate for a scene that is loaded. A few photons are traced to learn how often they land: in a closed white
-    /// cavity that can be hundreds of times.
+    /// The estimate for a scene that is loaded. A few photons are traced to learn how often they land: in a closed
+    /// white cavity that can be hundreds of times.
     ///
     /// # Errors
     /// `Invalid` if the grid has too many points; `Embree`.
@@ -92,8 +93,8 @@ impl MemoryEstimate {
         Ok(Parts::new(scene, volumes, settings, device)?.estimate(settings.bands))
     }
 
-    /// The least number of bands whose estimate is at most `most` bytes, and that estimate; as many bands as `settings` ask
-    /// for at least. If none fits, the least estimate there is.
+    /// The least number of bands whose estimate is at most `most` bytes, and that estimate; as many bands as `settings`
+    /// ask for at least. If none fits, the least estimate there is.
     ///
     /// # Errors
     /// As [`MemoryEstimate::new`].
@@ -314,8 +315,8 @@ impl Parts {
     }
 }
 
-/// Landings to be expected of all photons, and those in the photon maps of the lower and the higher side: on level sets, first
-/// landings left out.
+/// Landings to be expected of all photons, and those in the photon maps of the lower and the higher side: on level
+/// sets, first landings left out.
 fn landings(scene: &Scene, settings: &BakeSettings, device: &Device) -> Result<[f64; 3]> {
     let tracer = GraphTracer::new(device, scene)?;
     let pilot = PhotonSettings {

@@ -51,8 +51,8 @@ pub enum StrategyName {
 }
 
 impl StrategyName {
-    /// How scattered samples are placed; `None` for those at the grid's points. BB09's level sets stand at 39.0 + 17.7 k
-    /// of the bumps' sweep [3.6, 95]: the same fractions of any sweep, and as many planes.
+    /// How scattered samples are placed; `None` for those at the grid's points. BB09's level sets stand at 39.0 + 17.7
+    /// k of the bumps' sweep [3.6, 95]: the same fractions of any sweep, and as many planes.
     pub fn placed(self) -> Option<Strategy> {
         let fractions =
             || (-2..=3).map(|k| (39.0 + 17.7 * f64::from(k) - 3.6) / 91.4).filter(|s| (0.0..=1.0).contains(s));
@@ -73,7 +73,8 @@ pub enum Interpolation {
     Shepard,
     /// Least squares: the grid whose interpolation on isosurfaces is nearest to the samples.
     Fit,
-    /// Irradiance caching: closed-form direct light times the visible share that the samples know, and their indirect light.
+    /// Irradiance caching: closed-form direct light times the visible share that the samples know, and their indirect
+    /// light.
     #[default]
     Irradiance,
 }
@@ -193,7 +194,8 @@ impl BakeOptions {
         }
     }
 
-    /// The first option that is set and means nothing to sweeps, or little: they take a part of its rays where they end.
+    /// The first option that is set and means nothing to sweeps, or little: they take a part of its rays where they
+    /// end.
     fn of_photons(&self) -> Option<&'static str> {
         let own = [
             ("photons", self.photons.is_some()),
@@ -224,8 +226,9 @@ impl BakeOptions {
         self.engine.is_none() && self.of_photons().or(self.of_sweeps()).is_none()
     }
 
-    /// The engine for a scene: the one that is asked for; else sweeps, which are faster for the same error, unless options that
-    /// only photons know are set, the scene cannot be swept, or sweeps would leave out what its surfaces reflect.
+    /// The engine for a scene: the one that is asked for; else sweeps, which are faster for the same error, unless
+    /// options that only photons know are set, the scene cannot be swept, or sweeps would leave out what its surfaces
+    /// reflect.
     fn engine(&self, scene: &Scene) -> Result<Engine> {
         match (self.engine, self.of_photons(), self.of_sweeps()) {
             (Some(engine), ..) => Ok(engine),
@@ -313,7 +316,8 @@ impl BakeSettings {
     /// The preset with the options that are set, for a scene: it says whether it can be swept, which is the default.
     ///
     /// # Errors
-    /// `Invalid` for values out of range, and for options of both engines if neither is named; the message names the option.
+    /// `Invalid` for values out of range, and for options of both engines if neither is named; the message names the
+    /// option.
     pub fn new(o: &BakeOptions, scene: &Scene) -> Result<Self> {
         Self::with_engine(o, o.engine(scene)?)
     }

@@ -1,5 +1,5 @@
-//! The fast engine: line sweeps light every node; exact rays fill points outside the sweep beside steep edges, and those
-//! next to luminaires.
+//! The fast engine: line sweeps light every node; exact rays fill points outside the sweep beside steep edges, and
+//! those next to luminaires.
 
 use super::bands::Band;
 use super::contacts::{Contacts, Wedge};
@@ -27,15 +27,15 @@ use rayon::prelude::*;
 /// Resolution of the progress bar, since a sweep knows only fractions.
 const STEPS: f64 = 1000.0;
 
-/// The shares of the photon engine's gather and shadow rays that a sample beside steep edges takes: each point there is fitted
-/// to samples of its own and its neighbours'.
+/// The shares of the photon engine's gather and shadow rays that a sample beside steep edges takes: each point there is
+/// fitted to samples of its own and its neighbours'.
 const SHARES: [u32; 2] = [4, 8];
 
 /// Those that a wall takes at a contact: only a part of what arrives there is seen again.
 const CONTACT_SHARES: [u32; 2] = [2, 4];
 
-/// Points nearer to a luminaire than this many voxels are sampled by exact rays: on its front light falls off within a voxel,
-/// and what lies behind it is lit by lines that a sweep mixes a voxel further.
+/// Points nearer to a luminaire than this many voxels are sampled by exact rays: on its front light falls off within a
+/// voxel, and what lies behind it is lit by lines that a sweep mixes a voxel further.
 const NEAR: f64 = 1.5;
 
 pub(super) fn light(

@@ -35,7 +35,8 @@ const REPLICATES: usize = 2;
 const MOST_TRIES: usize = 5;
 const SHORT: f64 = 0.2;
 
-/// Luminaire points that a sweep is tried with, and the fewest of each luminaire. Walls look at sixteen of one together.
+/// Luminaire points that a sweep is tried with, and the fewest of each luminaire. Walls look at sixteen of one
+/// together.
 const LIGHT_POINTS: usize = 16;
 const FEWEST_POINTS: usize = 4;
 
@@ -57,9 +58,9 @@ pub struct TimeEstimate {
 }
 
 impl TimeEstimate {
-    /// Does a small part of each stage and scales it up: right within a factor of about 2 on a machine that stays as busy
-    /// as it is, if light settles after as many bounces of a sweep as it does as a rule. Interpolation of scattered samples,
-    /// rays beside the ends of a sweep and export are left out.
+    /// Does a small part of each stage and scales it up: right within a factor of about 2 on a machine that stays as
+    /// busy as it is, if light settles after as many bounces of a sweep as it does as a rule. Interpolation of
+    /// scattered samples, rays beside the ends of a sweep and export are left out.
     ///
     /// # Errors
     /// `Invalid` if the grid has too many points; `NotSupported` as [`sweep::sweep`]; `Embree`.
@@ -142,8 +143,8 @@ fn with_texels(walls: usize, texels: &dyn Fn(usize) -> f64, pilot: &dyn Fn(usize
     Ok(seconds + per_texel * (texels(walls) - texels(across)))
 }
 
-/// Estimated seconds of a sweep, of which `pilot` does a small part: several times if that is short, since whatever else
-/// the machine does adds to some of its parts only.
+/// Estimated seconds of a sweep, of which `pilot` does a small part: several times if that is short, since whatever
+/// else the machine does adds to some of its parts only.
 fn sweep_seconds(scene: &Scene, pilot: &SweepSettings, settings: &SweepSettings) -> Result<f64> {
     let mut parts = timed_sweep(scene, pilot)?;
     let begun = Instant::now();
@@ -247,8 +248,8 @@ impl SweepParts {
     }
 }
 
-/// Estimated seconds of the walls that photons light, from some of their texels: as few as photons are fewer, which leaves
-/// as many to each.
+/// Estimated seconds of the walls that photons light, from some of their texels: as few as photons are fewer, which
+/// leaves as many to each.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a part of a length")]
 fn walls_seconds(scene: &Scene, tracer: &GraphTracer<'_>, photons: &Photons, settings: &BakeSettings) -> f64 {
     let walls = settings.wall_resolution;

@@ -55,8 +55,8 @@ pub(super) struct Bake {
     /// Go on where an interrupted bake of the same settings stopped; from the beginning if there is no checkpoint
     #[arg(long)]
     resume: bool,
-    /// The estimated memory is to be at most this, such as 8G or 500M: by the photon engine if sweeps need more, its isovalues
-    /// cut into bands; refuse a bake that still needs more
+    /// The estimated memory is to be at most this, such as 8G or 500M: by the photon engine if sweeps need more, its
+    /// isovalues cut into bands; refuse a bake that still needs more
     #[arg(long, value_name = "BYTES", value_parser = bytes)]
     max_memory: Option<u64>,
     /// Print what memory and time it would take, check everything, and stop before the work

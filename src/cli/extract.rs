@@ -112,8 +112,8 @@ pub(super) fn open_bake(path: &Path, options: &SceneOptions) -> Result<Option<Ba
     }
 }
 
-/// The scene of a bake, volume or scene file, seen from the volume named `field` (the first if there is no name), and the
-/// bake if it is one, seen likewise.
+/// The scene of a bake, volume or scene file, seen from the volume named `field` (the first if there is no name), and
+/// the bake if it is one, seen likewise.
 pub(super) fn open_scene(
     path: &Path,
     options: &SceneOptions,

@@ -29,8 +29,8 @@ pub(super) struct ReferenceArgs {
     /// The isosurface, in the volume's units
     #[arg(long, value_name = "C", allow_negative_numbers = true)]
     isovalue: f64,
-    /// Of several volumes, the one to illuminate: its name (default: the first). The others stand at the same share of their
-    /// own ranges
+    /// Of several volumes, the one to illuminate: its name (default: the first). The others stand at the same share of
+    /// their own ranges
     #[arg(long, value_name = "NAME")]
     field: Option<String>,
     /// Output: .ply

@@ -59,7 +59,8 @@ pub struct SceneBuilder<'a> {
 pub struct Scene<'a> {
     handle: embree4_sys::RTCScene,
     device: Device,
-    /// Whether packets go to Embree in halves: it takes sixteen rays apart, one by one, where its own vectors are eight wide.
+    /// Whether packets go to Embree in halves: it takes sixteen rays apart, one by one, where its own vectors are eight
+    /// wide.
     halves: bool,
     /// What the callbacks of shared user geometries read: never touched, only kept.
     _shared: Vec<Arc<dyn UserGeometry + Send + 'a>>,

@@ -24,7 +24,8 @@ unsafe impl Send for Inner {}
 unsafe impl Sync for Inner {}
 
 impl Device {
-    /// Opens Embree with `threads` threads for building scenes (0: one per core). Queries run on their callers' threads.
+    /// Opens Embree with `threads` threads for building scenes (0: one per core). Queries run on their callers'
+    /// threads.
     ///
     /// It uses the widest vectors that the processor has, or at most those of [`Isa::chosen`].
     ///

@@ -61,7 +61,8 @@ impl Extrusions {
         Ok(this)
     }
 
-    /// The polygon that a ray met which met polygon `id`: another one only if it starts on both, where rounding would choose.
+    /// The polygon that a ray met which met polygon `id`: another one only if it starts on both, where rounding would
+    /// choose.
     #[inline]
     pub(super) fn settle(&self, ray: &FlattenedRay, id: u32) -> u32 {
         let (o, d) = (ray.origin.as_dvec3(), ray.direction.as_dvec3());

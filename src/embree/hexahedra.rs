@@ -2,8 +2,8 @@
 //!
 //! The whole volume is **one** primitive whose callback walks the min/max pyramid: Embree's hierarchy is blind to the
 //! isovalue, and a callback costs as much as several cells (design: speed). The isovalue rides in `ray.id`, what the
-//! ray starts and ends on in `ray.time`. Companions are a primitive each, in their own index spaces, but those that share
-//! the lattice: one callback serves them all, the own field first, so that its hit ends the others' walks.
+//! ray starts and ends on in `ray.time`. Companions are a primitive each, in their own index spaces, but those that
+//! share the lattice: one callback serves them all, the own field first, so that its hit ends the others' walks.
 
 use super::extrusions::{Extrusions, embree_ray, flattened_ray, padded};
 use super::{

@@ -6,9 +6,9 @@
 //! what the hits say about the start:
 //! * Directions that go into the surface by the trilinear gradient of the cell they enter meet it at t = 0, as in
 //!   [`super::GraphTracer`].
-//! * A hit from the other side on a triangle whose plane holds the start within [`ROUNDING`] is the start itself: the ray
-//!   goes on behind it. The same hit on any other triangle means that the ray began inside, below the triangles but not
-//!   below the trilinear surface: it meets the surface at t = 0.
+//! * A hit from the other side on a triangle whose plane holds the start within [`ROUNDING`] is the start itself: the
+//!   ray goes on behind it. The same hit on any other triangle means that the ray began inside, below the triangles but
+//!   not below the trilinear surface: it meets the surface at t = 0.
 //! * A hit from the own side within `ROUNDING` of the start touches the fan of triangles around a vertex or an edge: it
 //!   does not count, unless what follows shows that the ray went inside.
 
@@ -81,8 +81,8 @@ fn departing(ray: &FlattenedRay) -> Option<(usize, Side)> {
 }
 
 impl<'a> SurfaceTracer<'a> {
-    /// Extracts the isosurface of each field at `isovalue` (units of the sweep), every cell cut into `refine`³, and commits
-    /// them.
+    /// Extracts the isosurface of each field at `isovalue` (units of the sweep), every cell cut into `refine`³, and
+    /// commits them.
     ///
     /// # Errors
     /// From extraction; `NotSupported` for capped boundaries, whose caps are no triangles; `Embree`.
@@ -205,7 +205,8 @@ impl<'a> SurfaceTracer<'a> {
                 _ => break,
             }
         }
-        // The ray touched the surface from its own side and met nothing of it since: the values on its way tell where it is.
+        // The ray touched the surface from its own side and met nothing of it since: the values on its way tell where
+        // it is.
         if entered && reach.is_finite() {
             let (field, p) = self.field(own, o + ray.direction.as_dvec3() * (0.5 * f64::from(reach)));
             let h = field.value(p);

@@ -65,8 +65,8 @@ pub trait UserGeometry: Sync {
     /// `intersect` for the rays whose bit is set in `active`; returns the bits of the rays that hit, and their hits in
     /// `hits` (whatever stands in the other lanes is ignored).
     ///
-    /// Embree may split a packet: it is asked for eight rays at a time on a CPU with AVX2, and hands over single ones, to
-    /// `intersect`, on one without.
+    /// Embree may split a packet: it is asked for eight rays at a time on a CPU with AVX2, and hands over single ones,
+    /// to `intersect`, on one without.
     #[inline]
     fn intersect16(&self, prim: u32, active: u16, rays: &Ray16, hits: &mut UserHits16) -> u16 {
         let mut found = 0;

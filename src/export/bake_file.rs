@@ -78,10 +78,10 @@ fn suffix(i: usize) -> &'static str {
     if i == 0 { "" } else { "_inside" }
 }
 
-/// Writes the bakes of a scene's fields: one as `.vti` ([`write()`]); several as `.vtm` at `path` and beside it a `.vti` for
-/// each, `NAME-FIELD.vti`, which stands for itself and also holds `s`, the parameter that the fields share: a contour of it
-/// in all blocks shows all fields of one hyperplane. All are complete before the first has its name, so that what fails
-/// leaves the old set.
+/// Writes the bakes of a scene's fields: one as `.vti` ([`write()`]); several as `.vtm` at `path` and beside it a
+/// `.vti` for each, `NAME-FIELD.vti`, which stands for itself and also holds `s`, the parameter that the fields share:
+/// a contour of it in all blocks shows all fields of one hyperplane. All are complete before the first has its name, so
+/// that what fails leaves the old set.
 ///
 /// # Errors
 /// `Io`.

@@ -1,8 +1,8 @@
-//! Binary glTF 2.0 (`.glb`): one mesh with colours at its vertices, for browsers, Blender, ChimeraX and office programs.
-//! \[glTF\]
+//! Binary glTF 2.0 (`.glb`): one mesh with colours at its vertices, for browsers, Blender, ChimeraX and office
+//! programs. \[glTF\]
 //!
-//! glTF's y points up where the box's z does: the node's matrix turns the mesh, whose own coordinates stay the world's, less
-//! the centre of its bounds, so that f32 holds them well wherever the world's origin is.
+//! glTF's y points up where the box's z does: the node's matrix turns the mesh, whose own coordinates stay the world's,
+//! less the centre of its bounds, so that f32 holds them well wherever the world's origin is.
 
 use super::Mesh;
 use super::picture::srgb_decode;
@@ -18,12 +18,13 @@ const ELEMENT_ARRAY_BUFFER: u32 = 34963;
 const FLOAT: u32 = 5126;
 const UNSIGNED_INT: u32 = 5125;
 
-/// Writes `mesh`: `POSITION`, `NORMAL`, and the display colours as linear floats in `COLOR_0`, with a material that shows them
-/// without further light (`KHR_materials_unlit`): light is what they are. The named properties become `_NAME` attributes.
+/// Writes `mesh`: `POSITION`, `NORMAL`, and the display colours as linear floats in `COLOR_0`, with a material that
+/// shows them without further light (`KHR_materials_unlit`): light is what they are. The named properties become
+/// `_NAME` attributes.
 ///
 /// # Errors
-/// `Invalid` if the arrays do not fit each other, a position is not finite in f32 or the mesh is empty; `NotSupported` beyond
-/// 4 GB, the format's limit; `Io`.
+/// `Invalid` if the arrays do not fit each other, a position is not finite in f32 or the mesh is empty; `NotSupported`
+/// beyond 4 GB, the format's limit; `Io`.
 pub fn write(path: impl AsRef<Path>, mesh: &Mesh) -> Result<()> {
     let path = path.as_ref();
     mesh.check(path)?;

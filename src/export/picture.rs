@@ -99,11 +99,12 @@ impl Picture {
     }
 
     /// Writes a 32-bit float EXR of the linear values (scan lines, ZIP, channels B G R), with custom string attributes
-    /// (name, value), values in UTF-8. The order of the attributes in the file is not fixed, so its bytes are not either.
+    /// (name, value), values in UTF-8. The order of the attributes in the file is not fixed, so its bytes are not
+    /// either.
     ///
     /// # Errors
-    /// `Invalid` for an empty picture, a wrong number of pixels, or an attribute whose name is not 1–255 ASCII characters,
-    /// is used twice or belongs to the format; `Io`.
+    /// `Invalid` for an empty picture, a wrong number of pixels, or an attribute whose name is not 1–255 ASCII
+    /// characters, is used twice or belongs to the format; `Io`.
     pub fn write_exr(&self, path: impl AsRef<Path>, attributes: &[(String, String)]) -> Result<()> {
         let path = path.as_ref();
         self.check(path)?;

@@ -1,7 +1,7 @@
 //! Binary little-endian PLY: a mesh with named values at its vertices.
 //!
-//! What is written is read by ParaView/VTK, MeshLab, Blender and Mitsuba. So there is no `obj_info` line (Mitsuba refuses
-//! it), the face list is `uchar int`, and positions are `float`: with coordinates of 1e6 their steps are 0.06.
+//! What is written is read by ParaView/VTK, MeshLab, Blender and Mitsuba. So there is no `obj_info` line (Mitsuba
+//! refuses it), the face list is `uchar int`, and positions are `float`: with coordinates of 1e6 their steps are 0.06.
 
 use super::{Mesh, colour_bytes};
 use crate::atomic::AtomicFile;
@@ -171,8 +171,8 @@ struct Header {
 /// are before room for them is made.
 ///
 /// # Errors
-/// `Invalid` if the bytes are no PLY, are cut short or go on, or name vertices that do not exist; `NotSupported` for other
-/// encodings, elements and polygons.
+/// `Invalid` if the bytes are no PLY, are cut short or go on, or name vertices that do not exist; `NotSupported` for
+/// other encodings, elements and polygons.
 pub fn parse(bytes: &[u8], name: impl AsRef<Path>) -> Result<PlyMesh> {
     let name = name.as_ref();
     let (header, body) = parse_header(bytes, name)?;

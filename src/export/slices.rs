@@ -12,15 +12,16 @@ use exr::prelude::{
 };
 use std::path::Path;
 
-/// Writes one layer per slice along the third axis, `z0000`, `z0001` …, each nx × ny pixels of 32-bit floats (scan lines, ZIP),
-/// with the channels `R`, `G`, `B` for three components and `Y` for one. Row j of a layer is sample j: the first row, which
-/// viewers show on top, is the one at the lattice's origin. The values are written as they are.
+/// Writes one layer per slice along the third axis, `z0000`, `z0001` …, each nx × ny pixels of 32-bit floats (scan
+/// lines, ZIP), with the channels `R`, `G`, `B` for three components and `Y` for one. Row j of a layer is sample j: the
+/// first row, which viewers show on top, is the one at the lattice's origin. The values are written as they are.
 ///
-/// Each layer's text attributes `isolume:origin` (world position of sample (0, 0, 0)) and `isolume:axes` (the three steps, one axis after
-/// the other) place the pixels.
+/// Each layer's text attributes `isolume:origin` (world position of sample (0, 0, 0)) and `isolume:axes` (the three
+/// steps, one axis after the other) place the pixels.
 ///
 /// # Errors
-/// `Invalid` if the count is not the lattice's samples × `components`, or for other component counts than 1 and 3; `Io`.
+/// `Invalid` if the count is not the lattice's samples × `components`, or for other component counts than 1 and 3;
+/// `Io`.
 pub fn write(path: &Path, lattice: &Lattice, components: usize, values: SamplesRef<'_>) -> Result<()> {
     values.check(lattice, components).map_err(|e| Error::invalid(path, e))?;
     let names: &[&str] = match components {

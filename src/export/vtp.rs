@@ -1,17 +1,17 @@
-//! VTK XML polygons (`.vtp`) with appended zlib arrays, for ParaView, VTK and PyVista. Positions keep all digits of f64.
-//! \[VTK\]
+//! VTK XML polygons (`.vtp`) with appended zlib arrays, for ParaView, VTK and PyVista. Positions keep all digits of
+//! f64. \[VTK\]
 
 use super::{Mesh, colour_bytes};
 use crate::error::{Error, Result};
 use crate::volume::vti::XmlDocument;
 use std::path::Path;
 
-/// Writes `mesh`: point data `Normals` (active normals), `rgb` (active scalars, uchar, sRGB-encoded) and the named properties,
-/// of which `x_r`, `x_g`, `x_b` in this order become one array `x` of three components.
+/// Writes `mesh`: point data `Normals` (active normals), `rgb` (active scalars, uchar, sRGB-encoded) and the named
+/// properties, of which `x_r`, `x_g`, `x_b` in this order become one array `x` of three components.
 ///
 /// # Errors
-/// `Invalid` if the arrays do not fit each other, a position is not finite or the mesh is empty; `NotSupported` beyond 2³¹ − 1
-/// vertices or triangles; `Io`.
+/// `Invalid` if the arrays do not fit each other, a position is not finite or the mesh is empty; `NotSupported` beyond
+/// 2³¹ − 1 vertices or triangles; `Io`.
 pub fn write(path: impl AsRef<Path>, mesh: &Mesh) -> Result<()> {
     let path = path.as_ref();
     mesh.check(path)?;

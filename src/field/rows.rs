@@ -1,5 +1,5 @@
-//! A field at the points of a lattice over Ω, a row along x at a time: in which cell a point lies and where is found once for each
-//! axis instead of once for each point.
+//! A field at the points of a lattice over Ω, a row along x at a time: in which cell a point lies and where is found
+//! once for each axis instead of once for each point.
 
 use super::{Field, trilinear};
 use crate::volume::Lattice;
@@ -9,7 +9,8 @@ use glam::DVec3;
 pub struct FieldRows<'a> {
     field: &'a Field,
     places: Places,
-    /// The field whose nodes have receiver gradients, and the places in it; `None` if its nodes are the lattice's points.
+    /// The field whose nodes have receiver gradients, and the places in it; `None` if its nodes are the lattice's
+    /// points.
     normals: (&'a Field, Option<Places>),
 }
 

@@ -3,8 +3,8 @@
 use super::HeightField;
 use glam::DVec2;
 
-/// Segments of L(h, c) in index coordinates, c in units of the sweep. In a saddle cell the bilinear centre decides which
-/// corners join. Chords of the curve: ends are exact on the cells' edges.
+/// Segments of L(h, c) in index coordinates, c in units of the sweep. In a saddle cell the bilinear centre decides
+/// which corners join. Chords of the curve: ends are exact on the cells' edges.
 pub(super) fn level_curve(field: &HeightField, c: f64) -> Vec<[DVec2; 2]> {
     let [nx, ny] = field.dims();
     let mut segments = Vec::new();

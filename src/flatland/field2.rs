@@ -87,8 +87,9 @@ impl HeightField {
         }
     }
 
-    /// Reads a grey PNG (8 or 16 bits, values as stored, the longer edge of length 1, the top row at the largest y), a flat
-    /// field as [`Plane::open`] finds it (its axes are x and y, with its spacing, from 0 on), or one slice of a volume that is a single cell thick along some axis (its first two samples deep; in world units).
+    /// Reads a grey PNG (8 or 16 bits, values as stored, the longer edge of length 1, the top row at the largest y), a
+    /// flat field as [`Plane::open`] finds it (its axes are x and y, with its spacing, from 0 on), or one slice of a
+    /// volume that is a single cell thick along some axis (its first two samples deep; in world units).
     ///
     /// `sweep` of `None` takes the least and greatest value.
     ///

@@ -47,9 +47,9 @@ struct BoxKeys {
     radiance: Option<Rgb>,
 }
 
-/// Reads a scene file: `[field]` with `generator` (and `size`) or `file`; optional `isovalues`, `height` (world height of
-/// the sweep, default 1), `[surface]` with `albedo`, `outside`, and `[box]` with `walls = false`, the walls' albedos `left`,
-/// `right`, `back`, the `luminaire`'s ends in world units and its `radiance`.
+/// Reads a scene file: `[field]` with `generator` (and `size`) or `file`; optional `isovalues`, `height` (world height
+/// of the sweep, default 1), `[surface]` with `albedo`, `outside`, and `[box]` with `walls = false`, the walls' albedos
+/// `left`, `right`, `back`, the `luminaire`'s ends in world units and its `radiance`.
 ///
 /// # Errors
 /// `Io`; `Invalid` with file, line and key; what reading the field returns.

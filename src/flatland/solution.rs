@@ -1,5 +1,5 @@
-//! All light of a scene by iteration: radiance at the field's samples and in wall texels, each gathering from the others
-//! over fixed stratified directions until nothing changes.
+//! All light of a scene by iteration: radiance at the field's samples and in wall texels, each gathering from the
+//! others over fixed stratified directions until nothing changes.
 
 use super::{Landing, Receiver, World};
 use crate::error::{Error, Result};
@@ -104,7 +104,8 @@ impl Solution {
                     .into_par_iter()
                     .map(|t| {
                         let u = ((t % settings.wall) as f64 + 0.5) / settings.wall as f64;
-                        // The ends of the sweep are texels themselves: surfaces near them interpolate, never extrapolate.
+                        // The ends of the sweep are texels themselves: surfaces near them interpolate, never
+                        // extrapolate.
                         let s = (t / settings.wall) as f64 / (settings.heights - 1).max(1) as f64;
                         let key = (u64::from(id) + 1) << 40 | t as u64;
                         row(world, settings, &world.wall_receiver(id, u, s), segment.albedo, key)
@@ -177,8 +178,8 @@ impl Solution {
         &self.graph[side.index()]
     }
 
-    /// Radiance that leaves a landing, bilinear; points without normal are left out. Beyond the sweep's ends a wall looks as
-    /// at the end.
+    /// Radiance that leaves a landing, bilinear; points without normal are left out. Beyond the sweep's ends a wall
+    /// looks as at the end.
     #[inline]
     pub fn radiance(&self, landing: Landing) -> DVec3 {
         match landing {

@@ -1,9 +1,10 @@
 //! The two geometries of a height field behind the [`Tracer`] seam.
 //!
-//! * [`LevelCurves`]: rays in horizontal planes. The local frame is (x index, y index, 0), the isovalue rides in the ray.
-//!   The whole field is one user primitive: a walk over cells by the sign of h − c, above a layer of min/max blocks.
-//! * [`GraphSurface`]: rays in R³. The local frame is (x index, y index, height in units of the sweep); the graph is two
-//!   triangles per cell.
+//! * [`LevelCurves`]: rays in horizontal planes. The local frame is (x index, y index, 0), the isovalue rides in the
+//!   ray. The whole field is one user primitive: a walk over cells by the sign of h − c, above a layer of min/max
+//!   blocks.
+//! * [`GraphSurface`]: rays in R³. The local frame is (x index, y index, height in units of the sweep); the graph is
+//!   two triangles per cell.
 //!
 //! A segment is met where its ends lie on different sides of the ray: two walls with a common end leave no slit.
 
@@ -416,7 +417,8 @@ impl GraphSurface {
         Ok(Self { bvh: builder.commit()?, graph, field, triangles })
     }
 
-    /// Height of the triangles above `p`, and their slope there, in the local frame. On the diagonal, `towards` decides.
+    /// Height of the triangles above `p`, and their slope there, in the local frame. On the diagonal, `towards`
+    /// decides.
     pub fn plane(&self, p: DVec2, towards: DVec2) -> (f64, DVec2) {
         plane(&self.field, p, towards)
     }

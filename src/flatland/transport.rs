@@ -28,7 +28,8 @@ pub struct World {
 /// A point that receives light.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Receiver {
-    /// Local frame of the tracer: (x, y) in index units, then 0 when flattened, the height in sweep units when ordinary.
+    /// Local frame of the tracer: (x, y) in index units, then 0 when flattened, the height in sweep units when
+    /// ordinary.
     pub position: Vec3,
     /// Its plane when flattened.
     pub isovalue: f32,
@@ -330,15 +331,15 @@ impl World {
         sum / f64::from(gather.max(1))
     }
 
-    /// Reflected light per albedo at a receiver, direct and indirect ([`World::gathered`]). The albedo times their sum is
-    /// the outgoing radiance.
+    /// Reflected light per albedo at a receiver, direct and indirect ([`World::gathered`]). The albedo times their sum
+    /// is the outgoing radiance.
     pub fn reflected(&self, receiver: &Receiver, solved: &Solution, shadow: u32, gather: u32, key: u64) -> [DVec3; 2] {
         let set = Sobol::set(solved.seed(), Stage::Direct, key);
         [self.direct(receiver, shadow, &set), self.gathered(receiver, solved, gather, key)]
     }
 
-    /// Indirect light per albedo at a receiver, by path `path` of the stream of (seed, index): next-event estimation with
-    /// one shadow ray per vertex and Russian roulette after three reflections. Unbiased; no stored radiance.
+    /// Indirect light per albedo at a receiver, by path `path` of the stream of (seed, index): next-event estimation
+    /// with one shadow ray per vertex and Russian roulette after three reflections. Unbiased; no stored radiance.
     pub fn path(&self, receiver: &Receiver, path: u32, (seed, index): (u64, u64)) -> DVec3 {
         let set = Sobol::set(seed, Stage::Path, index);
         let mut rng = Rng::stream(seed ^ 0x9e37, Stage::Path, index << 32 | u64::from(path));
@@ -395,8 +396,8 @@ impl World {
         sum
     }
 
-    /// The vertices of photon `index`, from the first luminaire at height `s` (units of the sweep): emission ∝ cos θ, the
-    /// next direction ∝ cos θ, survival with the albedo's mean, at most `bounces` reflections. \[BB09 Fig. 3\]
+    /// The vertices of photon `index`, from the first luminaire at height `s` (units of the sweep): emission ∝ cos θ,
+    /// the next direction ∝ cos θ, survival with the albedo's mean, at most `bounces` reflections. \[BB09 Fig. 3\]
     pub fn photon_path(&self, seed: u64, index: u64, s: f64, bounces: usize) -> Vec<PathVertex> {
         let Some((id, _)) = self.lights.first() else { return Vec::new() };
         let mut rng = Rng::stream(seed, Stage::Photon, index);
@@ -425,8 +426,8 @@ impl World {
         path
     }
 
-    /// E₀ over its full amount: the unoccluded share of a point at the centre of the field, at mid-height, that faces the
-    /// brightest luminaire; the largest channel of all luminaires. 0 without luminaires.
+    /// E₀ over its full amount: the unoccluded share of a point at the centre of the field, at mid-height, that faces
+    /// the brightest luminaire; the largest channel of all luminaires. 0 without luminaires.
     pub fn reference_share(&self) -> f64 {
         let [lo, hi] = self.scene.field.bounds();
         let x = (0.5 * (lo + hi)).extend(0.5 * self.scene.height);

@@ -10,14 +10,14 @@ use super::Kind;
 pub(crate) trait Work {
     type Output;
 
-    /// Does it. What is always inlined into this, as this must be itself, is compiled for the set, what it only calls is not:
-    /// closures that the library calls (`map`, `from_fn`) are either.
+    /// Does it. What is always inlined into this, as this must be itself, is compiled for the set, what it only calls
+    /// is not: closures that the library calls (`map`, `from_fn`) are either.
     fn work(self) -> Self::Output;
 }
 
 impl Isa {
-    /// Does `work` in code compiled for this instruction set. No multiplication and addition becomes one, so that every set
-    /// gives the same bits.
+    /// Does `work` in code compiled for this instruction set. No multiplication and addition becomes one, so that every
+    /// set gives the same bits.
     #[inline]
     pub(crate) fn run<W: Work>(self, work: W) -> W::Output {
         #[cfg(target_arch = "x86_64")]

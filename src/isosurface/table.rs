@@ -1,8 +1,8 @@
 //! The 256 cases of marching cubes, derived from one rule instead of listed.
 //!
 //! Corner x + 2y + 4z of a cell is bit x + 2y + 4z of its case, set if the corner is inside (h ≥ c). On every face, the
-//! inside corners that are not joined by an edge of the face are **separated**. Two cells that share a face see the same
-//! four corners, hence draw the same segments on it, and the mesh closes. The rule is also that of VTK's tables.
+//! inside corners that are not joined by an edge of the face are **separated**. Two cells that share a face see the
+//! same four corners, hence draw the same segments on it, and the mesh closes. The rule is also that of VTK's tables.
 
 use std::sync::LazyLock;
 
@@ -56,8 +56,8 @@ fn edge_between(a: u8, b: u8) -> u8 {
 /// The closed loops in which the level set meets the cell's faces, each a cycle of crossed edges.
 ///
 /// Around a face, runs of inside corners alternate with outside ones. A run is cut off by one segment, from the edge
-/// where the run begins to the edge where it ends. A crossed edge belongs to two faces, which turn around it in opposite
-/// senses: it begins a run in one and ends a run in the other, so the segments join up to oriented loops.
+/// where the run begins to the edge where it ends. A crossed edge belongs to two faces, which turn around it in
+/// opposite senses: it begins a run in one and ends a run in the other, so the segments join up to oriented loops.
 pub(super) fn polygons(bits: u8) -> Vec<Vec<u8>> {
     let inside = |corner: u8| bits >> corner & 1 == 1;
     let mut next = [None; 12];

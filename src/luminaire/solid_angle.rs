@@ -1,5 +1,5 @@
-//! Points of a luminaire, uniform over the solid angle under which a receiver sees it: what they give is bounded, however
-//! near the luminaire is. Points uniform over the area give cos θ cos θ′/r², which is not.
+//! Points of a luminaire, uniform over the solid angle under which a receiver sees it: what they give is bounded,
+//! however near the luminaire is. Points uniform over the area give cos θ cos θ′/r², which is not.
 
 use super::{above_horizon, point_term};
 use crate::polygon::{Polygon, convex_area, sample_convex};
@@ -32,10 +32,10 @@ impl<'a> Aim<'a> {
         Self { polygon, x, n, rectangle, part: None, area: polygon.area() }
     }
 
-    /// The points that tell most of what `x` sees, where the whole luminaire gives `open` > 0: by solid angle of a rectangle that
-    /// fills 1 sr and more, and gives an eighth of that, so that an eighth of the points and more lie above the horizon; there points
-    /// spread over the area would hardly ever fall on what a receiver sees. Otherwise over the area of the part above the horizon.
-    /// `None` if that has no area.
+    /// The points that tell most of what `x` sees, where the whole luminaire gives `open` > 0: by solid angle of a
+    /// rectangle that fills 1 sr and more, and gives an eighth of that, so that an eighth of the points and more lie
+    /// above the horizon; there points spread over the area would hardly ever fall on what a receiver sees. Otherwise
+    /// over the area of the part above the horizon. `None` if that has no area.
     pub fn best(polygon: &'a Polygon, x: DVec3, n: DVec3, open: f64) -> Option<Self> {
         let mut aim = Self::new(polygon, x, n);
         let fills = aim.rectangle.as_ref().map_or(0.0, |r| r.solid_angle);
@@ -50,8 +50,8 @@ impl<'a> Aim<'a> {
         (aim.area > 0.0).then_some(aim)
     }
 
-    /// A point of the luminaire from two uniforms, and the irradiance per unit radiance that it gives: the mean of these is
-    /// what the whole luminaire gives.
+    /// A point of the luminaire from two uniforms, and the irradiance per unit radiance that it gives: the mean of
+    /// these is what the whole luminaire gives.
     #[inline]
     pub fn sample(&self, u: [f64; 2]) -> (DVec3, f64) {
         if let Some(r) = &self.rectangle {
@@ -172,8 +172,8 @@ mod tests {
         }
     }
 
-    /// What a receiver next to a luminaire sees through a hole: π r²/(r² + h²) for a disk of radius r at height h. Of points over
-    /// the area one in 80 000 would fall there.
+    /// What a receiver next to a luminaire sees through a hole: π r²/(r² + h²) for a disk of radius r at height h. Of
+    /// points over the area one in 80 000 would fall there.
     #[test]
     fn a_few_points_find_what_is_seen_of_a_near_luminaire() {
         let light = rectangle([-0.5, 0.5], [-0.5, 0.5]);

@@ -1,14 +1,15 @@
 //! Photons counted in bins, and irradiance as a local linear fit to the bins' densities.
 //!
-//! What a bin needs beside its photons' power, the measure ∫|∇h| dV of level sets in it with their mean isovalue, receiver
-//! normal and place, does not depend on the photons: it is integrated once. Level sets that face different octants have bins of
-//! their own, so that the sides of a thin sheet do not mix. The light around a bin at x minimises Σ K A D (P/D − a − b·(y − x))²
-//! over the bins (power P, measure D, centroid y) that it accepts (A): a + b·(z − x) at z. At a border or a crease, where bins
-//! lie on one side only, the slope b keeps their mean from standing for x. The kernel is a ball in coordinates of the
-//! bins, so that coarse slices of a volume blur no further than they must. \[Loader99\]
+//! What a bin needs beside its photons' power, the measure ∫|∇h| dV of level sets in it with their mean isovalue,
+//! receiver normal and place, does not depend on the photons: it is integrated once. Level sets that face different
+//! octants have bins of their own, so that the sides of a thin sheet do not mix. The light around a bin at x minimises
+//! Σ K A D (P/D − a − b·(y − x))² over the bins (power P, measure D, centroid y) that it accepts (A): a + b·(z − x) at
+//! z. At a border or a crease, where bins lie on one side only, the slope b keeps their mean from standing for x. The
+//! kernel is a ball in coordinates of the bins, so that coarse slices of a volume blur no further than they must.
+//! \[Loader99\]
 //!
-//! That, too, is found once per bin, as light is at the photons of \[Christensen99\]: an estimate blends what the bins of the
-//! eight cells around it say of its place.
+//! That, too, is found once per bin, as light is at the photons of \[Christensen99\]: an estimate blends what the bins
+//! of the eight cells around it say of its place.
 
 use super::cells::Cells;
 use super::measure::{self, Bin, octant};
@@ -73,8 +74,8 @@ pub(super) struct PhotonDensity<'a> {
 const LEAST: f32 = 1.05;
 const FIRST: f32 = 2.0;
 const MOST: f32 = 5.0;
-/// Photons of an estimate per photon of a bin, and how many photons bins are meant to hold on average. Fewer would take longer to
-/// fit than to trace.
+/// Photons of an estimate per photon of a bin, and how many photons bins are meant to hold on average. Fewer would take
+/// longer to fit than to trace.
 const SHARE: f64 = 8.0;
 const FILL: [f64; 2] = [4.0, 8.0];
 
@@ -206,8 +207,8 @@ impl<'a> PhotonDensity<'a> {
         near.truncate(found);
     }
 
-    /// The light that the bins around one that are alike have, within the radius that holds the photons asked for, so far as
-    /// bins allow.
+    /// The light that the bins around one that are alike have, within the radius that holds the photons asked for, so
+    /// far as bins allow.
     fn fitted(&self, at: &Bin, tallies: &[Tally], near: &mut Vec<Neighbour>) -> Light {
         let wanted = self.settings.photons as f32;
         // Photons of equal power that would be as noisy as those around.
@@ -326,8 +327,8 @@ impl Fit {
         self.power[3] += p * d.z;
     }
 
-    /// The value at d = 0, its slope, and what to multiply K P (1, d) with for a place's part of the value; `None` without measure.
-    /// A channel that the slope would drive below 0 falls back to the mean.
+    /// The value at d = 0, its slope, and what to multiply K P (1, d) with for a place's part of the value; `None`
+    /// without measure. A channel that the slope would drive below 0 falls back to the mean.
     fn solve(&self) -> Option<(Vec3, [Vec3; 3], Vec4)> {
         let weight = self.measure.weight();
         if weight <= 0.0 {
@@ -390,7 +391,8 @@ mod tests {
     /// Behind the last cell of a row of bins comes the first of the next, where it is bright.
     #[test]
     fn light_at_a_border_is_its_own() {
-        // Two samples to a bin: places at the border are nearer to where a next bin would be than to the middle of the last.
+        // Two samples to a bin: places at the border are nearer to where a next bin would be than to the middle of the
+        // last.
         let (scene, mut rng) = (ramp(41), Rng::stream(5, Stage::Test, 0));
         let mut sums = [0.0; 2];
         for seed in 1..=8 {
@@ -412,7 +414,8 @@ mod tests {
         }
     }
 
-    /// Photons of equal power anywhere in a ramp, fewer in half of it: as noisy as that many photons are, on either side.
+    /// Photons of equal power anywhere in a ramp, fewer in half of it: as noisy as that many photons are, on either
+    /// side.
     #[test]
     fn estimates_are_as_noisy_as_the_photons_asked_for() {
         let scene = ramp(40);

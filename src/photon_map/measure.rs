@@ -1,7 +1,8 @@
-//! The measure ∫|∇h| dV of level sets in the cells of a grid, by the octants that they face: what photons' power is divided by.
+//! The measure ∫|∇h| dV of level sets in the cells of a grid, by the octants that they face: what photons' power is
+//! divided by.
 //!
-//! One point stands for each eighth of a voxel, or in cells of many voxels for each voxel. Points of a row share their place along
-//! y and z, so that a row of the lattice is interpolated across once, and then along x.
+//! One point stands for each eighth of a voxel, or in cells of many voxels for each voxel. Points of a row share their
+//! place along y and z, so that a row of the lattice is interpolated across once, and then along x.
 
 use super::cells::Cells;
 use super::shares::{Block, Point};
@@ -35,8 +36,8 @@ pub(super) fn octant(n: Vec3) -> u8 {
     n.cmplt(Vec3::ZERO).bitmask() as u8
 }
 
-/// The bins of all cells, in the cells' order, and the first bin of each cell, with one more entry than cells. `tau`: see
-/// [`Bin::reach`].
+/// The bins of all cells, in the cells' order, and the first bin of each cell, with one more entry than cells. `tau`:
+/// see [`Bin::reach`].
 #[allow(clippy::cast_possible_truncation, reason = "2³² bins take 240 GB")]
 pub(super) fn bins(field: &Field, cells: &Cells, tau: f64) -> (Vec<u32>, Vec<Bin>) {
     let (points, isa) = (Points::new(field, cells, tau), Isa::current());
@@ -470,7 +471,8 @@ mod tests {
         }
     }
 
-    /// Against all points one by one, on balls that bulge towards all sides, beside a sample that is no number, and within Ω's faces.
+    /// Against all points one by one, on balls that bulge towards all sides, beside a sample that is no number, and
+    /// within Ω's faces.
     #[test]
     fn rows_and_ranges_leave_nothing_out() {
         let dims = [15, 14, 16];
@@ -502,7 +504,8 @@ mod tests {
         }
     }
 
-    /// The mean of |∇h| over noise is the same whatever the cells: points that lie at nodes find it half as large again.
+    /// The mean of |∇h| over noise is the same whatever the cells: points that lie at nodes find it half as large
+    /// again.
     #[test]
     fn noise_has_the_same_measure_in_cells_of_any_size() {
         let dims = [24, 22, 26];

@@ -10,8 +10,8 @@ use crate::warp;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
-/// Points of the unit ball for ∫_A: a step, the most, and how many accepted ones are enough. Where few are accepted (noise,
-/// thin sheets) a fixed number would make the divisor, and with it the estimate, jump.
+/// Points of the unit ball for ∫_A: a step, the most, and how many accepted ones are enough. Where few are accepted
+/// (noise, thin sheets) a fixed number would make the divisor, and with it the estimate, jump.
 const FOOTPRINT_STEP: usize = 64;
 const FOOTPRINT_POINTS: usize = 1024;
 const FOOTPRINT_ENOUGH: usize = 32;

@@ -55,8 +55,8 @@ impl Block {
         self.len += 1;
     }
 
-    /// Becomes the points beside `len` nodes from `first` on. `nodes`: h, ∂h/∂y, ∂h/∂z and the receiver gradient there, each behind
-    /// a place that no node has and with [`LANES`] more.
+    /// Becomes the points beside `len` nodes from `first` on. `nodes`: h, ∂h/∂y, ∂h/∂z and the receiver gradient there,
+    /// each behind a place that no node has and with [`LANES`] more.
     #[inline(always)]
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     pub(super) fn read(&mut self, nodes: &[Vec<f32>; 6], along: &Along, first: usize, len: usize) {

@@ -9,7 +9,8 @@ pub(super) struct Line {
     /// Start, and direction.
     pub(super) start: Vec4,
     pub(super) d: Vec4,
-    /// Where planes are crossed from: the start, but the middle of its cell along an axis whose planes the ray never crosses.
+    /// Where planes are crossed from: the start, but the middle of its cell along an axis whose planes the ray never
+    /// crosses.
     pub(super) o: Vec4,
     /// 1 / direction; huge, but finite, along such an axis.
     pub(super) inv: Vec4,
@@ -82,17 +83,17 @@ pub(super) trait Kernel: Copy {
     /// [`crate::cell::Cell::inside`].
     fn inside(self, corners: &Self::Corners, c: f32) -> u8;
 
-    /// Whether h − c is surely of one sign at the corners of the box from `begin` to `end`, local coordinates whose error,
-    /// times six, is below `slack`. A quick look: false says nothing.
+    /// Whether h − c is surely of one sign at the corners of the box from `begin` to `end`, local coordinates whose
+    /// error, times six, is below `slack`. A quick look: false says nothing.
     #[inline(always)]
     fn clear(self, _corners: &Self::Corners, _c: f32, _begin: Vec4, _end: Vec4, _slack: f32) -> bool {
         false
     }
 
-    /// h at the corners of the box that the piece spans: bit a of the position says whose coordinate along axis a counts,
-    /// that of its begin or of its end. So the first is h at its begin and the last h at its end, and
-    /// h along it is a cubic whose Bernstein coefficients are the first, the means of 1, 2, 4 and of 3, 5, 6, and
-    /// the last. Of a face it uses the face's own corners only, and the bits are the same from both sides.
+    /// h at the corners of the box that the piece spans: bit a of the position says whose coordinate along axis a
+    /// counts, that of its begin or of its end. So the first is h at its begin and the last h at its end, and h along
+    /// it is a cubic whose Bernstein coefficients are the first, the means of 1, 2, 4 and of 3, 5, 6, and the last. Of
+    /// a face it uses the face's own corners only, and the bits are the same from both sides.
     fn span(self, corners: &Self::Corners, piece: &Piece) -> [f64; 8];
 
     /// Which of `values` are at least `c`, bit by bit.

@@ -140,7 +140,8 @@ macro_rules! shared {
         #[inline(always)]
         fn corners(self, samples: &[f32], at: usize, [y, z]: [usize; 2]) -> __m256 {
             let s = &samples[at..at + z + y + 2];
-            // SAFETY: `self` exists, so the machine has the features; pairs of samples lie within `s`, and any bits are an f64.
+            // SAFETY: `self` exists, so the machine has the features; pairs of samples lie within `s`, and any bits are
+            // an f64.
             unsafe {
                 let pair = |at: usize| s.as_ptr().add(at).cast::<f64>().read_unaligned();
                 _mm256_castpd_ps(_mm256_setr_pd(pair(0), pair(y), pair(z), pair(z + y)))

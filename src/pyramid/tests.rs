@@ -78,7 +78,8 @@ fn with_and_without_simd_hits_are_the_same_bits() {
     }
 }
 
-/// Embree asks with the reach that whatever it met first left over: a hit counts up to there and no farther, and is the same wherever that is.
+/// Embree asks with the reach that whatever it met first left over: a hit counts up to there and no farther, and is the
+/// same wherever that is.
 #[test]
 fn where_the_reach_ends_does_not_move_a_hit() {
     // Long ways, and surfaces so curved that rays come back in the cell that they leave.
@@ -177,7 +178,8 @@ fn steps_lead_to_places() {
     }
 }
 
-/// Cells that are passed by hold nothing, wherever within its error the path lies; isovalues are close to what the path meets.
+/// Cells that are passed by hold nothing, wherever within its error the path lies; isovalues are close to what the path
+/// meets.
 #[test]
 fn cells_are_passed_by_only_if_the_path_stays_on_one_side() {
     let mut rng = Rng::stream(10, Stage::Test, 0);

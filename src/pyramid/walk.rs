@@ -11,8 +11,8 @@
 //! is met between two times of its own planes, in order; a block's planes lie around those of its cells and times are
 //! monotone, so that the times of the block are in order too.
 //!
-//! The walk climbs: it looks at the nodes around the start from the smallest up, each without the child it comes from. A
-//! path begins in all of them and leaves each but once, so that this is its order; and no node waits for another.
+//! The walk climbs: it looks at the nodes around the start from the smallest up, each without the child it comes from.
+//! A path begins in all of them and leaves each but once, so that this is its order; and no node waits for another.
 
 mod begin;
 
@@ -205,8 +205,8 @@ impl Pyramid {
         }
     }
 
-    /// Looks around the start: opens the nodes that hold it on the next two levels, but for the children that hold it and
-    /// are done. What they give comes first on the path, and neither node waits for the other.
+    /// Looks around the start: opens the nodes that hold it on the next two levels, but for the children that hold it
+    /// and are done. What they give comes first on the path, and neither node waits for the other.
     #[inline(always)]
     pub(super) fn climb<K: Kernel>(&self, kernel: K, lane: &mut Lane<K::Ray>) {
         if lane.climbed == 0 {
@@ -239,8 +239,8 @@ impl Pyramid {
         }
     }
 
-    /// Opens the next node of the top level that the ray may meet after its start's; false if there is none. Nodes larger
-    /// than 256³ cells are taken in turn; mostly there is one.
+    /// Opens the next node of the top level that the ray may meet after its start's; false if there is none. Nodes
+    /// larger than 256³ cells are taken in turn; mostly there is one.
     #[cold]
     #[allow(clippy::cast_possible_truncation, reason = "node numbers are small")]
     fn next_root<K: Kernel>(&self, kernel: K, lane: &mut Lane<K::Ray>, turn: &mut usize) -> bool {
@@ -470,7 +470,8 @@ impl<'a, R> Lane<'a, R> {
         };
         let v = kernel.span(&corners, &piece);
         let above = kernel.at_least(&v, ray.c);
-        // Signs come from weights, not from the cubic's coefficients, which a huge corner far away may have rounded off.
+        // Signs come from weights, not from the cubic's coefficients, which a huge corner far away may have rounded
+        // off.
         let (begins, ends) = (above & 1 == 1, above >> 7 == 1);
         let begins = if first { begins } else { state(inside, entry, line.negative(entry), begins) };
         let ends = state(inside, exit, !line.negative(exit), ends);
@@ -490,8 +491,9 @@ impl<'a, R> Lane<'a, R> {
     }
 }
 
-/// The shared state of a crossing: whether h ≥ c where the ray meets the face across `axis`. `inside`: the corners of the
-/// cell that are; `here`: what [`Cell::value`] says there. Equal signs of all four corners decide without arithmetic.
+/// The shared state of a crossing: whether h ≥ c where the ray meets the face across `axis`. `inside`: the corners of
+/// the cell that are; `here`: what [`Cell::value`] says there. Equal signs of all four corners decide without
+/// arithmetic.
 #[inline(always)]
 fn state(inside: u8, axis: usize, far: bool, here: bool) -> bool {
     let face = FACES[axis][usize::from(far)];

@@ -1,5 +1,5 @@
-//! What flats show, as textures: direct light of every texel, and the density of photons of later landings on that part of
-//! it that light reaches.
+//! What flats show, as textures: direct light of every texel, and the density of photons of later landings on that part
+//! of it that light reaches.
 
 use super::CacheSettings;
 use crate::brdf::reflected;
@@ -17,8 +17,8 @@ use glam::DVec3;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Direct light of texels and photons of later landings, on so many times the flat's area, smoothed little for gathers and
-/// more for pictures.
+/// Direct light of texels and photons of later landings, on so many times the flat's area, smoothed little for gathers
+/// and more for pictures.
 pub(super) fn fill_flat<T: Tracer>(
     scene: &Scene,
     tracer: &T,
@@ -107,8 +107,8 @@ fn hide(scene: &Scene, number: usize, flat: &Flat, [nu, nv, _]: [usize; 3], part
     }
 }
 
-/// Where on a flat solids stand: light reaches a wall on Ω's faces where the level sets' outer sides are, and a cap where
-/// the solid is that it closes.
+/// Where on a flat solids stand: light reaches a wall on Ω's faces where the level sets' outer sides are, and a cap
+/// where the solid is that it closes.
 struct Solid<'a> {
     scene: &'a Scene,
     flat: &'a Flat,
@@ -160,8 +160,8 @@ struct Open {
     shares: Vec<f64>,
     /// Where it is, at the texel's middle isovalue; `None` if nowhere.
     at: Vec<Option<[f64; 2]>>,
-    /// Texels that have such a part, and those around them, which are looked up together. The others hold what light there
-    /// is within solids.
+    /// Texels that have such a part, and those around them, which are looked up together. The others hold what light
+    /// there is within solids.
     outer: Vec<bool>,
 }
 
@@ -281,8 +281,8 @@ const GATHERED: Kernel = Kernel { photons: 300.0, most: 2.0 };
 const SHOWN: Kernel = Kernel { photons: 2000.0, most: 16.0 };
 
 impl Kernel {
-    /// Passes of ¼ ½ ¼ along u, v and c for so many photons per texel: the kernel is (2√π σ)³ texels worth, with σ² of half
-    /// the passes.
+    /// Passes of ¼ ½ ¼ along u, v and c for so many photons per texel: the kernel is (2√π σ)³ texels worth, with σ² of
+    /// half the passes.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
     fn passes(&self, photons_per_texel: f64) -> [usize; 3] {
         let texels = self.photons / photons_per_texel.max(1e-9);
@@ -293,9 +293,9 @@ impl Kernel {
     }
 }
 
-/// What `image` holds per `share`, smoothed by a 2D kernel × a 1D kernel in c that keep flux, twice: what the first smoothing
-/// took away is smoothed and put back, so that the bias left is of fourth order in their width \[Tukey77\]. Texels of which
-/// there is little are so spoken for by those around them.
+/// What `image` holds per `share`, smoothed by a 2D kernel × a 1D kernel in c that keep flux, twice: what the first
+/// smoothing took away is smoothed and put back, so that the bias left is of fourth order in their width \[Tukey77\].
+/// Texels of which there is little are so spoken for by those around them.
 fn smooth_twice(image: &[DVec3], shares: &[f64], dims: [usize; 3], passes: [usize; 3]) -> Vec<DVec3> {
     let area = smooth(shares.iter().map(|&s| DVec3::splat(s)).collect(), dims, passes);
     let mean = |image: Vec<DVec3>| -> Vec<DVec3> {
@@ -318,8 +318,8 @@ fn widened(image: &[Option<DVec3>], dims: [usize; 3], outer: &(dyn Fn(usize) -> 
     (0..image.len()).into_par_iter().with_min_len(1024).map(|i| image[i].unwrap_or_else(|| mean(i))).collect()
 }
 
-/// Passes of ¼ ½ ¼ along each axis, to and fro between two images: where they are large, new memory for each takes as long as
-/// the pass.
+/// Passes of ¼ ½ ¼ along each axis, to and fro between two images: where they are large, new memory for each takes as
+/// long as the pass.
 fn smooth(mut image: Vec<DVec3>, dims: [usize; 3], passes: [usize; 3]) -> Vec<DVec3> {
     let mut next = vec![DVec3::ZERO; image.len()];
     for (axis, &count) in passes.iter().enumerate() {
@@ -364,8 +364,8 @@ mod tests {
         }
     }
 
-    /// Photons as dense everywhere on that part of the floor where h < c: it shows the same irradiance up to the line where
-    /// surfaces stand on it.
+    /// Photons as dense everywhere on that part of the floor where h < c: it shows the same irradiance up to the line
+    /// where surfaces stand on it.
     #[test]
     fn density_does_not_fall_off_where_surfaces_stand_on_walls() {
         let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::splat(0.125)).unwrap();

@@ -19,7 +19,8 @@ pub(super) struct Pools {
 }
 
 impl Pools {
-    /// Pools of flats that are as small as a texel of a wall with `across` of them: those around that look the same way.
+    /// Pools of flats that are as small as a texel of a wall with `across` of them: those around that look the same
+    /// way.
     pub(super) fn new(scene: &Scene, across: usize) -> Self {
         let origin = scene.bounds()[0];
         let small: Vec<(u32, Vec3, Vec3)> = (0u32..)

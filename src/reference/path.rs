@@ -127,9 +127,9 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
     }
 }
 
-/// Whether a ray from a level set meets a polygon where it starts, within the rounding of f32 coordinates. What leaves the
-/// polygon there starts on the level set, too: it must not begin behind it. (The polygon itself is no obstacle if it is met
-/// from its front only.)
+/// Whether a ray from a level set meets a polygon where it starts, within the rounding of f32 coordinates. What leaves
+/// the polygon there starts on the level set, too: it must not begin behind it. (The polygon itself is no obstacle if
+/// it is met from its front only.)
 pub(super) fn touches(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> bool {
     let Target::Polygon(id) = hit.target else { return false };
     let on_surface = matches!(ray.departure, Departure::Surface(_) | Departure::Companion(..));

@@ -122,8 +122,8 @@ impl MappedSurface {
 }
 
 impl SurfaceMap {
-    /// Maps the photons of one isovalue that were reflected at least once; `mesh` is its isosurface, `companions` are the
-    /// scenes seen from each companion with theirs.
+    /// Maps the photons of one isovalue that were reflected at least once; `mesh` is its isosurface, `companions` are
+    /// the scenes seen from each companion with theirs.
     pub fn new(
         scene: &Scene,
         mesh: &SurfaceMesh,
@@ -158,8 +158,8 @@ impl SurfaceMap {
     }
 
     /// Radiance that leaves the surface at `receiver`: direct light, and a final gather of `samples` rays that find
-    /// direct light by a shadow ray and the rest in the map. A hit nearer than its kernel reaches would bring the kernel's bias
-    /// whole (in a corner half of all rays find the same photons): such rays go on as paths. \[Jensen01\]
+    /// direct light by a shadow ray and the rest in the map. A hit nearer than its kernel reaches would bring the
+    /// kernel's bias whole (in a corner half of all rays find the same photons): such rays go on as paths. \[Jensen01\]
     pub fn outgoing<T: Tracer>(
         &self,
         scene: &Scene,
@@ -197,8 +197,9 @@ impl SurfaceMap {
         reflected(scene.surface.albedo.at(f64::from(receiver.isovalue)), direct + indirect) + scene.surface.emission
     }
 
-    /// Irradiance of reflected photons, and the kernel's radius r: Σ w K / ∫_A K dA with K = 1 − (d/r)², r the distance of the
-    /// k-th photon and A what lies within r, on the same side, with a similar normal, on mesh or polygon. 0 on caps.
+    /// Irradiance of reflected photons, and the kernel's radius r: Σ w K / ∫_A K dA with K = 1 − (d/r)², r the distance
+    /// of the k-th photon and A what lies within r, on the same side, with a similar normal, on mesh or polygon. 0 on
+    /// caps.
     #[allow(clippy::cast_possible_truncation, reason = "distances are f32")]
     pub fn irradiance(&self, scene: &Scene, at: &Receiver, scratch: &mut Neighbours) -> (DVec3, f64) {
         let world = scene.lattice().to_world(at.position.as_dvec3());

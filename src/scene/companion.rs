@@ -1,8 +1,8 @@
 //! Several fields in one scene: each hyperplane holds one level set of every field, at the same sweep parameter.
 //!
-//! A scene is *seen from* one of its fields: that field's index space is the local frame, so that rays and samples of it
-//! have the same bits as in a scene of its own. The others are its companions, with an affine map from the local frame
-//! to their index spaces; t is the same number in all of them.
+//! A scene is *seen from* one of its fields: that field's index space is the local frame, so that rays and samples of
+//! it have the same bits as in a scene of its own. The others are its companions, with an affine map from the local
+//! frame to their index spaces; t is the same number in all of them.
 
 use super::{Boundary, Scene, Surface, outward_normal};
 use crate::error::{Error, Result};
@@ -135,8 +135,8 @@ fn corners(lattice: &Lattice) -> [DVec3; 8] {
     std::array::from_fn(|n| lattice.far() * DVec3::new((n & 1) as f64, (n >> 1 & 1) as f64, (n >> 2) as f64))
 }
 
-/// The map from index space of `own` to that of `other`. What is an integer but for rounding becomes one, so that lattices
-/// that share planes share them exactly.
+/// The map from index space of `own` to that of `other`. What is an integer but for rounding becomes one, so that
+/// lattices that share planes share them exactly.
 fn between(own: &Lattice, other: &Lattice) -> (DMat3, DVec3) {
     let snap = |v: DVec3| DVec3::select((v - v.round()).abs().cmplt(DVec3::splat(1e-9)), v.round(), v);
     let column = |a: usize| snap(other.direction_to_index(own.axes().col(a)));
@@ -147,8 +147,8 @@ impl Scene {
     /// Puts a scene of several fields together, seen from the first.
     ///
     /// # Errors
-    /// As [`Scene::new`], for each field; `Invalid` without fields, with too many, or with names that are missing or occur
-    /// twice.
+    /// As [`Scene::new`], for each field; `Invalid` without fields, with too many, or with names that are missing or
+    /// occur twice.
     pub fn with_members(members: Vec<Member>, policy: Policy, polygons: Vec<Polygon>) -> Result<Self> {
         if members.is_empty() || members.len() > 1 + usize::from(MAX_COMPANIONS) {
             return Err(Error::Invalid(format!("{} volumes: 1 to {} are possible", members.len(), 1 + MAX_COMPANIONS)));
@@ -230,8 +230,8 @@ impl Scene {
         Self::seen(self.members(), number, self.policy, self.polygons.clone()).expect("it was checked when it was made")
     }
 
-    /// The scene in which the light of field `number` is computed: seen from it, and without the others if the policy says
-    /// so.
+    /// The scene in which the light of field `number` is computed: seen from it, and without the others if the policy
+    /// says so.
     #[must_use]
     pub fn lit(&self, number: usize) -> Self {
         if self.policy == Policy::Joint {

@@ -1,5 +1,5 @@
-//! Luminaires that hang so closely before a wall that nothing fits between: what they hide of it lights nothing, and is no part of what its
-//! texels show beside them.
+//! Luminaires that hang so closely before a wall that nothing fits between: what they hide of it lights nothing, and is
+//! no part of what its texels show beside them.
 
 use super::Scene;
 use crate::polygon::Polygon;
@@ -17,8 +17,8 @@ pub(crate) fn voxel_along(lattice: &Lattice, polygon: &Polygon) -> (usize, f64) 
 }
 
 impl Scene {
-    /// The wall less than a quarter of a voxel behind all of luminaire `number`, if it faces where that faces and the luminaire's back is
-    /// opaque.
+    /// The wall less than a quarter of a voxel behind all of luminaire `number`, if it faces where that faces and the
+    /// luminaire's back is opaque.
     #[allow(clippy::cast_possible_truncation, reason = "fewer than 2¹⁶ polygons")]
     pub fn covered_wall(&self, number: u32) -> Option<u32> {
         let light = &self.polygons()[number as usize];

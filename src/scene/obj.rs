@@ -1,4 +1,5 @@
-//! Walls, luminaires and context geometry from a Wavefront OBJ with MTL, through tobj: Kd is the albedo, Ke the emission.
+//! Walls, luminaires and context geometry from a Wavefront OBJ with MTL, through tobj: Kd is the albedo, Ke the
+//! emission.
 
 use super::mtl;
 use crate::error::{Error, Result};
@@ -46,8 +47,8 @@ impl Default for Placement {
     }
 }
 
-/// Reads all faces as polygons with two faces each ([`Polygon::both_faces`]). Faces that are not planar and convex are split into
-/// triangles; those without an area are left out.
+/// Reads all faces as polygons with two faces each ([`Polygon::both_faces`]). Faces that are not planar and convex are
+/// split into triangles; those without an area are left out.
 ///
 /// # Errors
 /// `Io` if the OBJ or its MTL cannot be read; `Invalid` if no face has an area, for coordinates that are not finite,

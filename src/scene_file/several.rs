@@ -66,8 +66,8 @@ pub enum PolicyName {
     Independent,
 }
 
-/// One `[[volume]]`: where it comes from, its isovalues and its material. What is not set comes from the file's top level
-/// and `[surface]`.
+/// One `[[volume]]`: where it comes from, its isovalues and its material. What is not set comes from the file's top
+/// level and `[surface]`.
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
 pub struct VolumeEntry {
@@ -149,7 +149,8 @@ impl VolumeEntry {
         Ok(Member { name: self.name.clone(), field: field.into(), surface, boundary })
     }
 
-    /// The isosurface of a volume that is held at `isovalue`, as triangles with two faces that stand in every hyperplane.
+    /// The isosurface of a volume that is held at `isovalue`, as triangles with two faces that stand in every
+    /// hyperplane.
     #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
     fn standing(&self, isovalue: f64, volume: &Volume, file: &SceneFile) -> Result<Vec<Polygon>> {
         if self.isovalues.is_some() {

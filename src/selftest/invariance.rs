@@ -326,7 +326,8 @@ pub fn bakes(count: u64, device: &Device, progress: Progress) -> Result<Vec<Case
     Ok(cases)
 }
 
-/// |t| that Student's t of `dof` degrees exceeds with probability `p`: the normal quantile by Cornish–Fisher \[AS72 26.7.5\].
+/// |t| that Student's t of `dof` degrees exceeds with probability `p`: the normal quantile by Cornish–Fisher
+/// \[AS72 26.7.5\].
 fn student_limit(p: f64, dof: u64) -> f64 {
     let (x, n) = (normal_quantile(p), dof as f64);
     let (x3, x5, x7) = (x.powi(3), x.powi(5), x.powi(7));

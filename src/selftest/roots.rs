@@ -18,8 +18,8 @@ use glam::DVec3;
 /// Bound on |p(t)| / (ε Σ|c_i| tⁱ) of a cubic's root, unless the sign changes within [`ULPS`].
 const CUBIC_BOUND: f64 = 8.0;
 
-/// Bound on |h(x(t)) − c| / (ε max(|s|, |c|)) of a cell's root, unless the sign changes within [`ULPS`]: the rounding of
-/// the cubic's own coefficients is part of it.
+/// Bound on |h(x(t)) − c| / (ε max(|s|, |c|)) of a cell's root, unless the sign changes within [`ULPS`]: the rounding
+/// of the cubic's own coefficients is part of it.
 const CELL_BOUND: f64 = 8.0;
 
 /// Steps of f64 around a root within which the sign may change.

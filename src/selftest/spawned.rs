@@ -1,8 +1,8 @@
 //! Rays that leave the surface they start on: they must not find their own start again, and those that go inside a
 //! closed level set must not get out unseen.
 //!
-//! The judge divides the known root t = 0 out of the exact polynomial of the first cell: what is left, a quadratic, says
-//! in double-double whether a hit in that cell is real. Beyond the first cell a hit must be a zero of h − c.
+//! The judge divides the known root t = 0 out of the exact polynomial of the first cell: what is left, a quadratic,
+//! says in double-double whether a hit in that cell is real. Beyond the first cell a hit must be a zero of h − c.
 
 use super::double::Double;
 use super::watertight::{closed, start};
@@ -183,7 +183,8 @@ fn spawn<T: Tracer>(kind: &Kind, tracer: &T, index: u64) -> Option<(FlattenedRay
     let first = scene.ray(origin, warp::sphere(rng.unit2()) * lattice.spacing().x, c, Departure::Free);
     let hit = tracer.intersect(&first)?;
     let origin = first.at(hit.t).as_vec3();
-    // The shell is 0: below 0 no level set is closed, and rounding to f32 may have left the surface by a lot where it is steep.
+    // The shell is 0: below 0 no level set is closed, and rounding to f32 may have left the surface by a lot where it
+    // is steep.
     let here = scene.field.value(origin.as_dvec3());
     if !(here > 0.0) || !(0..3).all(|a| f64::from(origin[a]) >= 0.0 && f64::from(origin[a]) <= lattice.far()[a]) {
         return None;

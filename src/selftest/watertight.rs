@@ -145,7 +145,8 @@ fn ray(class: &Class, index: u64, fixed: Option<f32>) -> Option<FlattenedRay> {
     Some(FlattenedRay::free(origin, direction, c))
 }
 
-/// Whether h ≥ c at `origin` by exact arithmetic, and not within the rounding of an f64 evaluation unless h = c exactly.
+/// Whether h ≥ c at `origin` by exact arithmetic, and not within the rounding of an f64 evaluation unless h = c
+/// exactly.
 fn inside(scene: &Scene, origin: Vec3, c: f32) -> bool {
     let (cell, u) = scene.field.locate(origin.as_dvec3());
     let corners = scene.field.corners(cell);

@@ -47,10 +47,11 @@ struct Cloud<'a> {
     reach: Vec3,
 }
 
-/// Smooths the irradiance of scattered places whose two `halves` are given by their number, and returns it by that number.
-/// Places share light if their normals agree and their isovalues differ by `tau` at most, or by what h rises in half a step of
-/// the lattice where that is more: a steep edge has few places of one isovalue. Places without light (NaN) or without a normal
-/// take no part and stay 0. 80 bytes per place. The same bits on any number of threads. None once `tick` says stop.
+/// Smooths the irradiance of scattered places whose two `halves` are given by their number, and returns it by that
+/// number. Places share light if their normals agree and their isovalues differ by `tau` at most, or by what h rises in
+/// half a step of the lattice where that is more: a steep edge has few places of one isovalue. Places without light
+/// (NaN) or without a normal take no part and stay 0. 80 bytes per place. The same bits on any number of threads. None
+/// once `tick` says stop.
 #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
 pub fn smooth_scattered(
     scene: &Scene,
@@ -179,7 +180,8 @@ mod tests {
     use crate::scene::{Boundary, Surface};
     use crate::volume::{Samples, Volume};
 
-    /// Four places about most points of three in four planes of x, where h rises by `slope` a step from x = 0 and falls from x = 8 on.
+    /// Four places about most points of three in four planes of x, where h rises by `slope` a step from x = 0 and falls
+    /// from x = 8 on.
     struct Steep {
         scene: Scene,
         owners: NodeSet,

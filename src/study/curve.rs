@@ -28,7 +28,8 @@ struct Candidate {
     options: BakeOptions,
 }
 
-/// The photon engine over photons × samples × gather rays × strategy, and the sweep engine over directions × luminaire points.
+/// The photon engine over photons × samples × gather rays × strategy, and the sweep engine over directions × luminaire
+/// points.
 fn candidates(quick: bool) -> Vec<Candidate> {
     let photons: &[u64] = if quick { &[1 << 17, 1 << 19] } else { &[1 << 17, 1 << 19, 1 << 21] };
     let samples: &[u64] = if quick { &[10_000, 100_000] } else { &[100_000, 1_000_000] };

@@ -41,10 +41,10 @@ const COLUMNS: [&str; 26] = [
     "job",
 ];
 
-/// Each data set at its main isovalue: straight from the map, with uniform samples as BB09 and with samples at the nodes;
-/// samples at the nodes with final gather, and the sweep engine (or those of the engine that `base` names); the
-/// interpolation floor of direct light at grid factors 1, 2, 3, and of all light at that of the bakes (1 if their grid is given
-/// in points); the reference on triangles against the one on the trilinear surface.
+/// Each data set at its main isovalue: straight from the map, with uniform samples as BB09 and with samples at the
+/// nodes; samples at the nodes with final gather, and the sweep engine (or those of the engine that `base` names); the
+/// interpolation floor of direct light at grid factors 1, 2, 3, and of all light at that of the bakes (1 if their grid
+/// is given in points); the reference on triangles against the one on the trilinear surface.
 ///
 /// # Errors
 /// As bakes, references and tables.
@@ -151,8 +151,8 @@ fn reference_picture(study: &Study, scene: &Scene, isovalue: f32) -> Result<f64>
     Ok(begun.elapsed().as_secs_f64())
 }
 
-/// The bake's own noise at the reference's vertices, percent RMS over three channels: what `std_error` says, interpolated
-/// as if neighbouring points erred alike, so at most this.
+/// The bake's own noise at the reference's vertices, percent RMS over three channels: what `std_error` says,
+/// interpolated as if neighbouring points erred alike, so at most this.
 fn noise(bake: &Bake, reference: &ReferenceMesh) -> f64 {
     let grid = &bake.sides[0].1;
     let errors = IlluminationGrid {

@@ -15,9 +15,9 @@ const GAP: usize = 8;
 /// Samples drawn: more would cover the panel.
 const DRAWN: u64 = 40_000;
 
-/// Writes `figure6-<subject>-<strategy>.png`: seen along +y, with z up, samples coloured by their radiance (left), a slice
-/// through the illumination grid at 0.4 of its depth (middle), the isosurface reported first (right). The bake's grid
-/// must be the volume's.
+/// Writes `figure6-<subject>-<strategy>.png`: seen along +y, with z up, samples coloured by their radiance (left), a
+/// slice through the illumination grid at 0.4 of its depth (middle), the isosurface reported first (right). The bake's
+/// grid must be the volume's.
 ///
 /// # Errors
 /// As rendering; `Io`.

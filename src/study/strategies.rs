@@ -33,8 +33,8 @@ const STRATEGIES: [(StrategyName, &str); 4] = [
     (StrategyName::Nodes, "nodes"),
 ];
 
-/// Error of the strategies at 10⁵, 10⁶ and 10⁷ samples over the whole sweep, and Figure 6 at 10⁶. `nodes` takes its samples
-/// at the points of a grid as fine as they allow; the others interpolate onto the volume's lattice.
+/// Error of the strategies at 10⁵, 10⁶ and 10⁷ samples over the whole sweep, and Figure 6 at 10⁶. `nodes` takes its
+/// samples at the points of a grid as fine as they allow; the others interpolate onto the volume's lattice.
 ///
 /// # Errors
 /// `Invalid` if a subject has no surface at any isovalue that is compared; as bakes, references and tables.
@@ -148,8 +148,8 @@ fn is_in_table(subject: &Subject, isovalue: f64) -> bool {
     [35.0, 47.0, 80.0].iter().any(|c| subject.at((c - 3.6) / 91.4) == isovalue)
 }
 
-/// Level sets of strategy 1, the middles between them, 35, 47 and 80 of [3.6, 95], and a regular comb, where there is a surface;
-/// source units, increasing.
+/// Level sets of strategy 1, the middles between them, 35, 47 and 80 of [3.6, 95], and a regular comb, where there is a
+/// surface; source units, increasing.
 ///
 /// # Errors
 /// `Invalid` if there is none.

@@ -11,7 +11,8 @@ pub(super) struct Blockers {
 }
 
 impl Blockers {
-    /// Polygons that can hide luminaire `light` from a point of `receivers`: all but those that everything is in front of.
+    /// Polygons that can hide luminaire `light` from a point of `receivers`: all but those that everything is in front
+    /// of.
     pub(super) fn new(scene: &Scene, light: u32, receivers: &[DVec3]) -> Self {
         let source = &scene.polygons()[light as usize];
         let polygons = scene.polygons().iter().enumerate().filter_map(|(i, p)| {

@@ -28,8 +28,8 @@ pub(super) fn clearance(scene: &Scene, geometry: &Geometry, sides: &[Side]) -> O
     (!inside).then(|| Clearance::new(geometry))
 }
 
-/// Direct irradiance of every node, one set of planes per side in `sides`; that of the flats is added to theirs at the end.
-/// `tick` is asked before every point; false stops.
+/// Direct irradiance of every node, one set of planes per side in `sides`; that of the flats is added to theirs at the
+/// end. `tick` is asked before every point; false stops.
 #[allow(clippy::cast_possible_truncation, reason = "irradiance is f32")]
 pub(super) fn direct(
     scene: &Scene,
@@ -210,7 +210,8 @@ fn walls(
             let mut rng = Rng::stream(part.seed, Stage::Sweep, stream ^ 1 << 63);
             // Number of isovalue texels at or below h.
             let below = |h: f32| ((h * nc as f32 + 0.5).floor().max(0.0) as usize).min(nc);
-            // Σ g of what begins at each isovalue texel on the lower side, and of what ends before it on the higher one.
+            // Σ g of what begins at each isovalue texel on the lower side, and of what ends before it on the higher
+            // one.
             let (mut lit, mut all) = (Staircases::new(nc), Staircases::new(nc));
             for points in points.chunks(LANES) {
                 let mut segments = Segments::NONE;

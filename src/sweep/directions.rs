@@ -1,4 +1,5 @@
-//! Families of parallel lines: a world direction as a shear of the lattice, and the low-discrepancy sets they come from.
+//! Families of parallel lines: a world direction as a shear of the lattice, and the low-discrepancy sets they come
+//! from.
 
 use crate::rng::{Rng, Sobol, Stage};
 use crate::volume::Lattice;
@@ -64,7 +65,8 @@ impl Shear {
         Self { layout, omega, slope: [d[u] / d[a], d[v] / d[a]], offset, area }
     }
 
-    /// Whole and broken part of the offset of slice `k` along u (0) or v (1): line p runs through cell column p + whole.
+    /// Whole and broken part of the offset of slice `k` along u (0) or v (1): line p runs through cell column p +
+    /// whole.
     #[inline]
     #[allow(clippy::cast_possible_truncation, reason = "a few thousand cells")]
     pub(super) fn shift(&self, axis: usize, k: f64) -> (isize, f64) {
@@ -73,10 +75,10 @@ impl Shear {
     }
 }
 
-/// `directions`/2 lines, low-discrepancy and uniform over the projective sphere in **world** space, each family with its
-/// own lattice offset: a Fibonacci lattice of the hemisphere \[Marques13\], turned at random. Sets of different `index`
-/// are independent; the `parts` of one are interleaved, and together as well distributed as one set of that many more.
-/// The first 2, 4, 8 … parts of a power of two of them are evenly spread, too.
+/// `directions`/2 lines, low-discrepancy and uniform over the projective sphere in **world** space, each family with
+/// its own lattice offset: a Fibonacci lattice of the hemisphere \[Marques13\], turned at random. Sets of different
+/// `index` are independent; the `parts` of one are interleaved, and together as well distributed as one set of that
+/// many more. The first 2, 4, 8 … parts of a power of two of them are evenly spread, too.
 #[allow(clippy::cast_possible_truncation, reason = "at most 2³¹ directions")]
 pub(super) fn lines(
     lattice: &Lattice,
@@ -138,8 +140,8 @@ mod tests {
         assert!((total / 128.0 - 1.0 / 3.0).abs() < 1e-2, "uniform over the sphere: {total}");
     }
 
-    /// The largest distance of any direction to the nearest line of a set: 2.3/√n for a good one, three times that for a
-    /// random one.
+    /// The largest distance of any direction to the nearest line of a set: 2.3/√n for a good one, three times that for
+    /// a random one.
     #[test]
     fn parts_of_a_set_cover_the_sphere_together() {
         let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::ONE).unwrap();

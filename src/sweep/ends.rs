@@ -198,9 +198,9 @@ impl Ends {
         self.met.iter().filter(met).map(move |m| (m.stop(p, q, at(&m.tau, p, q), m.front_plus), !m.front_plus))
     }
 
-    /// The luminaires that cut line (p, q) between `from` and `to`, in order of τ: how each looks from before and behind, and the τ
-    /// behind whose slice it cuts. Surfaces between a luminaire and the last slice in front of it are read at the one behind if that is
-    /// nearer, and shows what is in front.
+    /// The luminaires that cut line (p, q) between `from` and `to`, in order of τ: how each looks from before and
+    /// behind, and the τ behind whose slice it cuts. Surfaces between a luminaire and the last slice in front of it are
+    /// read at the one behind if that is nearer, and shows what is in front.
     pub(super) fn cuts(&self, p: f64, q: f64, from: f64, to: f64, out: &mut Vec<(f64, [Stop; 2])>) {
         out.clear();
         for m in self.met.iter().filter(|m| m.standing.place != Place::Outside) {

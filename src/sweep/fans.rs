@@ -1,5 +1,5 @@
-//! Fans of lines from a luminaire's point through every slice of the lattice: along each the running extrema of h tell which
-//! samples see the point on their own level set.
+//! Fans of lines from a luminaire's point through every slice of the lattice: along each the running extrema of h tell
+//! which samples see the point on their own level set.
 
 use super::directions::Layout;
 use super::grid::{Blocks, Geometry};
@@ -116,7 +116,8 @@ impl Fan {
             if lo >= hi {
                 continue;
             }
-            // The row of lines lies between two rows of samples: mixed once, for near slices hold many lines per sample.
+            // The row of lines lies between two rows of samples: mixed once, for near slices hold many lines per
+            // sample.
             let (i0, i1) =
                 (((u0 + lo as f32 * du).max(0.0) as usize).min(nu - 2), ((u0 + hi as f32 * du) as usize + 2).min(nu));
             let (near, far) = (&h[k * sa + j * sv..][i0..i1], &h[k * sa + (j + 1) * sv..][i0..i1]);
@@ -127,7 +128,8 @@ impl Fan {
         }
     }
 
-    /// The share of the four lines around local `x` that see the source at their own isovalue there: lower, higher side.
+    /// The share of the four lines around local `x` that see the source at their own isovalue there: lower, higher
+    /// side.
     #[inline]
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the fan")]
     fn visibility(&self, seen: &[u8], turn: u8, x: [f64; 3]) -> Option<[f32; 2]> {
@@ -165,9 +167,9 @@ pub(super) struct Fans {
 }
 
 impl Fans {
-    /// Marches along all lines of the fans of local point `y`, where h is `start`, side by side: the rows of one fan alone are too few
-    /// for threads to share well. They take the place of another point's: most of the lines of the widest miss Ω, and memory that
-    /// is new, or cleared, for every point would be written as a whole.
+    /// Marches along all lines of the fans of local point `y`, where h is `start`, side by side: the rows of one fan
+    /// alone are too few for threads to share well. They take the place of another point's: most of the lines of the
+    /// widest miss Ω, and memory that is new, or cleared, for every point would be written as a whole.
     pub(super) fn march(&mut self, (geometry, isa, sides): (&Geometry, Isa, &[Side]), y: DVec3, start: f32) {
         self.source = y;
         self.fans = std::array::from_fn(|f| Fan::new(geometry.dims, y, f % 3, f >= 3));
@@ -202,8 +204,8 @@ impl Fans {
         );
     }
 
-    /// The share of the four lines around local `x` that see the source at their own isovalue there: lower, higher side. `None`
-    /// where no line passes.
+    /// The share of the four lines around local `x` that see the source at their own isovalue there: lower, higher
+    /// side. `None` where no line passes.
     #[inline(always)]
     pub(super) fn visibility(&self, x: [f64; 3]) -> Option<[f32; 2]> {
         let y = self.source;
@@ -219,8 +221,8 @@ fn join(a: (usize, usize), b: (usize, usize)) -> (usize, usize) {
     (a.0.min(b.0), a.1.max(b.1))
 }
 
-/// What lines from number `start` on see that meet u = place\[0\] + n · place\[1\] (line n) in a row of samples, in this turn;
-/// takes the row into their extrema.
+/// What lines from number `start` on see that meet u = place\[0\] + n · place\[1\] (line n) in a row of samples, in
+/// this turn; takes the row into their extrema.
 #[inline(always)]
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the row")]
 pub(super) fn march_row(

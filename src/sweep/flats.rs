@@ -206,8 +206,8 @@ impl Flats {
         flat.map_or(0, |(flat, uv)| self.places(flat, &uv.map(|x| [x]), &[random])[0])
     }
 
-    /// Where in [`Flats::packed`] the B over isovalues starts at points of a flat: that of one of the four texels around
-    /// each, as likely (over `random` ∈ [0, 1)) as bilinear interpolation weighs it.
+    /// Where in [`Flats::packed`] the B over isovalues starts at points of a flat: that of one of the four texels
+    /// around each, as likely (over `random` ∈ [0, 1)) as bilinear interpolation weighs it.
     #[inline(always)]
     #[allow(clippy::cast_possible_truncation, reason = "textures hold fewer than 2³² numbers")]
     pub(super) fn places<const N: usize>(&self, flat: u32, uv: &[[f32; N]; 2], random: &[f32; N]) -> [u32; N] {
@@ -216,7 +216,8 @@ impl Flats {
         for l in 0..N {
             let [a, b, c, d] = around(texture.dims, [uv[0][l], uv[1][l]]);
             let left = [random[l] - a.1, random[l] - a.1 - b.1, random[l] - a.1 - b.1 - c.1];
-            // Selected from the last to the first: an end at the first that fits would be a branch that nobody can foretell.
+            // Selected from the last to the first: an end at the first that fits would be a branch that nobody can
+            // foretell.
             let mut texel = d.0;
             texel = if left[2] < 0.0 { c.0 } else { texel };
             texel = if left[1] < 0.0 { b.0 } else { texel };
@@ -239,8 +240,8 @@ impl Flats {
         self.reflect(false);
     }
 
-    /// As [`Flats::reflect`] while light settles, the defect included: goes ω times as far from what was before the pass's light, which is
-    /// kept for the next one. \[GV61\]
+    /// As [`Flats::reflect`] while light settles, the defect included: goes ω times as far from what was before the
+    /// pass's light, which is kept for the next one. \[GV61\]
     pub(super) fn settle(&mut self, omega: [f32; 3]) {
         let light: Vec<Option<Vec<f32>>> =
             self.textures.iter().map(|t| t.as_ref().map(|t| t.radiance.clone())).collect();
@@ -265,7 +266,8 @@ impl Flats {
         self.textures.iter().flatten().map(|t| t.indirect.clone()).collect()
     }
 
-    /// Keeps what the last pass brought more than `few` directions: while light settles it is added to what a pass brings.
+    /// Keeps what the last pass brought more than `few` directions: while light settles it is added to what a pass
+    /// brings.
     pub(super) fn correct(&mut self, few: Vec<Vec<f32>>) {
         for (t, mut defect) in self.textures.iter_mut().flatten().zip(few) {
             defect.iter_mut().zip(&t.indirect).for_each(|(x, y)| *x = y - *x);

@@ -77,8 +77,8 @@ struct Family<'a> {
 
 impl Pass<'_> {
     /// Irradiance of every node of `side` from the radiance `b` of the nodes (times `scale`) and the flats, along all
-    /// `lines` and both their directions. Flats receive too. `tick` is asked before every family; false stops with what is
-    /// done.
+    /// `lines` and both their directions. Flats receive too. `tick` is asked before every family; false stops with what
+    /// is done.
     #[allow(clippy::too_many_arguments, reason = "one caller")]
     pub(super) fn gather(
         &self,
@@ -144,7 +144,8 @@ impl Pass<'_> {
             });
     }
 
-    /// All lines of one family, both ways. `before` is what the last family brought to walls; returns what this one does.
+    /// All lines of one family, both ways. `before` is what the last family brought to walls; returns what this one
+    /// does.
     fn family(
         &self,
         (side, shear, lines): (Side, &Shear, usize),
@@ -198,8 +199,9 @@ impl Pass<'_> {
         }
     }
 
-    /// The rows q = `first` … of lines that thread `own` gets: their light to the nodes between each and the one before, and
-    /// to walls. Only for a row that does not follow the thread's last one the one before is walked through again.
+    /// The rows q = `first` … of lines that thread `own` gets: their light to the nodes between each and the one
+    /// before, and to walls. Only for a row that does not follow the thread's last one the one before is walked through
+    /// again.
     fn rows_of_lines(
         &self,
         family: &Family,
@@ -270,8 +272,8 @@ impl Pass<'_> {
         }
     }
 
-    /// A row of nodes, which memory is asked for with what else [`Self::accumulate`] reads. It may be held beside the one before: no
-    /// other row of lines adds to either.
+    /// A row of nodes, which memory is asked for with what else [`Self::accumulate`] reads. It may be held beside the
+    /// one before: no other row of lines adds to either.
     fn ask<'r, 'e>(&self, family: &Family, rows: &'r Rows<'e>, [k, j]: [usize; 2]) -> MutexGuard<'r, Row<'e>> {
         let layout = &family.plan.shear.layout;
         let at = k * layout.stride[1] + j * layout.stride[0];
@@ -284,8 +286,8 @@ impl Pass<'_> {
         row
     }
 
-    /// Adds what a row of lines and the one before it brought to a row of nodes: each node takes its four nearest lines by
-    /// bilinear weights, which go on linearly on Ω's faces ([`inwards`]), times the cosine of its own normal.
+    /// Adds what a row of lines and the one before it brought to a row of nodes: each node takes its four nearest lines
+    /// by bilinear weights, which go on linearly on Ω's faces ([`inwards`]), times the cosine of its own normal.
     fn accumulate(&self, family: &Family, light: [&RowLight; 2], row: &mut Row, [k, j]: [usize; 2]) {
         let plan = family.plan;
         let layout = &plan.shear.layout;

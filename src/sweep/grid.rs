@@ -1,5 +1,5 @@
-//! The lattice's share of the sweep: h and normals as lines read them, which nodes are lit, and the filling of those without
-//! a surface.
+//! The lattice's share of the sweep: h and normals as lines read them, which nodes are lit, and the filling of those
+//! without a surface.
 
 use super::directions::Layout;
 use super::half::{Half4, decode, encode};
@@ -14,8 +14,8 @@ use rayon::prelude::*;
 
 /// What every pass reads: h in both memory orders, and the receiver normals towards the lower side.
 ///
-/// Nodes are *lit* that hold a surface of the sweep, and those just outside the sweep, whose own light is a better neighbour to
-/// interpolate with than a copy.
+/// Nodes are *lit* that hold a surface of the sweep, and those just outside the sweep, whose own light is a better
+/// neighbour to interpolate with than a copy.
 pub(super) struct Geometry<'a> {
     pub dims: [usize; 3],
     pub h: &'a [f32],
@@ -44,7 +44,8 @@ impl Blocks {
         Self { size, reciprocal: (1usize << 32).div_ceil(size), rows }
     }
 
-    /// The blocks of nodes that `is` holds, in rows of `nu`; those of neighbours along the row, up to `reach`, count too.
+    /// The blocks of nodes that `is` holds, in rows of `nu`; those of neighbours along the row, up to `reach`, count
+    /// too.
     fn along(nu: usize, rows: usize, (size, reach): (usize, usize), is: impl Fn(usize) -> bool + Sync) -> Self {
         let holds = |row: usize, block: usize| {
             let (a, b) = ((block * size).saturating_sub(reach), ((block + 1) * size + reach).min(nu));

@@ -1,5 +1,5 @@
-//! Radiance in half precision: four numbers a node (red, green, blue, nothing) in eight bytes, which one load of a gather
-//! fetches. Numbers are not negative; those below 2⁻¹⁴ are 0, so that no instruction meets a subnormal.
+//! Radiance in half precision: four numbers a node (red, green, blue, nothing) in eight bytes, which one load of a
+//! gather fetches. Numbers are not negative; those below 2⁻¹⁴ are 0, so that no instruction meets a subnormal.
 
 /// Red, green, blue and 0.
 pub(super) type Half4 = [u16; 4];

@@ -1,5 +1,6 @@
-//! Nodes next to a luminaire, nearer to it than its points are to each other: of points that all nodes share one or two would give such
-//! a node most of its light. Each looks at points of its own instead, spread over the solid angle, along segments.
+//! Nodes next to a luminaire, nearer to it than its points are to each other: of points that all nodes share one or two
+//! would give such a node most of its light. Each looks at points of its own instead, spread over the solid angle,
+//! along segments.
 
 use super::blockers::Blockers;
 use super::grid::Geometry;
@@ -16,8 +17,8 @@ use crate::scene::Scene;
 use glam::DVec3;
 use rayon::prelude::*;
 
-/// Replaces \[Σ V g, Σ g\] of the nodes near luminaire `number` (`sums`: per node, per side) by those of points of their own: as many
-/// as a replicate has.
+/// Replaces \[Σ V g, Σ g\] of the nodes near luminaire `number` (`sums`: per node, per side) by those of points of
+/// their own: as many as a replicate has.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice; sums are f32")]
 pub(super) fn look(
     (scene, geometry, isa): (&Scene, &Geometry, Isa),

@@ -1,5 +1,5 @@
-//! The share of a luminaire outside the matter. A luminaire may stand in the volume; then part of it lies within the solid of an
-//! isovalue, and how much its points say of that is the same error at all receivers.
+//! The share of a luminaire outside the matter. A luminaire may stand in the volume; then part of it lies within the
+//! solid of an isovalue, and how much its points say of that is the same error at all receivers.
 
 use crate::field::Field;
 use crate::flattened::Side;
@@ -59,7 +59,8 @@ mod tests {
     use crate::rng::Stage;
     use crate::volume::{Lattice, Samples, Volume};
 
-    /// h = x on the unit cube, a luminaire from x = 0.5 to 1.5 across its face: at isovalue c the part c < x < 1 lies in the solid.
+    /// h = x on the unit cube, a luminaire from x = 0.5 to 1.5 across its face: at isovalue c the part c < x < 1 lies
+    /// in the solid.
     #[test]
     fn shares_follow_from_the_field_on_the_luminaire() {
         let lattice = Lattice::aligned([11; 3], DVec3::ZERO, DVec3::splat(0.1)).unwrap();

@@ -1,4 +1,5 @@
-//! Sixteen neighbouring lines in lock-step: h and B along them, what they end on, and the next value ≥ h of every sample.
+//! Sixteen neighbouring lines in lock-step: h and B along them, what they end on, and the next value ≥ h of every
+//! sample.
 
 #![allow(clippy::needless_range_loop, reason = "a channel indexes several planes at once")]
 
@@ -168,12 +169,12 @@ pub(super) struct Way {
 /// line's entry and exit through Ω's sides stand in the rows before its first and after its last slice.
 pub(super) struct Pack {
     pub h: Vec<Lanes>,
-    /// Which node's B stands for that of each sample: per row one of the four around the line, each as likely as bilinear
-    /// interpolation weighs it. Neighbouring nodes differ little and every ray meets others, so that the mean is what
-    /// interpolation gives at a quarter of the work.
+    /// Which node's B stands for that of each sample: per row one of the four around the line, each as likely as
+    /// bilinear interpolation weighs it. Neighbouring nodes differ little and every ray meets others, so that the mean
+    /// is what interpolation gives at a quarter of the work.
     pub node: Vec<[u32; LANES]>,
-    /// Per direction (+, −), the number 16 · row + lane of the sample that the ray from each sample meets, and h there; from
-    /// [`Pack::ends`] on the place of an end in [`Flats::packed`], and ∞.
+    /// Per direction (+, −), the number 16 · row + lane of the sample that the ray from each sample meets, and h there;
+    /// from [`Pack::ends`] on the place of an end in [`Flats::packed`], and ∞.
     pub next: [Vec<[u32; LANES]>; 2],
     pub h_next: [Vec<Lanes>; 2],
     /// The rows that were read, ascending: all that reach the sweep. In the others, but the first and the last, h is
@@ -459,8 +460,8 @@ impl Pack {
     /// For every sample, the radiance that its ray meets which leaves downhill: B where h is first back at the sample's
     /// value, or what stands at the end. \[BSV93: all nearest greater values, one line per lane\]
     ///
-    /// Uphill the ray of the same line runs inside the solid; which way is downhill tells the neighbouring samples, as the
-    /// receiver normal does. Writes slice k to `out` at k · width + start.
+    /// Uphill the ray of the same line runs inside the solid; which way is downhill tells the neighbouring samples, as
+    /// the receiver normal does. Writes slice k to `out` at k · width + start.
     pub(super) fn scan(&mut self, way: Way, light: Light, out: &mut [Vec<f32>], place: (usize, usize)) {
         self.link(way, true);
         self.link(way, false);
@@ -497,8 +498,8 @@ impl Pack {
         }
     }
 
-    /// Calls `close` with the lanes of which cuts close what lies beyond them when a scan comes to `row`, and the place of
-    /// what they show. Rows between that were not read count.
+    /// Calls `close` with the lanes of which cuts close what lies beyond them when a scan comes to `row`, and the place
+    /// of what they show. Rows between that were not read count.
     #[inline(always)]
     pub(super) fn close(&self, row: usize, forward: bool, mut close: impl FnMut(usize, u32)) {
         if self.cuts.is_empty() {

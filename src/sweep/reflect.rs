@@ -11,9 +11,10 @@ use crate::scene::Scene;
 use glam::DVec3;
 use rayon::prelude::*;
 
-/// What a line reads at a hit is one of the four nodes around it on the nearer slice, drawn with bilinear weights. Over all places in
-/// a cell linear interpolation exceeds E by E″/12 along both axes of the slice, and the nearest slice falls short by E″/24; with every
-/// axis in turn across, E + ∇²E/24 is read: this much is taken off before. \[Condat05\]
+/// What a line reads at a hit is one of the four nodes around it on the nearer slice, drawn with bilinear weights. Over
+/// all places in a cell linear interpolation exceeds E by E″/12 along both axes of the slice, and the nearest slice
+/// falls short by E″/24; with every axis in turn across, E + ∇²E/24 is read: this much is taken off before.
+/// \[Condat05\]
 const SHARPENING: f32 = 1.0 / 24.0;
 
 /// What nodes reflect.
@@ -55,9 +56,9 @@ impl<'a> Mirror<'a> {
     }
 
     /// B = Le + ρ/π Σ scale · irradiance of the sides, sharpened, and filled where no surface is; packs the flats too.
-    /// `light`: one or two sets of irradiance, each with its scale; `memory`: of the same form, or empty. While light settles
-    /// there is also what the pass read, and ω ≥ 1: the result goes ω times as far from `memory`, which was there before that.
-    /// Returns sums of B itself, too.
+    /// `light`: one or two sets of irradiance, each with its scale; `memory`: of the same form, or empty. While light
+    /// settles there is also what the pass read, and ω ≥ 1: the result goes ω times as far from `memory`, which was
+    /// there before that. Returns sums of B itself, too.
     #[allow(clippy::cast_possible_truncation, reason = "albedo and emission")]
     pub(super) fn reflect(
         &self,
@@ -169,8 +170,8 @@ pub(super) struct Job<'a> {
     memory: f32,
 }
 
-/// What nodes of a row reflect on side `s`, into `b`. `beside` are the numbers of the row and of those around it, of which `rows` tell what
-/// is shown.
+/// What nodes of a row reflect on side `s`, into `b`. `beside` are the numbers of the row and of those around it, of
+/// which `rows` tell what is shown.
 #[inline(always)]
 pub(super) fn reflect_row(job: &Job, s: usize, beside: [Option<usize>; 5], rows: &mut Rows, b: &mut [Half4]) -> Sums {
     let nx = b.len();
@@ -283,8 +284,8 @@ mod tests {
     use crate::rng::{Rng, Stage};
     use crate::sweep::planes::HalfPlanes;
 
-    /// Of a field whose second differences are known: read as lines do, at any place, it is itself on average. Without sharpening the
-    /// mean would be off by 0.083.
+    /// Of a field whose second differences are known: read as lines do, at any place, it is itself on average. Without
+    /// sharpening the mean would be off by 0.083.
     #[test]
     fn lines_read_on_average_what_is_there() {
         let n = 9;
@@ -341,7 +342,8 @@ mod tests {
         }
     }
 
-    /// Rows of random light, some of it not shown or negative, with and without memory, ω and an albedo of every node's own.
+    /// Rows of random light, some of it not shown or negative, with and without memory, ω and an albedo of every node's
+    /// own.
     #[test]
     fn every_instruction_set_reflects_the_same_bits() {
         let (nx, rows) = (61, 5);

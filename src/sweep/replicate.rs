@@ -1,9 +1,10 @@
 //! The passes of one replicate: few directions until light has settled, then more.
 //!
-//! In bright closed rooms that is not enough. What few directions bring too much, by a share δ, each bounce brings again: the level of
-//! the light is off by δ / (1 − r), of which r² are left after two later passes. There the defect of few directions is corrected
-//! \[Stetter78\]: x₁ being the light, it settles again as x = D + (T − T₁) x₁ + T₁ x, where T₁ is a pass with few directions and T one with
-//! all that the replicates' last passes have together. What is off then is of second order: (1 − T₁)⁻¹ (T − T₁) (x₁ − x).
+//! In bright closed rooms that is not enough. What few directions bring too much, by a share δ, each bounce brings
+//! again: the level of the light is off by δ / (1 − r), of which r² are left after two later passes. There the defect
+//! of few directions is corrected \[Stetter78\]: x₁ being the light, it settles again as x = D + (T − T₁) x₁ + T₁ x,
+//! where T₁ is a pass with few directions and T one with all that the replicates' last passes have together. What is
+//! off then is of second order: (1 − T₁)⁻¹ (T − T₁) (x₁ − x).
 
 use super::directions::{self, Shear};
 use super::flats::Flats;
@@ -21,8 +22,8 @@ use std::sync::Mutex;
 const COARSE: usize = 8;
 /// Fewest directions of a coarse pass.
 const LEAST: usize = 16;
-/// Passes after the light has settled, each with twice the directions of the one before. The last one counts: one set of
-/// twice the directions errs less than the mean of two.
+/// Passes after the light has settled, each with twice the directions of the one before. The last one counts: one set
+/// of twice the directions errs less than the mean of two.
 const LATE: usize = 2;
 /// Coarse passes until light has settled, as a rule; only estimates of time rely on it.
 const SETTLING: usize = 8;
@@ -102,9 +103,9 @@ impl Run<'_> {
         }
     }
 
-    /// Whether a replicate starts from the light of those before instead of from luminaires alone: then its last pass is all
-    /// it needs. What replicates share in this way are the bounces before their last, which the last one averages over the
-    /// sphere.
+    /// Whether a replicate starts from the light of those before instead of from luminaires alone: then its last pass
+    /// is all it needs. What replicates share in this way are the bounces before their last, which the last one
+    /// averages over the sphere.
     fn warm(&self, state: &State) -> bool {
         state.done > 0 && self.settings.settles() && state.total.sides().len() == self.sides.len()
     }
@@ -120,7 +121,8 @@ impl Run<'_> {
         if level && now.late == 1 && now.bounce + 2 * LATE < s.max_bounces {
             return Kind::Level;
         }
-        // Light goes on to settle after the level: half of the bounces are left to that, and what is missing before hardly matters.
+        // Light goes on to settle after the level: half of the bounces are left to that, and what is missing before
+        // hardly matters.
         let (most, target) = if level { (s.max_bounces / 2, EARLY * s.target) } else { (s.max_bounces, s.target) };
         let more = if now.corrected { 1 } else { LATE };
         let settled = now.settling.missing(more).is_some_and(|m| m < target);
@@ -145,8 +147,9 @@ impl Run<'_> {
         directions::lines(self.scene.lattice(), (s.seed, index), directions, part)
     }
 
-    /// Bounces: coarse passes until what is missing is known and small, then finer ones. Goes on behind the passes of `from`, whose
-    /// light the flats hold. Returns the indirect irradiance per side, and false if `progress` stopped it.
+    /// Bounces: coarse passes until what is missing is known and small, then finer ones. Goes on behind the passes of
+    /// `from`, whose light the flats hold. Returns the indirect irradiance per side, and false if `progress` stopped
+    /// it.
     pub(super) fn replicate(
         &self,
         state: &mut State,

@@ -1,5 +1,5 @@
-//! Consecutive numbers shared out among threads: each has a run of its own, and one that is done takes the farther half of
-//! what is left of the longest. So neighbours mostly meet the same thread, and none waits for long.
+//! Consecutive numbers shared out among threads: each has a run of its own, and one that is done takes the farther half
+//! of what is left of the longest. So neighbours mostly meet the same thread, and none waits for long.
 
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};

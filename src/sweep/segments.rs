@@ -51,8 +51,8 @@ impl Segments {
         self.place::<false>(lane, lattice, h, a, b);
     }
 
-    /// As [`Segments::set`] to a node, without h at that node itself, from the node on until less than `enough`\[0\] or as much as
-    /// `enough`\[1\] is found.
+    /// As [`Segments::set`] to a node, without h at that node itself, from the node on until less than `enough`\[0\] or
+    /// as much as `enough`\[1\] is found.
     #[inline]
     pub(super) fn set_before(
         &mut self,
@@ -206,8 +206,8 @@ mod tests {
         }
     }
 
-    /// From nodes of noise to points around: whether all is below or none, told from the slices that are needed, is what all of them tell,
-    /// and the first ones beside the node are enough to tell that something is there.
+    /// From nodes of noise to points around: whether all is below or none, told from the slices that are needed, is
+    /// what all of them tell, and the first ones beside the node are enough to tell that something is there.
     #[test]
     fn who_has_found_enough_looks_no_further() {
         let mut rng = Rng::stream(4, Stage::Test, 0);

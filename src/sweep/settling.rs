@@ -1,8 +1,9 @@
 //! How bounces settle: sooner than one by one, and when they have.
 //!
-//! Reflected radiance is the fixed point of x = D + T x, where a pass makes y = D + T x of x. T is nearly self-adjoint, and light that goes
-//! to and fro between walls and surfaces gives it eigenvalues of either sign. So the next x is x₋ + ω (y − x₋), where x₋ was before x, with
-//! Chebyshev's ω for ±r: errors shrink by √(ω∞ − 1) a pass, 0.39 where passes alone would leave r = 0.68. \[GV61\]
+//! Reflected radiance is the fixed point of x = D + T x, where a pass makes y = D + T x of x. T is nearly self-adjoint,
+//! and light that goes to and fro between walls and surfaces gives it eigenvalues of either sign. So the next x is x₋ +
+//! ω (y − x₋), where x₋ was before x, with Chebyshev's ω for ±r: errors shrink by √(ω∞ − 1) a pass, 0.39 where passes
+//! alone would leave r = 0.68. \[GV61\]
 
 /// What is known of a replicate's light while few directions spread it, per channel.
 #[derive(Clone, Debug, PartialEq)]
@@ -148,8 +149,8 @@ impl Settling {
         }
     }
 
-    /// λ of what the last two passes changed, should that be one eigenvector: of it they leave q each, where ω λ q = q² + ω − 1 \[GV61\].
-    /// 0 where that cannot be, or nothing is known.
+    /// λ of what the last two passes changed, should that be one eigenvector: of it they leave q each, where
+    /// ω λ q = q² + ω − 1 \[GV61\]. 0 where that cannot be, or nothing is known.
     fn eigenvalue(&self, c: usize) -> f64 {
         let [old, _, new] = self.changes.map(|change| change[c]);
         // ω is that of the x which the changes are measured from.
@@ -157,9 +158,9 @@ impl Settling {
         if old > 0.0 && q * q > omega - 1.0 { (q + (omega - 1.0) / q) / omega } else { 0.0 }
     }
 
-    /// The share of indirect light that is still missing, `more` passes from now: at most |y − x| r / (1 − r) after a pass, as far as
-    /// r is known. `None` before that. Where r is near 1 that is light of one sign everywhere, so that its sum tells; other light
-    /// settles sooner, and rounding, which has no sign, does not count.
+    /// The share of indirect light that is still missing, `more` passes from now: at most |y − x| r / (1 − r) after a
+    /// pass, as far as r is known. `None` before that. Where r is near 1 that is light of one sign everywhere, so that
+    /// its sum tells; other light settles sooner, and rounding, which has no sign, does not count.
     #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, reason = "few passes")]
     pub(super) fn missing(&self, more: usize) -> Option<f64> {
         let after = (1 + self.since + more) as i32;
@@ -192,8 +193,8 @@ mod tests {
         (0..5000).fold(direct(), |x, _| pass(spread, &x))
     }
 
-    /// Light that `spread` hands on from `x` until `target` of what is indirect is missing: passes, the share that is, and what is said
-    /// of it.
+    /// Light that `spread` hands on from `x` until `target` of what is indirect is missing: passes, the share that is,
+    /// and what is said of it.
     fn go_on(
         settling: &mut Settling,
         mut x: Vec<f64>,
@@ -253,8 +254,8 @@ mod tests {
         assert!(left < 1e-4 && passes < 60, "{passes} {left}");
     }
 
-    /// A ring that begins again with r known and a light that is a little too bright everywhere needs few passes more, and what is
-    /// said to be missing holds.
+    /// A ring that begins again with r known and a light that is a little too bright everywhere needs few passes more,
+    /// and what is said to be missing holds.
     #[test]
     fn light_that_begins_again_settles_sooner() {
         let mut settling = Settling::new([1.0; 3]);
@@ -267,8 +268,8 @@ mod tests {
         assert!(again < first, "{again} {first}");
     }
 
-    /// Each node hands most of its light to all alike and the rest to its neighbours: one slow eigenvalue, as closed bright rooms have. What
-    /// is said to be missing holds for any.
+    /// Each node hands most of its light to all alike and the rest to its neighbours: one slow eigenvalue, as closed
+    /// bright rooms have. What is said to be missing holds for any.
     #[test]
     fn the_level_of_a_bright_room_settles() {
         for r in [0.97, 0.99, 0.995] {

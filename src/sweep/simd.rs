@@ -1,6 +1,6 @@
-//! The hot loops in the widest instructions the machine has. One source serves all where the compiler vectorises it over the
-//! sixteen lines of a pack; what takes its numbers from places that lanes compute is written by hand, for AVX-512 and for
-//! AVX2. No fused multiply-adds: every instruction set gives the same bits.
+//! The hot loops in the widest instructions the machine has. One source serves all where the compiler vectorises it
+//! over the sixteen lines of a pack; what takes its numbers from places that lanes compute is written by hand, for
+//! AVX-512 and for AVX2. No fused multiply-adds: every instruction set gives the same bits.
 
 #![allow(clippy::needless_range_loop, reason = "a channel indexes several planes at once")]
 

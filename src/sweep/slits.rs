@@ -7,7 +7,8 @@ use glam::DVec3;
 
 /// The slits behind all luminaires.
 pub(super) struct Slits {
-    /// Nodes within one, in rising order, and the node in front of the luminaire that each shows to lines instead of itself.
+    /// Nodes within one, in rising order, and the node in front of the luminaire that each shows to lines instead of
+    /// itself.
     pub hidden: Vec<(usize, usize)>,
     standing: Vec<Standing>,
 }

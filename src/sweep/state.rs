@@ -142,8 +142,8 @@ impl State {
         out.bytes
     }
 
-    /// Takes the state back from [`State::bytes`]; the passes of a replicate of `sides` that was under way are returned, and
-    /// the flats take what belongs to them. Nothing is changed if the bytes do not fit.
+    /// Takes the state back from [`State::bytes`]; the passes of a replicate of `sides` that was under way are
+    /// returned, and the flats take what belongs to them. Nothing is changed if the bytes do not fit.
     pub(super) fn restore(&mut self, bytes: &[u8], sides: usize, flats: &mut Flats) -> Option<Passes> {
         let Parsed { state, direct, passes } = self.parse(bytes, sides, flats)?;
         self.total = state.total;

@@ -9,7 +9,8 @@ use glam::DVec3;
 use rayon::prelude::*;
 use std::f32::consts::PI;
 
-/// One node of so many tells how much better replicates are together: of 16, and not more than 65 536 to 131 071 in all.
+/// One node of so many tells how much better replicates are together: of 16, and not more than 65 536 to 131 071 in
+/// all.
 pub(super) fn stride(nodes: usize) -> usize {
     (nodes >> 16).max(16)
 }
@@ -26,8 +27,8 @@ pub(super) struct Totals {
     pub(super) direct: Vec<HalfPlanes>,
     /// Sum of the indirect irradiance of the stored sides.
     pub(super) light: Vec<HalfPlanes>,
-    /// Roots of the sums of squared deviations of the luminance of ρE/π from its mean, of direct and of indirect light: they
-    /// come from independent sets. \[Welford62\]
+    /// Roots of the sums of squared deviations of the luminance of ρE/π from its mean, of direct and of indirect light:
+    /// they come from independent sets. \[Welford62\]
     pub(super) spread: Vec<Vec<bf16>>,
     /// That luminance of each replicate at every [`stride`]th node.
     pub(super) parts: Vec<Vec<f32>>,
@@ -88,8 +89,8 @@ impl Totals {
         self.light = new[..self.sides.len()].iter().map(|new| HalfPlanes::new(new, 1.0, old.next())).collect();
     }
 
-    /// Adds the deviations of the light of the replicate that is the `count`th of its kind, where `mean` (side, channel, node)
-    /// is that of those before.
+    /// Adds the deviations of the light of the replicate that is the `count`th of its kind, where `mean` (side,
+    /// channel, node) is that of those before.
     #[allow(clippy::cast_possible_truncation, reason = "albedo")]
     fn deviate(
         &mut self,
@@ -161,11 +162,11 @@ impl Totals {
 
 /// The variance of the mean of replicates over that of as many independent ones; 1 unless they are 4, 8, 16 …
 ///
-/// Replicates are parts of one well distributed set, in an order in which their halves and quarters are evenly spread parts of it.
-/// Squared deviations of halves from the mean of all average e₂ − e₄, since those from the truth average e₂, and the mean's own is
-/// e₄; those of quarters average e₁ − e₄. What is independent of the set falls to a half from quarters to halves to all, what a
-/// scrambled set integrates smoothly to an eighth \[Owen97\]: e₄ = (10 (e₂ − e₄) − (e₁ − e₄))/7 is exact for both. For what falls
-/// at a rate in between it is too large, at most by two thirds.
+/// Replicates are parts of one well distributed set, in an order in which their halves and quarters are evenly spread
+/// parts of it. Squared deviations of halves from the mean of all average e₂ − e₄, since those from the truth average
+/// e₂, and the mean's own is e₄; those of quarters average e₁ − e₄. What is independent of the set falls to a half from
+/// quarters to halves to all, what a scrambled set integrates smoothly to an eighth \[Owen97\]: e₄ = (10 (e₂ − e₄) −
+/// (e₁ − e₄))/7 is exact for both. For what falls at a rate in between it is too large, at most by two thirds.
 fn together(parts: &[Vec<f32>]) -> f64 {
     let count = parts.len();
     if count < 4 || !count.is_power_of_two() {

@@ -1,5 +1,5 @@
-//! How volumes and colours travel inside the page: quantised, as differences of neighbours split into byte planes, which
-//! is what makes zlib effective on them.
+//! How volumes and colours travel inside the page: quantised, as differences of neighbours split into byte planes,
+//! which is what makes zlib effective on them.
 
 use crate::export::picture::srgb_encode;
 

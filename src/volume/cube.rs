@@ -1,7 +1,7 @@
 //! Gaussian cube files (`.cube`, `.cub`, each also gzipped): a density or potential around a molecule.
 //!
-//! World units are the file's: bohr, or ångström where it counts its samples by negative numbers. The file runs z fastest;
-//! here x does, as everywhere.
+//! World units are the file's: bohr, or ångström where it counts its samples by negative numbers. The file runs z
+//! fastest; here x does, as everywhere.
 
 use crate::error::{Error, Result};
 use crate::files::{self, Section};
@@ -17,8 +17,8 @@ const WORD_LIMIT: usize = 64;
 /// Reads a cube of one value per point.
 ///
 /// # Errors
-/// `Io`; `Invalid` for a broken header, or too few or too many values (known before they are allocated); `NotSupported` for
-/// several orbitals or values per point.
+/// `Io`; `Invalid` for a broken header, or too few or too many values (known before they are allocated); `NotSupported`
+/// for several orbitals or values per point.
 pub fn read(path: &Path) -> Result<Volume> {
     let text = Text { path, section: Section { start: 0, packing: files::gzip_or_plain(path, 0)?, skip: 0 } };
     let (lattice, mut reader) = text.header()?;
@@ -67,8 +67,8 @@ impl Text<'_> {
         Ok(String::from_utf8_lossy(&line).into_owned())
     }
 
-    /// Calls `visit` with the number and the characters (the first 64 of them) of the next `count` words; returns how many
-    /// there are, but looks for one more only.
+    /// Calls `visit` with the number and the characters (the first 64 of them) of the next `count` words; returns how
+    /// many there are, but looks for one more only.
     fn values(
         &self,
         reader: &mut impl BufRead,

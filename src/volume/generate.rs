@@ -55,9 +55,9 @@ pub enum Generator {
     Xyz,
     /// Two cylinders, one above the other, whose axes cross at 0.5 rad when seen from above \[BB09 Fig. 1\].
     ///
-    /// hᵢ = 2^−(dᵢ/R)², d the distance from axis i and R = [`CYLINDER_RADIUS`], joined smoothly as (h₁⁸ + h₂⁸)^⅛. The level
-    /// set at ½ is the two cylinders of radius R; where they nearly touch they swell towards each other, and below a gap
-    /// of 0.12 R they join.
+    /// hᵢ = 2^−(dᵢ/R)², d the distance from axis i and R = [`CYLINDER_RADIUS`], joined smoothly as (h₁⁸ + h₂⁸)^⅛. The
+    /// level set at ½ is the two cylinders of radius R; where they nearly touch they swell towards each other, and
+    /// below a gap of 0.12 R they join.
     TwoCylinders {
         /// Free distance between the two cylinders at h = ½ in the field's units. BB09 shows several diameters and
         /// less than one.

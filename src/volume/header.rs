@@ -32,8 +32,8 @@ pub(super) enum Line {
 }
 
 impl<'a> Header<'a> {
-    /// Reads up to the line that `line`, given its number from 1 on and its text without its end, says is the last, or to the
-    /// end of the file. What is no text becomes U+FFFD.
+    /// Reads up to the line that `line`, given its number from 1 on and its text without its end, says is the last, or
+    /// to the end of the file. What is no text becomes U+FFFD.
     ///
     /// # Errors
     /// `Io`; `Invalid` if there is no end within 1 MB; what `line` returns.

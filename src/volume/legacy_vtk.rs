@@ -6,14 +6,16 @@ use crate::volume::{ElementType, Endian, Lattice, Samples, Volume, ascii};
 use glam::DVec3;
 use std::path::Path;
 
-/// Reads the first one-component scalars of the point data (unsigned char ones may be called `COLOR_SCALARS`), or else the first one-component array of its `FIELD` data.
+/// Reads the first one-component scalars of the point data (unsigned char ones may be called `COLOR_SCALARS`), or else
+/// the first one-component array of its `FIELD` data.
 ///
 /// `ASPECT_RATIO`, the keyword of version 1, means the same as `SPACING`; a missing spacing is 1. `long` has 64 bits.
 /// Cell data in front of the point data, where VTK's writer puts them, are passed over. Keywords and types may have any
 /// case, as in VTK.
 ///
 /// # Errors
-/// `Io`; `Invalid` for a broken header, or arrays cut short; `NotSupported` for other data sets and for cell data alone.
+/// `Io`; `Invalid` for a broken header, or arrays cut short; `NotSupported` for other data sets and for cell data
+/// alone.
 pub fn read(path: &Path) -> Result<Volume> {
     let bytes = files::read(path)?;
     let (lattice, samples) = parse(&bytes).map_err(|e| e.in_file(path))?;

@@ -1,8 +1,9 @@
 //! Electron-microscopy maps in MRC2014 or CCP4 form (`.mrc`, `.map`, `.ccp4`, `.rec`, each also gzipped).
 //! \[MRC2014\]
 //!
-//! World units are the file's, ångström. Columns, rows and sections stay the lattice's axes in memory order; `MAPC`, `MAPR`
-//! and `MAPS` say along which crystal axes they run, so that the world's x, y and z are right for every storage order.
+//! World units are the file's, ångström. Columns, rows and sections stay the lattice's axes in memory order; `MAPC`,
+//! `MAPR` and `MAPS` say along which crystal axes they run, so that the world's x, y and z are right for every storage
+//! order.
 
 use crate::error::{Error, Result};
 use crate::files::{self, Packing, Section};
@@ -155,7 +156,8 @@ impl<'a> Header<'a> {
     }
 }
 
-/// Unit vectors of a cell's axes: a along x, b in the plane z = 0; angles α, β, γ in degrees. `None` if they make no cell.
+/// Unit vectors of a cell's axes: a along x, b in the plane z = 0; angles α, β, γ in degrees. `None` if they make no
+/// cell.
 fn cell_axes(angles: DVec3) -> Option<DMat3> {
     if angles.to_array().iter().any(|a| !(*a > 0.0 && *a < 180.0)) {
         return None;

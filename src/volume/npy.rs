@@ -2,8 +2,8 @@
 //!
 //! x runs fastest in memory, whichever way the array is indexed: a C-ordered array has the shape (nz, ny, nx) and is
 //! indexed `a[z, y, x]` (as scikit-image, tifffile, SimpleITK and napari do), a Fortran-ordered one has the shape
-//! (nx, ny, nz) and is indexed `a[x, y, z]` (as nibabel and pynrrd do). The format holds no place in the world: spacing 1,
-//! origin 0.
+//! (nx, ny, nz) and is indexed `a[x, y, z]` (as nibabel and pynrrd do). The format holds no place in the world: spacing
+//! 1, origin 0.
 
 use crate::error::{Error, Result};
 use crate::files::{self, Packing, Section};
@@ -24,12 +24,12 @@ struct Header {
     shape: Vec<usize>,
 }
 
-/// Reads an array of three axes, or of more where all others are of length 1. Integers of 8 to 64 bits, booleans (as u8),
-/// and floats of 16 (stored as f32), 32 and 64 bits, in either byte order.
+/// Reads an array of three axes, or of more where all others are of length 1. Integers of 8 to 64 bits, booleans (as
+/// u8), and floats of 16 (stored as f32), 32 and 64 bits, in either byte order.
 ///
 /// # Errors
-/// `Io`; `Invalid` for a broken header or too few bytes (known before they are allocated); `NotSupported` for other shapes
-/// and types.
+/// `Io`; `Invalid` for a broken header or too few bytes (known before they are allocated); `NotSupported` for other
+/// shapes and types.
 pub fn read(path: &Path) -> Result<Volume> {
     let plain = |start, skip| Section { start, packing: Packing::Plain, skip };
     let head = files::read_head(path, plain(0, 0), 12)?;
@@ -127,8 +127,8 @@ fn parse_header(text: &str) -> Result<Header> {
     Ok(Header { element, half, endian: if order == b'>' { Endian::Big } else { Endian::Little }, fortran, shape })
 }
 
-/// Writes values on a lattice: C order, little-endian, shape (nz, ny, nx) for one component and (nz, ny, nx, components) for
-/// more. The file appears under its name only when it is complete.
+/// Writes values on a lattice: C order, little-endian, shape (nz, ny, nx) for one component and (nz, ny, nx,
+/// components) for more. The file appears under its name only when it is complete.
 ///
 /// # Errors
 /// `Invalid` if the count is not the lattice's samples × `components`; `Io`.

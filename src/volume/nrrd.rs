@@ -36,8 +36,8 @@ pub fn read(path: &Path) -> Result<Volume> {
     Ok(Volume { space, ..Volume::new(path.display().to_string(), lattice, samples)? })
 }
 
-/// Reads a field of two axes (others must hold a single sample); `None` if the file holds a volume. The steps along the axes are
-/// the lengths of their `space directions`, or `spacings`, or 1.
+/// Reads a field of two axes (others must hold a single sample); `None` if the file holds a volume. The steps along the
+/// axes are the lengths of their `space directions`, or `spacings`, or 1.
 ///
 /// # Errors
 /// As [`read`].
@@ -62,11 +62,12 @@ pub fn read_plane(path: &Path) -> Result<Option<Plane>> {
     Ok(Some(Plane { dims, spacing, samples: header.samples(count, header.element()?)? }))
 }
 
-/// Writes values on a lattice as an attached, gzip-packed, little-endian NRRD that 3D Slicer, ITK and pynrrd read: one component
-/// as a scalar volume, more as a vector image, whose vector axis is the first and has no direction. `notes` become `key:=value`
-/// lines.
+/// Writes values on a lattice as an attached, gzip-packed, little-endian NRRD that 3D Slicer, ITK and pynrrd read: one
+/// component as a scalar volume, more as a vector image, whose vector axis is the first and has no direction. `notes`
+/// become `key:=value` lines.
 ///
-/// The file appears under its name only when it is complete. VTK's and ParaView's own NRRD reader does not read vectors.
+/// The file appears under its name only when it is complete. VTK's and ParaView's own NRRD reader does not read
+/// vectors.
 ///
 /// # Errors
 /// `Invalid` if the count is not the lattice's samples × `components`; `Io`.

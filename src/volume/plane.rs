@@ -16,8 +16,8 @@ pub struct Plane {
 }
 
 impl Plane {
-    /// Reads a 2D `.nrrd` (or one with further axes of a single sample) or a `.vti` that is one sample thick; `None` if the file
-    /// is a volume or has another extension.
+    /// Reads a 2D `.nrrd` (or one with further axes of a single sample) or a `.vti` that is one sample thick; `None` if
+    /// the file is a volume or has another extension.
     ///
     /// # Errors
     /// What the format's reader returns.

@@ -62,10 +62,11 @@ impl VolumeStatistics {
     /// more than 16 bits), with the same result for every number of threads.
     ///
     /// The suggested sweep leaves out background and noise. Its upper end holds back ½ % of all isosurface area
-    /// (∫|∇h| dV, by the coarea formula) and 2 % of the range; its lower end stands above the background (the commonest value), past
-    /// 5 % of the area, and where the field becomes coherent: gradients taken over ±1 and over ±2 samples agree on
-    /// surfaces and are independent in noise. For a background brighter than the middle of the range the two ends change
-    /// roles. Both ends lie strictly inside the range, so that no isosurface of a volume of finite samples is empty.
+    /// (∫|∇h| dV, by the coarea formula) and 2 % of the range; its lower end stands above the background (the commonest
+    /// value), past 5 % of the area, and where the field becomes coherent: gradients taken over ±1 and over ±2 samples
+    /// agree on surfaces and are independent in noise. For a background brighter than the middle of the range the two
+    /// ends change roles. Both ends lie strictly inside the range, so that no isosurface of a volume of finite samples
+    /// is empty.
     pub fn of(volume: &Volume) -> Self {
         let lattice = &volume.lattice;
         let distribution = Distribution::of(volume.samples());

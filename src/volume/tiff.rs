@@ -19,8 +19,8 @@ use tiff::{ColorType, TiffError, TiffResult};
 /// A text longer than this is not read for a spacing.
 const TEXT_LIMIT: usize = 16 << 20;
 
-/// Reads all pages as one volume: grey, integers of 8 to 64 bits or floats (16-bit ones stored as f32), not packed or by
-/// LZW, Deflate or PackBits.
+/// Reads all pages as one volume: grey, integers of 8 to 64 bits or floats (16-bit ones stored as f32), not packed or
+/// by LZW, Deflate or PackBits.
 ///
 /// World units are the spacing's: `spacing=` and the resolution of ImageJ; micrometres from `PhysicalSizeX`, `Y` and
 /// `Z` of OME, whose units are converted (units without a length, such as `pixel`, are kept if all axes have the same).

@@ -146,8 +146,8 @@ struct Arrays {
 }
 
 impl Arrays {
-    /// Reads the bytes of a file. `place` makes what it needs of the placement and says how many points there are; of none, the
-    /// arrays are left unread.
+    /// Reads the bytes of a file. `place` makes what it needs of the placement and says how many points there are; of
+    /// none, the arrays are left unread.
     fn parse<T>(bytes: &[u8], place: impl FnOnce(Placement) -> Result<(T, usize)>) -> Result<(T, Self)> {
         let (text, appended) = split_appended(bytes)?;
         let document = files::xml(&text).map_err(|e| Error::Invalid(format!("is no well-formed XML: {e}")))?;

@@ -71,8 +71,8 @@ fn binary_volumes_are_baked_by_exact_rays() {
     assert!(lines.contains("engine  sweep") && !lines.contains("warning"), "{lines}");
 }
 
-/// A closed room whose surfaces absorb nothing, and its walls a half or a thousandth: where bounces end before light has settled, a bake
-/// says so.
+/// A closed room whose surfaces absorb nothing, and its walls a half or a thousandth: where bounces end before light
+/// has settled, a bake says so.
 #[test]
 fn light_that_has_not_settled_is_warned_of() {
     let dir = tempfile::tempdir().unwrap();

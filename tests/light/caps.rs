@@ -10,7 +10,8 @@ use isolume::scene::{Boundary, Scene};
 use isolume::stats::Moments;
 use isolume::tracer::Tracer;
 
-/// A solid 0 ≤ z ≤ 1 − c in [0, 1]³, moved off the origin so that faces are no round f32 numbers, lamps beyond two faces.
+/// A solid 0 ≤ z ≤ 1 − c in [0, 1]³, moved off the origin so that faces are no round f32 numbers, lamps beyond two
+/// faces.
 fn solid() -> (Scene, DVec3) {
     let at = DVec3::new(0.137, -3.211, 7.713);
     let field = field(lattice([8; 3], at, at + 1.0), 0.0, 1.0, |x| 1.0 - (x - at).z);
@@ -100,7 +101,8 @@ fn the_inside_of_a_capped_solid_is_dark() {
 }
 
 /// −h with the other side outside is the same scene: the mean radiance of 4 shells agrees, nodes in Ω's faces included
-/// (rays that leave Ω there once met the lower side of their own level set). Errors from 4 seeds each; systematic 0.3 %: `inside` takes h = c to different sides.
+/// (rays that leave Ω there once met the lower side of their own level set). Errors from 4 seeds each; systematic 0.3
+/// %: `inside` takes h = c to different sides.
 #[test]
 fn mirrored_fields_give_the_same_light() {
     let build = |sign: f64, outside: Side| {

@@ -138,9 +138,9 @@ fn integrating_sphere(albedo: f64, radius: f64, gather: u32, seeds: std::ops::Ra
 }
 
 /// Mean E = Φ/(4πR²(1−ρ)), indirect ρΦ/(4πR²(1−ρ)) at every point, for every isovalue of one run. Errors from four
-/// seeds. Systematic 1 %: normals are central differences (Δ²/R² ≈ 0.6 %), means over nodes are no area means. The first and
-/// last shell are one cell thick: there the cache interpolates nodes that no hyperplane of the sweep lights from points
-/// up to a cell inside, 7 % of R² away: 3 %.
+/// seeds. Systematic 1 %: normals are central differences (Δ²/R² ≈ 0.6 %), means over nodes are no area means. The
+/// first and last shell are one cell thick: there the cache interpolates nodes that no hyperplane of the sweep lights
+/// from points up to a cell inside, 7 % of R² away: 3 %.
 #[test]
 fn integrating_sphere_of_every_isovalue() {
     let mut families = [Family::new("integrating sphere", 0.01), Family::new("its sweep's end cells", 0.03)];
@@ -200,9 +200,9 @@ fn furnace_of_emitting_walls() {
 }
 
 /// Black walls of radiance 1 give a convex level set exactly ρ, node by node. A plane has no curvature that shadow rays
-/// could graze: f32 rounding only. On balls of 3 to 13 cells, normals of central differences are not the facets', so rays
-/// near the horizon start into the surface: the share of E below elevation ε is ε², ε ≈ Δ/2R = 1/6 at worst; the mean,
-/// where most balls are large, 1e-3.
+/// could graze: f32 rounding only. On balls of 3 to 13 cells, normals of central differences are not the facets', so
+/// rays near the horizon start into the surface: the share of E below elevation ε is ε², ε ≈ Δ/2R = 1/6 at worst; the
+/// mean, where most balls are large, 1e-3.
 #[test]
 fn furnace_of_black_walls() {
     let walls = || closed_box(UNIT.0, UNIT.1, 0.0, 1.0);
@@ -270,8 +270,8 @@ fn furnace_of_emitting_level_sets() {
 
 /// A floor z = 0 beside a wall of height 1 that runs along y without end: the field max(−z, min(x, 1 − z)) holds both
 /// exactly at isovalue 0 (which is the lattice's own value on them). All other directions end on luminaires of
-/// radiance one. The wall takes ½(1 − 1/√(1 + k²)) of the light. Tolerance 1e-3: the share is a ratio of 2¹⁵ low-discrepancy points
-/// per luminaire (edge strata 2¹⁵^-¾ ≈ 4e-4), the wall ends after 100 heights.
+/// radiance one. The wall takes ½(1 − 1/√(1 + k²)) of the light. Tolerance 1e-3: the share is a ratio of 2¹⁵
+/// low-discrepancy points per luminaire (edge strata 2¹⁵^-¾ ≈ 4e-4), the wall ends after 100 heights.
 #[test]
 fn occlusion_by_an_infinite_wall() {
     let (lo, hi) = (DVec3::new(-4.0, -100.0, -0.5), DVec3::new(1.0, 100.0, 2.0));
@@ -315,8 +315,8 @@ fn occlusion_by_an_infinite_wall() {
     }
 }
 
-/// The ceiling above a lamp that hangs closer below it than a voxel is dark: what lines bring to points a voxel lower must not
-/// reach it. Below a thousandth of the light in front of the lamp.
+/// The ceiling above a lamp that hangs closer below it than a voxel is dark: what lines bring to points a voxel lower
+/// must not reach it. Below a thousandth of the light in front of the lamp.
 #[test]
 fn the_ceiling_above_a_lamp_is_dark() {
     let planes = field(lattice([33; 3], DVec3::ZERO, DVec3::ONE), 0.1, 1.1, |x| x.z + 0.1 * x.x);

@@ -74,8 +74,8 @@ fn oblique() -> Lattice {
     Lattice::new([30, 24, 20], DVec3::new(0.49, 0.48, 0.71) - axes * far * 0.5, axes).unwrap()
 }
 
-/// Radiance means of a bake over random points of the world whose isovalue lies on the sweep: by quarter of the sweep and
-/// channel.
+/// Radiance means of a bake over random points of the world whose isovalue lies on the sweep: by quarter of the sweep
+/// and channel.
 fn means(bake: &Bake, scene: &Scene, inside: impl Fn(DVec3) -> bool) -> Vec<f64> {
     let (mut sums, mut counts) = (vec![0.0; 12], vec![0.0; 12]);
     for i in 0..100_000 {
@@ -95,8 +95,8 @@ fn means(bake: &Bake, scene: &Scene, inside: impl Fn(DVec3) -> bool) -> Vec<f64>
     sums.iter().zip(counts).map(|(s, n)| s / n).collect()
 }
 
-/// Random rays of all departures, seen from either field, hit what is nearest of what the fields alone give; one by one and
-/// in packets.
+/// Random rays of all departures, seen from either field, hit what is nearest of what the fields alone give; one by one
+/// and in packets.
 #[test]
 fn the_nearest_hit_of_all_fields_wins() {
     let device = Device::new(1).unwrap();
@@ -253,8 +253,8 @@ fn a_field_that_nothing_sees_changes_nothing() {
     assert_eq!(alone.flats[..6], both[0].flats[..6]);
 }
 
-/// One field cut into two members along a lattice plane: the union of their surfaces is the same surface, so that all light
-/// across the cut is light across fields.
+/// One field cut into two members along a lattice plane: the union of their surfaces is the same surface, so that all
+/// light across the cut is light across fields.
 #[test]
 fn a_field_cut_in_two_has_the_same_light() {
     let whole = |x: DVec3| large(x) + 0.9 * small(x);
@@ -362,7 +362,8 @@ fn an_integrating_sphere_of_one_field_around_a_source_of_another() {
     families.accept();
 }
 
-/// The bake of both fields against path tracing of two meshes, and the two integrators of the reference against each other.
+/// The bake of both fields against path tracing of two meshes, and the two integrators of the reference against each
+/// other.
 #[test]
 fn cross_light_agrees_with_paths_between_two_meshes() {
     let device = Device::new(1).unwrap();

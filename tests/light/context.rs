@@ -31,7 +31,8 @@ fn bumps_with(polygons: impl FnOnce(Vec<Polygon>) -> Vec<Polygon>) -> Scene {
     Scene::new(field, Surface::default(), Boundary::Open, polygons(walls)).unwrap()
 }
 
-/// A floor from an OBJ file, whole or in triangles, is the box's own: every bit of the grid, and its light within noise.
+/// A floor from an OBJ file, whole or in triangles, is the box's own: every bit of the grid, and its light within
+/// noise.
 #[test]
 fn a_rectangle_from_a_file_is_the_same_wall() {
     let grey = 0.7;
@@ -79,8 +80,8 @@ fn a_rectangle_from_a_file_is_the_same_wall() {
     }
 }
 
-/// A black plate between light and floor, whichever way it faces: E is Lambert's form for the part of the light that its edge
-/// leaves, at every node of horizontal planes.
+/// A black plate between light and floor, whichever way it faces: E is Lambert's form for the part of the light that
+/// its edge leaves, at every node of horizontal planes.
 #[test]
 fn a_plate_covers_its_part_of_the_light() {
     let (lo, hi) = (DVec3::ZERO, DVec3::ONE);
@@ -116,8 +117,8 @@ fn a_plate_covers_its_part_of_the_light() {
     }
 }
 
-/// A slanted sheet and an octahedron of triangles among bumps: what a bake finds on level sets and on both sides of every
-/// face is what paths find there.
+/// A slanted sheet and an octahedron of triangles among bumps: what a bake finds on level sets and on both sides of
+/// every face is what paths find there.
 #[test]
 fn light_to_and_from_context_agrees_with_paths() {
     let mut obj = String::from("v 0.08 0.1 0.2\nv 0.3 0.1 0.55\nv 0.3 0.7 0.55\nv 0.08 0.7 0.2\nf 1 2 3 4\n");

@@ -17,11 +17,12 @@ use isolume::scene::{Scene, Surface, cornell_box};
 use isolume::stats::Moments;
 use isolume::surface_mesh::SurfaceMesh;
 
-/// What final gather finds at the vertices themselves, without a grid in between, against path tracing of two meshes: cross
-/// light on nuclear pasta, whose surfaces run through each other. A folder with `pasta-proton.vti` and `pasta-neutron.vti`
-/// (`isolume generate pasta --species both -o pasta.vti`) in ISOLUME_PASTA; by hand. Neutrons were 5.07 % [1.33, 7.05] as long as
-/// points spread over the luminaire's area missed what vertices right below it see, and 2.06 % [1.11, 2.69] as long as gather
-/// rays that land in the crevice where the surfaces cross read the lit nodes around it.
+/// What final gather finds at the vertices themselves, without a grid in between, against path tracing of two meshes:
+/// cross light on nuclear pasta, whose surfaces run through each other. A folder with `pasta-proton.vti` and
+/// `pasta-neutron.vti` (`isolume generate pasta --species both -o pasta.vti`) in ISOLUME_PASTA; by hand. Neutrons were
+/// 5.07 % [1.33, 7.05] as long as points spread over the luminaire's area missed what vertices right below it see, and
+/// 2.06 % [1.11, 2.69] as long as gather rays that land in the crevice where the surfaces cross read the lit nodes
+/// around it.
 #[test]
 #[ignore = "needs simulated volumes and minutes"]
 fn pasta_at_its_vertices() {
@@ -51,8 +52,8 @@ struct AtVertex {
     paths: [DVec3; 2],
 }
 
-/// Final gather of `rays` at vertices of both fields' level sets at `c`, cells cut `refine` times, no grid in between, and path
-/// tracing of the two meshes, refined, at so many vertices with so many samples each.
+/// Final gather of `rays` at vertices of both fields' level sets at `c`, cells cut `refine` times, no grid in between,
+/// and path tracing of the two meshes, refined, at so many vertices with so many samples each.
 fn at_vertices(
     scene: &Scene,
     c: f32,
@@ -105,8 +106,8 @@ fn joint_cache(views: &[Scene; 2], tracers: &[GraphTracer; 2], count: u64) -> Ra
     cache
 }
 
-/// A ball sunk into a floor, on a coarse lattice: at s = ½ the ball has a radius of 0.25, and 0.22 of it stand above z = 0.2,
-/// so that the crevice around it is 28° narrow.
+/// A ball sunk into a floor, on a coarse lattice: at s = ½ the ball has a radius of 0.25, and 0.22 of it stand above
+/// z = 0.2, so that the crevice around it is 28° narrow.
 fn sunk_ball() -> Scene {
     let floor = field(unit(13), 0.1, 0.3, |x| x.z);
     let ball = field(unit(13), 0.2, 0.3, |x| (x - DVec3::new(0.5, 0.5, 0.42)).length());
@@ -115,8 +116,8 @@ fn sunk_ball() -> Scene {
     joint(vec![member("floor", floor, outside([0.9; 3])), member("ball", ball, outside([0.9; 3]))], walls)
 }
 
-/// Light within a cell of a crevice between two fields, where the cache's nodes stand in the open or in the other's solid: off by
-/// −12 % if rays that land there take what the cache says.
+/// Light within a cell of a crevice between two fields, where the cache's nodes stand in the open or in the other's
+/// solid: off by −12 % if rays that land there take what the cache says.
 #[test]
 fn crevices_between_fields_are_dark() {
     let scene = sunk_ball();
@@ -147,7 +148,8 @@ fn crevices_between_fields_are_dark() {
     }
 }
 
-/// A receiver on the floor inside the ball is known to be dark after a quarter of its rays; one beside it casts them all.
+/// A receiver on the floor inside the ball is known to be dark after a quarter of its rays; one beside it casts them
+/// all.
 #[test]
 fn sealed_receivers_stop_early() {
     let scene = sunk_ball();

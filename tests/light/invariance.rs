@@ -204,14 +204,16 @@ fn lattices_do_not_matter() {
 
 #[test]
 fn where_the_sweep_ends_does_not_matter() {
-    // 1.14 and 0.47 % apart; 1.42 and 3.03 % with nodes outside the sweep fitted to samples instead of lit by lines themselves.
+    // 1.14 and 0.47 % apart; 1.42 and 3.03 % with nodes outside the sweep fitted to samples instead of lit by lines
+    // themselves.
     let hill = |x: DVec3| (-(x - DVec3::new(0.45, 0.55, 0.4)).length_squared() / 0.2).exp();
     ends_do_not_matter(hill, &BakeSettings { engine: Engine::Sweep, ..at_nodes(1) }, 0.0125);
 }
 
 #[test]
 fn where_the_sweep_ends_does_not_matter_to_exact_rays() {
-    // 1.69 and 2.74 % apart; 3.29 and 4.52 % with points outside the sweep fitted to samples instead of sampled themselves.
+    // 1.69 and 2.74 % apart; 3.29 and 4.52 % with points outside the sweep fitted to samples instead of sampled
+    // themselves.
     let dunes = |x: DVec3| 0.55 + 3.0 * (0.5 - x.z) + 0.2 * (20.0 * x.x).sin() * (20.0 * x.y).cos();
     ends_do_not_matter(dunes, &at_nodes(1), 0.03);
 }
@@ -242,8 +244,9 @@ fn ends_do_not_matter(h: impl Fn(DVec3) -> f64, settings: &BakeSettings, limit: 
     }
 }
 
-/// A coil two voxels thick on a plateau closely outside the sweep: direct light on an isosurface near its edge, against exact shadow
-/// rays. Grid points on the plateau hold what fits the light around; 23 instead of 15 % off with their own.
+/// A coil two voxels thick on a plateau closely outside the sweep: direct light on an isosurface near its edge, against
+/// exact shadow rays. Grid points on the plateau hold what fits the light around; 23 instead of 15 % off with their
+/// own.
 #[test]
 fn a_plateau_outside_the_sweep_is_no_end_to_interpolate_from() {
     let coil = |x: DVec3| {

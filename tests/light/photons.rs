@@ -16,8 +16,8 @@ use isolume::stats::Moments;
 use std::f64::consts::PI;
 
 /// h = z² under a lamp, and h = xyz with a lamp behind the corner (1, 1, 1): convex towards their lamps, so that
-/// next-event irradiance is Lambert's closed form. The first is piecewise linear on its lattice, the second exact on any.
-/// Bins are no finer than the lattice, so that it is finer than h needs.
+/// next-event irradiance is Lambert's closed form. The first is piecewise linear on its lattice, the second exact on
+/// any. Bins are no finer than the lattice, so that it is finer than h needs.
 fn slopes() -> [(&'static str, Scene); 2] {
     let unit = |dims| lattice(dims, DVec3::ZERO, DVec3::ONE);
     let lamp = rectangle("lamp", DVec3::new(0.5, 0.5, 1.5), DVec3::Y, DVec3::X, 0.0, 1.0);
@@ -29,8 +29,8 @@ fn slopes() -> [(&'static str, Scene); 2] {
     [("z²", square), ("xyz", product)]
 }
 
-/// Photon irradiance / next-event irradiance in 10 bins of the isovalue, at points whose distance to the nearest face of
-/// Ω lies in `margin`.
+/// Photon irradiance / next-event irradiance in 10 bins of the isovalue, at points whose distance to the nearest face
+/// of Ω lies in `margin`.
 fn against_next_event(
     name: &str,
     scene: &Scene,
@@ -65,9 +65,9 @@ fn against_next_event(
     filled.for_each(|(b, m)| family.ratios(format!("{name} bin {b}"), m));
 }
 
-/// Photon irradiance of first landings = next-event irradiance in every bin: inside, at Ω's faces, and with a narrow τ, by
-/// every estimator. Errors from the spread over points (k = 48 photons each: 14 %). Systematic 2 %: at a face the points'
-/// kernel looks to one side, by 0.2 r of the scale on which E |∇h| varies.
+/// Photon irradiance of first landings = next-event irradiance in every bin: inside, at Ω's faces, and with a narrow τ,
+/// by every estimator. Errors from the spread over points (k = 48 photons each: 14 %). Systematic 2 %: at a face the
+/// points' kernel looks to one side, by 0.2 r of the scale on which E |∇h| varies.
 #[test]
 fn photons_need_the_gradient_and_no_more() {
     let mut right = Family::new("with |∇h|", 0.02);

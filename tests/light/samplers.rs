@@ -25,8 +25,8 @@ fn bin(x: f64, n: usize) -> usize {
 fn samplers_agree_with_their_densities() {
     let mut family: Vec<(&str, f64)> = Vec::new();
 
-    // A tiny lamp in the centre of spheres: where a photon lands is the direction it left in. Cosine-distributed: cos² θ
-    // and φ are uniform; the isovalue is, too. The lamp's size blurs directions by 1e-3.
+    // A tiny lamp in the centre of spheres: where a photon lands is the direction it left in. Cosine-distributed: cos²
+    // θ and φ are uniform; the isovalue is, too. The lamp's size blurs directions by 1e-3.
     let cavity = field(lattice([33; 3], DVec3::NEG_ONE, DVec3::ONE), 0.25, 0.95, |x| x.length_squared());
     let lamp = rectangle("lamp", DVec3::ZERO, 5e-4 * DVec3::X, 5e-4 * DVec3::Y, 0.0, 1.0);
     let cavity = scene(cavity, grey(0.0, Side::Lower), vec![lamp]);

@@ -12,7 +12,8 @@ use isolume::volume::Lattice;
 use rayon::prelude::*;
 use std::f64::consts::PI;
 
-/// What bounces leave out is known where they converged, replicates that start warm among them, and is not 0 where they were cut.
+/// What bounces leave out is known where they converged, replicates that start warm among them, and is not 0 where they
+/// were cut.
 #[test]
 fn the_residual_of_cut_bounces_is_not_known() {
     let f = bumps(21);
@@ -47,15 +48,16 @@ fn bright_room(size: usize, albedo: DVec3) -> Scene {
     Scene::new(f, surface, Boundary::Open, walls).unwrap()
 }
 
-/// Light that counts as settled against light that went on, in closed rooms that are bright, too: the last passes' directions are the
-/// same, so all that differs is what is missing.
+/// Light that counts as settled against light that went on, in closed rooms that are bright, too: the last passes'
+/// directions are the same, so all that differs is what is missing.
 #[test]
 fn settled_light_misses_what_it_says() {
     let f = bumps(41);
     let default = cornell_box(f.lattice(), 0.0).unwrap();
     let colour = DVec3::new(0.9, 0.6, 0.3);
     let red = (colour, default.clone(), [7, 10], 0.05);
-    // Light that settles again, after its level was corrected, is nearer than what is said: noise fades sooner than levels do.
+    // Light that settles again, after its level was corrected, is nearer than what is said: noise fades sooner than
+    // levels do.
     let room = |x, most| (DVec3::splat(x), closed_box(f.lattice(), DVec3::splat(x)), most, 0.01);
     let open = (DVec3::splat(0.75), default, [6, 9], 0.05);
     for (albedo, walls, most, least) in [open, red, room(0.9, [27, 37]), room(0.97, [31, 47])] {
@@ -92,8 +94,8 @@ fn settled_light_misses_what_it_says() {
     }
 }
 
-/// What the few directions along which light spreads bring too much makes the whole of a bright room too bright: against path tracing,
-/// seed by seed, 3.4 % RMS where the level is not corrected.
+/// What the few directions along which light spreads bring too much makes the whole of a bright room too bright:
+/// against path tracing, seed by seed, 3.4 % RMS where the level is not corrected.
 #[test]
 fn bright_rooms_are_as_bright_as_they_should_be() {
     let scene = bright_room(25, DVec3::splat(0.95));
@@ -118,8 +120,8 @@ fn bright_rooms_are_as_bright_as_they_should_be() {
     assert!(off < 0.008, "{levels:?}");
 }
 
-/// Walls that emit what they absorb, a hundredth, around surfaces that absorb as much or nothing: radiance 1 everywhere. Light fades by a
-/// hundredth in a bounce: when bounces ended after 64, 20 and 13 % were missing.
+/// Walls that emit what they absorb, a hundredth, around surfaces that absorb as much or nothing: radiance 1
+/// everywhere. Light fades by a hundredth in a bounce: when bounces ended after 64, 20 and 13 % were missing.
 #[test]
 fn rooms_that_absorb_a_hundredth_settle() {
     for albedo in [1.0, 0.99] {
@@ -155,8 +157,9 @@ fn bright_rooms_have_all_their_bounces() {
     }
 }
 
-/// The light that replicates share while it spreads is that of all their luminaire points, not of the first one's few: with two each,
-/// the mean indirect light errs less than the mean direct light does (0.5 times as much; 1.4 times where the first one spread its own).
+/// The light that replicates share while it spreads is that of all their luminaire points, not of the first one's few:
+/// with two each, the mean indirect light errs less than the mean direct light does (0.5 times as much; 1.4 times where
+/// the first one spread its own).
 #[test]
 fn what_bounces_is_the_light_of_all_replicates() {
     let f = bumps(21);

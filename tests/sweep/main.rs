@@ -353,8 +353,9 @@ fn waves(scale: f64) -> Scene {
     Scene::new(f, Surface::default(), Boundary::Open, walls.into_iter().map(black).collect()).unwrap()
 }
 
-/// A luminaire that stands in the matter: nodes nearer to it than its points are to each other, against many exact shadow rays over the
-/// solid angle. With 8 points a replicate that all nodes share, the mean was 14 % low and the RMS 27 %.
+/// A luminaire that stands in the matter: nodes nearer to it than its points are to each other, against many exact
+/// shadow rays over the solid angle. With 8 points a replicate that all nodes share, the mean was 14 % low and the RMS
+/// 27 %.
 #[test]
 fn light_next_to_a_luminaire_agrees_with_exact_shadow_rays() {
     let scene = waves(1.0);
@@ -390,8 +391,9 @@ fn light_next_to_a_luminaire_agrees_with_exact_shadow_rays() {
     }
 }
 
-/// One bounce between strongly curved surfaces around a luminaire against exact rays that find exact direct light: the mean of 300
-/// nodes. What lines read between the last slice before a luminaire and itself counts: without sharpening and slits it was 5.3 % low.
+/// One bounce between strongly curved surfaces around a luminaire against exact rays that find exact direct light: the
+/// mean of 300 nodes. What lines read between the last slice before a luminaire and itself counts: without sharpening
+/// and slits it was 5.3 % low.
 #[test]
 fn one_bounce_near_a_luminaire_keeps_its_energy() {
     let scene = waves(0.5);
@@ -450,7 +452,8 @@ fn light_does_not_depend_on_the_unit_of_length() {
     assert!(scene.unwrap_err().to_string().contains("lengths"));
 }
 
-/// The number that files have where there are no data, on either side of the sweep, is as good as any other so far away.
+/// The number that files have where there are no data, on either side of the sweep, is as good as any other so far
+/// away.
 #[test]
 fn the_farthest_numbers_are_only_far() {
     let settings = SweepSettings { directions: 32, light_points: 4, max_bounces: 2, replicates: 1, ..ONE_BOUNCE };

@@ -34,8 +34,8 @@ impl Drop for Running {
     }
 }
 
-/// Loads `page` with `driver` run after it, and returns what it posts, by name, until it posts `done`. Errors of the page
-/// are posted as `error`.
+/// Loads `page` with `driver` run after it, and returns what it posts, by name, until it posts `done`. Errors of the
+/// page are posted as `error`.
 pub(crate) fn drive(program: &Path, page: &str, driver: &str, seconds: u64) -> Vec<(String, Vec<u8>)> {
     const HOOKS: &str = "<head><script>
         const post = (name, body) => fetch('/' + name, { method: 'POST', body });

@@ -8,8 +8,8 @@ use crate::pyramid::{Pyramid, Tile};
 use glam::Vec4;
 use std::arch::x86_64::*;
 
-/// Proof that the processor has what `#[target_feature]` asks for below: made by [`Avx512::of`] only, of an [`Isa`]. Refers to [`Z`]:
-/// what the compiler knows it turns into two shuffles each.
+/// Proof that the processor has what `#[target_feature]` asks for below: made by [`Avx512::of`] only, of an [`Isa`].
+/// Refers to [`Z`]: what the compiler knows it turns into two shuffles each.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Avx512(&'static [[i32; 16]; 5]);
 

@@ -155,7 +155,8 @@ impl Pyramid {
         if let Departure::Surface(side) = ray.departure {
             let outwards = |a: usize| (o[a] == 0.0 && d[a] < 0.0) || (o[a] == n[a] as f64 && d[a] > 0.0);
             if let Some(axis) = (0..3).find(|&a| outwards(a)) {
-                // It leaves Ω where it starts. There h = c counts as inside, which must not end a ray from the lower side.
+                // It leaves Ω where it starts. There h = c counts as inside, which must not end a ray from the lower
+                // side.
                 let closed = self.capped && side == Side::Higher;
                 let target = cap(axis, d[axis] > 0.0, side);
                 return Begun::Done(closed.then_some(FlattenedHit { t: 0.0, target }));

@@ -1,6 +1,6 @@
-//! AVX2, sixteen lines as two times eight lanes: what the compiler does not find in the plain code. Masks are vectors, all
-//! ones in a lane that is meant. Gathers cost as much as loads one by one here, or more, so that lines which lie close
-//! together are permuted out of what two loads bring.
+//! AVX2, sixteen lines as two times eight lanes: what the compiler does not find in the plain code. Masks are vectors,
+//! all ones in a lane that is meant. Gathers cost as much as loads one by one here, or more, so that lines which lie
+//! close together are permuted out of what two loads bring.
 
 use crate::sweep::clearance::Clearance;
 use crate::sweep::fans::{HIGHER, LOWER, SAMPLED, march_row};
@@ -180,7 +180,8 @@ pub(super) fn extrema(h: &[f32], s: &mut Segments, clearance: Option<&Clearance>
                 _mm256_and_si256(exists(beside), _mm256_and_si256(exists(over), exists(opposite))),
             );
             let mask = _mm256_castsi256_ps(mask);
-            // SAFETY: in lanes of the mask all four places, as unsigned numbers, are below the length of `h`, which is below 2³¹.
+            // SAFETY: in lanes of the mask all four places, as unsigned numbers, are below the length of `h`, which is
+            // below 2³¹.
             let [a, b, c, d] = unsafe {
                 let sample = |at| _mm256_mask_i32gather_ps::<4>(zero, h.as_ptr(), at, mask);
                 [sample(at), sample(beside), sample(over), sample(opposite)]
@@ -253,8 +254,9 @@ fn link<const STRICT: bool, const FORWARD: bool>(pack: &mut Pack) {
             t = _mm256_blendv_ps(t, after_top[half], pop);
             pop = _mm256_and_ps(pop, lower(t));
             while _mm256_movemask_ps(pop) != 0 {
-                // SAFETY: a lane that pops has t at most its own h, which `active` says is finite, so j is no end (their t
-                // is ∞) but a sample that this scan has linked, and `next` and `h_next` hold a number for each.
+                // SAFETY: a lane that pops has t at most its own h, which `active` says is finite, so j is no end
+                // (their t is ∞) but a sample that this scan has linked, and `next` and `h_next` hold a number for
+                // each.
                 unsafe {
                     t = _mm256_mask_i32gather_ps::<4>(t, pack.h_next[d].as_ptr().cast(), j, pop);
                     let mask = _mm256_castps_si256(pop);

@@ -98,7 +98,8 @@ pub(super) fn extrema(h: &[f32], s: &mut Segments, clearance: Option<&Clearance>
         let [over, opposite] = [at, beside].map(|x| _mm512_add_epi32(x, stride[1]));
         let exists = |at| _mm512_cmp_epu32_mask::<_MM_CMPINT_LT>(at, end);
         let mask = wanted & exists(at) & exists(beside) & exists(over) & exists(opposite);
-        // SAFETY: in lanes of the mask all four places, as unsigned numbers, are below the length of `h`, which is below 2³¹.
+        // SAFETY: in lanes of the mask all four places, as unsigned numbers, are below the length of `h`, which is
+        // below 2³¹.
         let [a, b, c, d] = unsafe {
             let sample = |at| _mm512_mask_i32gather_ps::<4>(zero, mask, at, h.as_ptr());
             [sample(at), sample(beside), sample(over), sample(opposite)]

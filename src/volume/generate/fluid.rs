@@ -1,4 +1,5 @@
-//! A Lennard-Jones fluid quenched in a closed slit pore whose two wide walls it wets. \[AT17\] Reduced units: the fluid's σ, ε and m are 1.
+//! A Lennard-Jones fluid quenched in a closed slit pore whose two wide walls it wets. \[AT17\] Reduced units: the
+//! fluid's σ, ε and m are 1.
 
 use super::molecular_dynamics::{MolecularDynamics, PairTerm, Schedule, spread_evenly};
 use super::neighbours::SimulationBox;
@@ -7,7 +8,8 @@ use crate::error::{Error, Result};
 use crate::progress::Progress;
 use glam::DVec3;
 
-/// Cut-off of the pair potential, σ. With shifted force the critical temperature is lower than the full potential's 1.3.
+/// Cut-off of the pair potential, σ. With shifted force the critical temperature is lower than the full potential's
+/// 1.3.
 const CUTOFF: f64 = 2.5;
 /// Skin of the neighbour lists, σ.
 const SKIN: f64 = 0.4;

@@ -3,8 +3,9 @@
 //! Each particle sums the forces on it by itself, in the order of its neighbour list: twice the arithmetic of Newton's
 //! third law, but the same bits for any number of threads, and pairs still cancel exactly before summation rounds.
 //!
-//! Without rescaling, at the steps that volumes are made with (2 fm/c; 0.005 Lennard-Jones times), energy drifts by −1.2·10⁻⁷ MeV
-//! per nucleon and fm/c, and by −3.4·10⁻⁶ ε per atom and Lennard-Jones time: 3·10⁻⁴ and 4·10⁻⁵ of the kinetic energy in 4000 steps.
+//! Without rescaling, at the steps that volumes are made with (2 fm/c; 0.005 Lennard-Jones times), energy drifts by
+//! −1.2·10⁻⁷ MeV per nucleon and fm/c, and by −3.4·10⁻⁶ ε per atom and Lennard-Jones time: 3·10⁻⁴ and 4·10⁻⁵ of the
+//! kinetic energy in 4000 steps.
 
 use super::neighbours::{SimulationBox, neighbours};
 use super::pair_potential::PairPotential;

@@ -105,8 +105,8 @@ impl<'a> Cells<'a> {
     }
 }
 
-/// For each particle, those within `reach` of it, as far as `members` says that either matters; itself excluded. Particles
-/// that are no members have none. Positions must lie within half an edge of the box.
+/// For each particle, those within `reach` of it, as far as `members` says that either matters; itself excluded.
+/// Particles that are no members have none. Positions must lie within half an edge of the box.
 ///
 /// `reach` must be at most half of [`SimulationBox::period`].
 pub fn neighbours(bounds: &SimulationBox, positions: &[DVec3], members: &[u32], reach: f64) -> Vec<Vec<u32>> {

@@ -10,8 +10,8 @@ use rayon::prelude::*;
 const REACH: f64 = 6.0;
 
 /// Number density of points, each convolved with a normalised Gaussian of standard deviation `sigma`, on dims³ samples
-/// over the whole box, both faces included. Along an axis that repeats, the last sample stands for the same place as the
-/// first, and images count; along others the Gaussian is cut at the face.
+/// over the whole box, both faces included. Along an axis that repeats, the last sample stands for the same place as
+/// the first, and images count; along others the Gaussian is cut at the face.
 ///
 /// # Errors
 /// `Invalid` as [`Lattice::new`].

@@ -12,8 +12,8 @@ const BINS: u32 = 8192;
 /// Distances below this fraction of the cut-off are evaluated exactly: a table over r² is coarse there.
 const INNER: f64 = 1.0 / 16.0;
 
-/// A pair potential, cut off with shifted force: V(r) − V(r_c) − (r − r_c) V′(r_c), 0 beyond r_c, so that neither energy
-/// nor force jumps. \[AT17 Ch. 5\]
+/// A pair potential, cut off with shifted force: V(r) − V(r_c) − (r − r_c) V′(r_c), 0 beyond r_c, so that neither
+/// energy nor force jumps. \[AT17 Ch. 5\]
 ///
 /// Between nodes it is a cubic Hermite polynomial in r², and the force is that polynomial's own derivative: energy is
 /// conserved as well as by the formula itself.

@@ -24,8 +24,8 @@ impl<R: Read> Words<'_, R> {
     }
 }
 
-/// The first tag in any directory whose values would take more than `trusted` bytes, and how many it promises. Directories
-/// that end early or form a ring are the decoder's to complain about.
+/// The first tag in any directory whose values would take more than `trusted` bytes, and how many it promises.
+/// Directories that end early or form a ring are the decoder's to complain about.
 pub(super) fn excessive<R: Read + Seek>(reader: &mut R, trusted: u64) -> Option<(u16, u64)> {
     reader.rewind().ok()?;
     let mut order = [0; 2];

@@ -1,5 +1,5 @@
-//! A VTK XML document whose arrays are appended: raw, 64-bit headers, zlib blocks. The arrays are borrowed and never copied
-//! whole. \[VTK\]
+//! A VTK XML document whose arrays are appended: raw, 64-bit headers, zlib blocks. The arrays are borrowed and never
+//! copied whole. \[VTK\]
 
 use super::SamplesRef;
 use super::writer::Values;
@@ -58,8 +58,8 @@ impl<'a> Document<'a> {
         self.text += &format!("{:21}/>\n", "");
     }
 
-    /// Writes the file; it appears under its name only when it is complete. No array may be empty: VTK 9.7's reader was seen to
-    /// crash on one.
+    /// Writes the file; it appears under its name only when it is complete. No array may be empty: VTK 9.7's reader was
+    /// seen to crash on one.
     ///
     /// # Errors
     /// `Io`.
