@@ -135,8 +135,8 @@ impl Study {
     /// isovalue.
     ///
     /// # Errors
-    /// As `reference()`, or from reading the cache.
-    pub fn references(&self, subject: &Subject, isovalue: f64, effort: Effort) -> Result<Option<Vec<ReferenceMesh>>> {
+    /// `Invalid` if there is no surface; as `reference()`, or from reading the cache.
+    pub fn references(&self, subject: &Subject, isovalue: f64, effort: Effort) -> Result<Vec<ReferenceMesh>> {
         let (vertices, samples) = match effort {
             _ if self.quick => (500, 128),
             Effort::Table => (4000, 1024),
@@ -144,7 +144,7 @@ impl Study {
         };
         let scene = &subject.scene;
         let c = scene.field.sweep().isovalue(isovalue);
-        let Ok(mesh) = SurfaceMesh::extract(scene, c, 1) else { return Ok(None) };
+        let mesh = SurfaceMesh::extract(scene, c, 1)?;
         let mut out = Vec::new();
         let job = scene_job(scene);
         for seed in [101, 202] {
@@ -165,7 +165,7 @@ impl Study {
             let mesh = ReferenceMesh::from_ply(&ply::read(&path)?).map_err(|e| e.in_file(&path))?;
             out.push(mesh);
         }
-        Ok(Some(out))
+        Ok(out)
     }
 
     /// A bake of `subject`, and the wall and processor seconds it took without loading and export.
@@ -242,7 +242,7 @@ mod tests {
         let new = || Study::new(dir.path().into(), Device::new(1).unwrap(), Progress::Quiet, true).unwrap();
         let study = new();
         let of = |study: &Study, subject: &Subject, isovalue: f64| {
-            study.references(subject, isovalue, Effort::Table).unwrap().expect("a surface").swap_remove(0)
+            study.references(subject, isovalue, Effort::Table).unwrap().swap_remove(0)
         };
         let (dark, bright) = (subject(0.1), subject(0.9));
         let at_47 = of(&study, &dark, 47e-6);

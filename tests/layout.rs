@@ -85,12 +85,12 @@ fn unsafe_stays_behind_its_fence() {
 fn comments_are_no_wider_than_code() {
     let rustfmt = fs::read_to_string(root().join("rustfmt.toml")).unwrap();
     let width: usize = rustfmt.lines().find_map(|l| l.strip_prefix("max_width = ")).unwrap().parse().unwrap();
-    let mut files = Vec::new();
+    let mut files = vec![root().join("build.rs")];
     ["src", "tests", "benches"].iter().for_each(|folder| rust_files(&root().join(folder), &mut files));
     let mut wrong = Vec::new();
     for file in files {
         let text = fs::read_to_string(&file).unwrap();
-        let wide = |l: &str| l.trim_start().starts_with("//") && l.chars().count() > width && l.contains(' ');
+        let wide = |l: &str| l.trim_start().starts_with("//") && l.chars().count() > width;
         wrong.extend(
             text.lines().enumerate().filter(|l| wide(l.1)).map(|(n, _)| format!("{}:{}", file.display(), n + 1)),
         );

@@ -19,6 +19,7 @@ use crate::sampling::{Strategy, positions};
 use crate::scene::Scene;
 use crate::sweep::{self, SweepSettings};
 use rayon::prelude::*;
+use std::hint::black_box;
 use std::sync::Mutex;
 use std::time::Instant;
 
@@ -283,10 +284,10 @@ fn field_seconds(
         let p = position.as_dvec3();
         let isovalue = scene.field.value(p) as f32;
         let Some(normal) = scene.normal(p, side) else { return };
-        map.irradiance(p, f64::from(isovalue), scratch);
+        black_box(map.irradiance(p, f64::from(isovalue), scratch));
         let receiver = Receiver { position, normal, isovalue, departure: Departure::Surface(side) };
         let key = (settings.seed, Stage::Cache, i as u64);
-        direct_irradiance(scene, tracer, &receiver, settings.cache_shadow_rays, key);
+        black_box(direct_irradiance(scene, tracer, &receiver, settings.cache_shadow_rays, key));
     });
     let per_node = begun.elapsed().as_secs_f64() / tried;
     // Light reaches the other side of most surfaces, too.

@@ -81,7 +81,7 @@ pub fn curve(study: &Study, subjects: &[Subject], base: &BakeOptions, limit: Opt
     for ((subject, job), isovalues) in subjects.iter().zip(&jobs).zip(&compared) {
         let mut references = Vec::new();
         for &c in isovalues {
-            references.extend(study.references(subject, c, Effort::Curve)?);
+            references.push(study.references(subject, c, Effort::Curve)?);
         }
         for Candidate { name, options } in candidates(study.quick) {
             let number = |n: Option<u64>| n.map_or_else(|| "-".to_owned(), |n| n.to_string());
