@@ -210,24 +210,68 @@ impl Field {
         [lo, hi]
     }
 
-    /// h at `p` (trilinear), exact at the nodes; NaN in a cell that holds no surface.
+    /// h at `p` (trilinear), exact at the nodes; NaN unless a cell that holds `p` has finite samples only.
     pub fn value(&self, p: DVec3) -> f64 {
         let (cell, u) = self.locate(p);
-        trilinear(&self.corners(cell).map(f64::from), u)
+        self.value_in(cell, u)
+    }
+
+    /// [`Field::value`] at `u` in a cell.
+    #[inline(always)]
+    fn value_in(&self, cell: [usize; 3], u: DVec3) -> f64 {
+        let h = trilinear(&self.corners(cell).map(f64::from), u);
+        if h.is_nan() { self.beside(cell, u).map_or(h, |(s, u)| trilinear(&s, u)) } else { h }
+    }
+
+    /// The samples of a cell that has finite ones only and shares the place `u` of a cell that has not, and the place in
+    /// it.
+    #[cold]
+    fn beside(&self, cell: [usize; 3], u: DVec3) -> Option<([f64; 8], DVec3)> {
+        self.sharing(cell, u).find(|(s, _)| s.iter().all(|s| s.is_finite())).map(|(s, u)| (s.map(f64::from), u))
+    }
+
+    /// The samples of all cells that share the place `u` of one, and the place in each: faces, edges and nodes belong to
+    /// the cells on all their sides.
+    fn sharing(&self, cell: [usize; 3], u: DVec3) -> impl Iterator<Item = ([f32; 8], DVec3)> {
+        (0..8usize).filter_map(move |sides| {
+            let (mut cell, mut u) = (cell, u);
+            for a in (0..3).filter(|a| sides >> a & 1 == 1) {
+                if u[a] != 0.0 || cell[a] == 0 {
+                    return None;
+                }
+                (cell[a], u[a]) = (cell[a] - 1, 1.0);
+            }
+            Some((self.corners(cell), u))
+        })
+    }
+
+    /// Whether all cells that hold `p` have finite samples only.
+    pub fn is_whole(&self, p: DVec3) -> bool {
+        let (cell, u) = self.locate(p);
+        self.sharing(cell, u).all(|(s, _)| s.iter().all(|s| s.is_finite()))
     }
 
     /// ∇h at `p` of the trilinear cell, per world unit. Jumps at cell faces: it serves sides and |∇h|, not cosines.
     pub fn gradient(&self, p: DVec3) -> DVec3 {
         let (cell, u) = self.locate(p);
-        self.lattice.gradient_to_world(trilinear_gradient(&self.corners(cell).map(f64::from), u))
+        let g = trilinear_gradient(&self.corners(cell).map(f64::from), u);
+        let g = if g.is_nan() { self.beside(cell, u).map_or(g, |(s, u)| trilinear_gradient(&s, u)) } else { g };
+        self.lattice.gradient_to_world(g)
     }
 
     /// [`Field::value`] and [`Field::gradient`].
     #[inline]
     pub fn value_and_gradient(&self, p: DVec3) -> (f64, DVec3) {
         let (cell, u) = self.locate(p);
-        let s = self.corners(cell).map(f64::from);
-        (trilinear(&s, u), self.lattice.gradient_to_world(trilinear_gradient(&s, u)))
+        let (mut s, mut u) = (self.corners(cell).map(f64::from), u);
+        let mut h = trilinear(&s, u);
+        if h.is_nan()
+            && let Some(finite) = self.beside(cell, u)
+        {
+            (s, u) = finite;
+            h = trilinear(&s, u);
+        }
+        (h, self.lattice.gradient_to_world(trilinear_gradient(&s, u)))
     }
 
     /// Central-difference gradient at a node, per world unit: one-sided at Ω's faces and beside non-finite samples,
@@ -434,6 +478,33 @@ mod tests {
             .unwrap();
         assert_eq!(f.node_gradient([1, 0, 0]), DVec3::new(0.25, 0.0, 0.0));
         assert!(f.falling_normal(DVec3::new(1.5, 0.5, 0.5)).unwrap().is_finite());
+    }
+
+    /// A place on the border of cells is known as soon as one of them has finite samples only.
+    #[test]
+    fn a_place_is_known_by_any_of_its_cells_that_is_finite() {
+        let mut f = oblique(|x| (3.0 * x.x).sin() + (x.y * x.z * 0.002).cos());
+        let whole = f.clone();
+        let gap = DVec3::new(2.0, 2.0, 3.0);
+        let o = f.lattice().offset(2, 2, 3);
+        f.samples[o] = f32::NAN;
+        for twice in (0..9).flat_map(|x| (0..7).flat_map(move |y| (0..11).map(move |z| [x, y, z]))) {
+            let p = DVec3::from_array(twice.map(|x| 0.5 * f64::from(x)));
+            // Within the eight cells that are gone, or where they end at Ω's face y = 3.
+            let d = p - gap;
+            let gone = d.x.abs() < 1.0 && d.y > -1.0 && d.z.abs() < 1.0;
+            let (h, g) = f.value_and_gradient(p);
+            assert_eq!((h.is_nan(), g.is_nan()), (gone, gone), "{p}");
+            assert_eq!((f.value(p).to_bits(), f.gradient(p).is_nan()), (h.to_bits(), gone), "{p}");
+            if !gone {
+                assert!((h - whole.value(p)).abs() < 1e-12 && f.gradient(p) == g, "{p}");
+            }
+            // On the gap's faces the cell beyond is the only one.
+            let beyond = d.abs().cmpeq(DVec3::ONE).bitmask();
+            if !gone && d.abs().max_element() == 1.0 && beyond.count_ones() == 1 {
+                assert!((g - whole.gradient(p + 1e-9 * d)).length() < 1e-6, "{p}");
+            }
+        }
     }
 
     #[test]

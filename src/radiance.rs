@@ -116,7 +116,7 @@ impl<T: Tracer> Sampler<'_, T> {
         let Self { scene, tracer, side, .. } = *self;
         let p = position.as_dvec3();
         let isovalue = scene.field.value(p);
-        // A point of a cell that holds no surface, since a value beside it is not finite.
+        // A point whose cells hold no surface, since each has a sample that is not finite.
         if !isovalue.is_finite() {
             return None;
         }

@@ -121,8 +121,8 @@ impl<'a> Contacts<'a> {
 
     /// What a white surface would reflect at point `o` on `wall`, the `n`th of its walls, if it would reflect `white`
     /// with that wall as its texture shows it, and the variance that this adds to the luminance that leaves. `None`
-    /// where ∇h vanishes, or where a sample that is not finite hides the isovalue at which the wall is met: what cannot
-    /// be told corrects nothing.
+    /// where ∇h vanishes, or where a cell holds no surface, since a sample is not finite: what meets the wall there is no
+    /// edge.
     #[allow(clippy::cast_possible_truncation, reason = "positions and isovalues are f32")]
     fn meet<T: Tracer>(
         &self,
@@ -135,7 +135,7 @@ impl<'a> Contacts<'a> {
         let scene = self.scene;
         let Wedge { tracer, cache, gather_rays, shadow_rays, seed } = *wedge;
         let x = local_position(&scene.field, scene.lattice(), o);
-        let isovalue = Some(scene.field.value(x) as f32).filter(|c| c.is_finite())?;
+        let isovalue = scene.field.is_whole(x).then(|| scene.field.value(x) as f32)?;
         let polygon = &scene.polygons()[wall as usize];
         // The share of either hemisphere that the other surface fills. \[Lambert1760\]
         let share = 0.5 * (1.0 - scene.normal(x, side)?.dot(polygon.normal()));

@@ -1,7 +1,7 @@
 //! A field at the points of a lattice over Ω, a row along x at a time: in which cell a point lies and where is found
 //! once for each axis instead of once for each point.
 
-use super::{Field, trilinear};
+use super::Field;
 use crate::volume::Lattice;
 use glam::DVec3;
 
@@ -37,7 +37,7 @@ impl<'a> FieldRows<'a> {
     #[inline(always)]
     pub fn value(&self, point: [usize; 3]) -> f64 {
         let [(i, u), (j, v), (k, w)] = [0, 1, 2].map(|a| self.places[a][point[a]]);
-        trilinear(&self.field.corners([i, j, k]).map(f64::from), DVec3::new(u, v, w))
+        self.field.value_in([i, j, k], DVec3::new(u, v, w))
     }
 
     /// [`Self::value`] of the points of row (`j`, `k`), in their order, rounded to f32; `to` takes one for each.

@@ -6,6 +6,7 @@ mod colour;
 mod companions;
 mod context;
 mod crossings;
+mod gaps;
 mod invariance;
 mod photons;
 mod samplers;
