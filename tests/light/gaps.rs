@@ -9,7 +9,8 @@ use isolume::mask::Mask;
 use isolume::scene::{Boundary, Scene, Surface};
 use isolume::volume::{Lattice, Samples, Volume};
 
-/// The bumps with a ball of samples missing where many surfaces pass; or the same with all axes of the lattice turned round.
+/// The bumps with a ball of samples missing where many surfaces pass; or the same with all axes of the lattice turned
+/// round.
 fn bumps_with_a_gap(turned: bool) -> Scene {
     const N: usize = 24;
     let lattice = Lattice::aligned([N; 3], DVec3::ZERO, DVec3::splat(1.0 / (N - 1) as f64)).unwrap();
@@ -42,8 +43,8 @@ fn cells(field: &Field, p: DVec3) -> [bool; 2] {
     found
 }
 
-/// Points on the border of a gap hold light of their own level set, whichever side of it they lie on: the same as with axes turned
-/// round, which puts what is missing on their other side.
+/// Points on the border of a gap hold light of their own level set, whichever side of it they lie on: the same as with
+/// axes turned round, which puts what is missing on their other side.
 #[test]
 fn points_beside_a_gap_are_lit_on_all_its_sides() {
     let [scene, turned] = [false, true].map(bumps_with_a_gap);
