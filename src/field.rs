@@ -223,15 +223,15 @@ impl Field {
         if h.is_nan() { self.beside(cell, u).map_or(h, |(s, u)| trilinear(&s, u)) } else { h }
     }
 
-    /// The samples of a cell that has finite ones only and shares the place `u` of a cell that has not, and the place in
-    /// it.
+    /// The samples of a cell that has finite ones only and shares the place `u` of a cell that has not, and the place
+    /// in it.
     #[cold]
     fn beside(&self, cell: [usize; 3], u: DVec3) -> Option<([f64; 8], DVec3)> {
         self.sharing(cell, u).find(|(s, _)| s.iter().all(|s| s.is_finite())).map(|(s, u)| (s.map(f64::from), u))
     }
 
-    /// The samples of all cells that share the place `u` of one, and the place in each: faces, edges and nodes belong to
-    /// the cells on all their sides.
+    /// The samples of all cells that share the place `u` of one, and the place in each: faces, edges and nodes belong
+    /// to the cells on all their sides.
     fn sharing(&self, cell: [usize; 3], u: DVec3) -> impl Iterator<Item = ([f32; 8], DVec3)> {
         (0..8usize).filter_map(move |sides| {
             let (mut cell, mut u) = (cell, u);

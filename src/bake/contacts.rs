@@ -121,8 +121,8 @@ impl<'a> Contacts<'a> {
 
     /// What a white surface would reflect at point `o` on `wall`, the `n`th of its walls, if it would reflect `white`
     /// with that wall as its texture shows it, and the variance that this adds to the luminance that leaves. `None`
-    /// where ∇h vanishes, or where a cell holds no surface, since a sample is not finite: what meets the wall there is no
-    /// edge.
+    /// where ∇h vanishes, or where a cell holds no surface, since a sample is not finite: what meets the wall there is
+    /// no edge.
     #[allow(clippy::cast_possible_truncation, reason = "positions and isovalues are f32")]
     fn meet<T: Tracer>(
         &self,
