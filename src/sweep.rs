@@ -214,7 +214,7 @@ pub fn sweep_resumable(
     let sides = swept_sides(scene);
     let replicates = settings.replicates.max(1);
     let mut flats = Flats::new(scene, settings.flat_resolution.0.max(2), settings.flat_resolution.1.max(2));
-    let mut state = State::new(&stored, geometry.h.len(), replicates);
+    let mut state = State::new(&sides, stored.len(), geometry.h.len(), replicates);
     let mut passes = saved.read(0, |bytes| state.restore(bytes, sides.len(), &mut flats)).flatten();
     if state.counts.valid == 0 {
         let nodes = geometry.h.len();

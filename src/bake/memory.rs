@@ -53,15 +53,15 @@ const GRID: u64 = 17;
 const CACHED: u64 = 12;
 
 /// Bytes of the sweep engine per grid point (h turned over, normals, one plane of a pass turned over, bits per block),
-/// per point and swept side (direct light, what lines read, what a pass gathers), and per point and stored side (sums
-/// over replicates and their spread). Direct light takes less: 44 and what its lines see.
+/// per point and swept side (direct light, what lines read, what a pass gathers; and sums over replicates), and per
+/// point and stored side (their spread, while it is written). Direct light takes less: 44 and what its lines see.
 const SWEPT: u64 = 13;
 const SWEPT_SIDE: u64 = 26;
-const SUMMED_SIDE: u64 = 9;
-/// Per point and swept side while light settles, before there are such sums: what lines read a pass before, here and in
-/// a checkpoint; and of the sums' bytes those of the spread.
-const SETTLING_SIDE: u64 = 14;
+const SUMMED_SIDE: u64 = 6;
 const SPREAD_SIDE: u64 = 3;
+/// Per point and swept side while light settles, before there are such sums: what lines read a pass before, here and in
+/// a checkpoint.
+const SETTLING_SIDE: u64 = 14;
 /// The same where the level of light may be corrected: what few directions lack, here and in a checkpoint.
 const LEVEL_SIDE: u64 = 12;
 
@@ -229,7 +229,7 @@ impl Parts {
         let texels = flat::texels(scene, settings.wall_resolution, settings.wall_isovalues) as u64;
         let sides = sweep::swept_sides(scene).len() as u64;
         let settling = SETTLING_SIDE + if sweep::bright(scene) { LEVEL_SIDE } else { 0 };
-        let summed = (2 * stored * SUMMED_SIDE).max(sides * settling + 2 * stored * SPREAD_SIDE);
+        let summed = 2 * stored * SPREAD_SIDE + sides * settling.max(2 * SUMMED_SIDE);
         let swept = points * (SWEPT + sides * (SWEPT_SIDE + KEPT_SIDE) + summed);
         let ([landings, lower, higher], gather) = match settings.engine {
             Engine::Photon => (landings(scene, settings, device)?, settings.gather_rays > 0),

@@ -107,7 +107,7 @@ impl Run<'_> {
     /// is all it needs. What replicates share in this way are the bounces before their last, which the last one
     /// averages over the sphere.
     fn warm(&self, state: &State) -> bool {
-        state.done > 0 && self.settings.settles() && state.total.sides().len() == self.sides.len()
+        state.done > 0 && self.settings.settles()
     }
 
     /// What the next pass is for.

@@ -43,10 +43,10 @@ pub(super) struct Passes {
 }
 
 impl State {
-    pub(super) fn new(stored: &[Side], nodes: usize, replicates: usize) -> Self {
+    pub(super) fn new(sides: &[Side], stored: usize, nodes: usize, replicates: usize) -> Self {
         Self {
             done: 0,
-            total: Totals::new(stored, nodes, replicates),
+            total: Totals::new(sides, stored, nodes, replicates),
             flats: Vec::new(),
             bounces: 0,
             residual: 0.0,
@@ -162,9 +162,8 @@ impl State {
     fn parse(&self, bytes: &[u8], sides: usize, flats: &Flats) -> Option<Parsed> {
         let mut from = Reader { bytes };
         let nodes = self.total.nodes();
-        let stored = self.total.sides();
         let replicates = if self.total.spread.is_empty() { 1 } else { 2 };
-        let mut state = Self::new(stored, nodes, replicates);
+        let mut state = Self::new(self.total.sides(), self.total.stored(), nodes, replicates);
         state.done = from.count()?;
         state.total.count = state.done;
         state.bounces = from.count()?;
@@ -199,7 +198,7 @@ impl State {
         }
         let bounced = from.count()?;
         if state.done > 0 {
-            state.total.light = from.half_planes(bounced.min(stored.len()), nodes)?;
+            state.total.light = from.half_planes(bounced.min(sides), nodes)?;
             for (sum, texture) in state.flats.iter_mut().zip(&flats.textures) {
                 if let Some(t) = texture {
                     *sum = Some(from.numbers(t.radiance.len())?);

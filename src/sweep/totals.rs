@@ -17,7 +17,9 @@ pub(super) fn stride(nodes: usize) -> usize {
 
 /// Sums over replicates.
 pub(super) struct Totals {
+    /// The swept sides, the stored ones first.
     sides: Vec<Side>,
+    stored: usize,
     nodes: usize,
     /// Sum of the direct irradiance of all swept sides over the replicates so far; gone once it is that of all.
     pub(super) lighting: Vec<Planes>,
@@ -25,7 +27,7 @@ pub(super) struct Totals {
     pub(super) lit: usize,
     /// Mean of their direct irradiance.
     pub(super) direct: Vec<HalfPlanes>,
-    /// Sum of the indirect irradiance of the stored sides.
+    /// Sum of the indirect irradiance of all swept sides.
     pub(super) light: Vec<HalfPlanes>,
     /// Roots of the sums of squared deviations of the luminance of ρE/π from its mean, of direct and of indirect light:
     /// they come from independent sets. \[Welford62\]
@@ -37,10 +39,14 @@ pub(super) struct Totals {
 }
 
 impl Totals {
-    pub(super) fn new(sides: &[Side], n: usize, replicates: usize) -> Self {
-        let spread = if replicates > 1 { vec![vec![bf16::ZERO; n]; sides.len()] } else { Vec::new() };
+    pub(super) fn new(sides: &[Side], stored: usize, n: usize, replicates: usize) -> Self {
+        let spread = if replicates > 1 { vec![vec![bf16::ZERO; n]; stored] } else { Vec::new() };
         let (lighting, direct, light, parts) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-        Self { sides: sides.to_vec(), nodes: n, lighting, lit: 0, direct, light, spread, parts, count: 0 }
+        Self { sides: sides.to_vec(), stored, nodes: n, lighting, lit: 0, direct, light, spread, parts, count: 0 }
+    }
+
+    pub(super) fn stored(&self) -> usize {
+        self.stored
     }
 
     pub(super) fn sides(&self) -> &[Side] {
@@ -86,7 +92,7 @@ impl Totals {
         let light = std::mem::take(&mut self.light);
         self.deviate(scene, new, self.count, |s, c, i| before * light[s].at(c, i));
         let mut old = light.into_iter();
-        self.light = new[..self.sides.len()].iter().map(|new| HalfPlanes::new(new, 1.0, old.next())).collect();
+        self.light = new.iter().map(|new| HalfPlanes::new(new, 1.0, old.next())).collect();
     }
 
     /// Adds the deviations of the light of the replicate that is the `count`th of its kind, where `mean` (side,
@@ -113,7 +119,7 @@ impl Totals {
             (0..3).map(|c| luminance[c] * planes[c][i]).sum::<f32>()
         };
         let nodes = (0..self.nodes).step_by(stride(self.nodes));
-        let part = new[..self.sides.len()].iter().flat_map(|planes| nodes.clone().map(|i| at(planes, i)));
+        let part = new[..self.stored].iter().flat_map(|planes| nodes.clone().map(|i| at(planes, i)));
         match self.parts.get_mut(count - 1) {
             // Its direct light is there.
             Some(sum) => sum.iter_mut().zip(part).for_each(|(sum, x)| *sum += x),
@@ -156,7 +162,7 @@ impl Totals {
             };
             SweptSide { side, irradiance, std_error: spread.next().map(error).unwrap_or_default() }
         };
-        self.sides.iter().zip(self.direct).map(side).collect()
+        self.sides.iter().take(self.stored).zip(self.direct).map(side).collect()
     }
 }
 
