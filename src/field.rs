@@ -71,6 +71,8 @@ pub struct Field {
     samples: Vec<f32>,
     /// No finite sample is larger in magnitude.
     largest: f32,
+    /// Whether some sample is NaN.
+    gaps: bool,
     /// The field that gives receiver normals, if this one is a finer copy of it.
     coarse: Option<Arc<Field>>,
 }
@@ -107,7 +109,7 @@ impl Field {
                 sweep.hi()
             )));
         }
-        let samples = (0..volume.samples().len())
+        let samples: Vec<f32> = (0..volume.samples().len())
             .into_par_iter()
             .with_min_len(1 << 14)
             .map(|i| {
@@ -115,7 +117,9 @@ impl Field {
                 if v.is_finite() { sweep.isovalue(v).clamp(-FARTHEST, FARTHEST) } else { f32::NAN }
             })
             .collect();
-        Ok(Self { lattice: volume.lattice.clone(), sweep, samples, largest: largest.min(FARTHEST), coarse: None })
+        let gaps = samples.par_iter().with_min_len(1 << 14).any(|s| s.is_nan());
+        let (lattice, largest) = (volume.lattice.clone(), largest.min(FARTHEST));
+        Ok(Self { lattice, sweep, samples, largest, gaps, coarse: None })
     }
 
     /// The same function on another lattice over the same Ω: exactly the same where that divides this one's cells.
@@ -127,6 +131,7 @@ impl Field {
             sweep: self.sweep,
             samples: self.samples_at(lattice),
             largest: self.largest,
+            gaps: self.gaps,
             coarse: Some(Arc::new(self.clone())),
         }
     }
@@ -172,6 +177,11 @@ impl Field {
     /// The largest magnitude that a sample may have.
     pub fn largest(&self) -> f32 {
         self.largest
+    }
+
+    /// Whether some sample is not finite, so that the cells around it hold no surface.
+    pub fn has_gaps(&self) -> bool {
+        self.gaps
     }
 
     /// The cell that holds `p`, and `p` inside it in [0, 1]³.
@@ -246,7 +256,7 @@ impl Field {
     }
 
     /// Whether all cells that hold `p` have finite samples only.
-    pub fn is_whole(&self, p: DVec3) -> bool {
+    pub fn is_whole_around(&self, p: DVec3) -> bool {
         let (cell, u) = self.locate(p);
         self.sharing(cell, u).all(|(s, _)| s.iter().all(|s| s.is_finite()))
     }

@@ -20,6 +20,7 @@ mod directions;
 mod ends;
 mod fans;
 mod flats;
+mod gaps;
 mod gather;
 mod grid;
 mod half;
@@ -32,6 +33,7 @@ mod points;
 mod reflect;
 mod replicate;
 mod runs;
+mod scan;
 mod segments;
 mod settling;
 #[allow(unsafe_code, reason = "vector instructions: measured to pay, chosen at run time")]
@@ -171,6 +173,16 @@ pub fn supported(scene: &Scene) -> Result<()> {
         )));
     }
     let inside = ends::inside(scene);
+    let lamp = scene.luminaires().iter().any(|&number| inside[number as usize]);
+    if scene.boundary == Boundary::Capped
+        && scene.surface.stored_sides().contains(&Side::Higher)
+        && (lamp || scene.surface.emission != DVec3::ZERO)
+    {
+        return Err(Error::NotSupported(
+            "boundary = \"capped\": sweeps take caps for black from within, where this scene has light; use --engine photon"
+                .into(),
+        ));
+    }
     if let Some((_, p)) = inside.iter().zip(scene.polygons()).find(|(inside, p)| **inside && !p.opaque_back) {
         return Err(Error::NotSupported(format!(
             "polygon '{}' stands inside the volume, where sweeps cannot see it; use --engine photon",
@@ -191,7 +203,8 @@ fn numbered([nx, ny, nz]: [usize; 3]) -> bool {
 ///
 /// # Errors
 /// `NotSupported` for several fields that light each other, if a polygon that is not a luminaire stands inside the
-/// volume, if there are more than [`MOST_POLYGONS`], or about 2³¹ points or more: that needs the photon engine.
+/// volume, if there are more than [`MOST_POLYGONS`], or about 2³¹ points or more, and for the inside of capped solids
+/// if there may be light in it: that needs the photon engine.
 pub fn sweep(scene: &Scene, settings: &SweepSettings, tick: &(dyn Fn(f64) -> bool + Sync)) -> Result<SweepResult> {
     sweep_resumable(scene, settings, Stage::UNSAVED, tick)
 }
@@ -278,12 +291,13 @@ pub fn sweep_resumable(
 
 /// The sides that are swept: the stored ones, and the other one if light passes to it.
 pub(crate) fn swept_sides(scene: &Scene) -> Vec<Side> {
-    // Only around the open rims of level sets, outside Ω.
+    // Only around the open rims of level sets: outside Ω, or beside samples that are not finite.
     let margin = {
         let [lo, hi] = gather::local_bounds(scene);
         lo.min(scene.lattice().far() - hi).min_element() < -1e-6
     };
-    let coupled = margin && scene.boundary == Boundary::Open && !scene.polygons().is_empty();
+    let rims = (margin || scene.field.has_gaps()) && scene.boundary == Boundary::Open;
+    let coupled = rims && !scene.polygons().is_empty();
     let mut sides = scene.surface.stored_sides();
     if coupled && sides.len() == 1 {
         sides.push(sides[0].opposite());

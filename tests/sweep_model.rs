@@ -319,6 +319,32 @@ fn caps_close_level_sets() {
     assert!(got.flats.iter().flatten().flat_map(|t| &t.texels).flatten().all(|x| x.is_finite()));
 }
 
+/// Light from outside stays outside: the inside of capped solids is black, beside the luminaire too, and the outside as
+/// if it alone were stored.
+#[test]
+fn the_inside_of_capped_solids_is_dark() {
+    let scene = |both_sides: bool, emission: f64| {
+        let f = field(cube(25, 0.0, 1.0), (3.6, 95.0), bumps);
+        let walls = cornell_box(f.lattice(), 0.05).unwrap();
+        let surface = Surface { both_sides, emission: DVec3::splat(emission), ..Surface::default() };
+        Scene::new(f, surface, Boundary::Capped, walls).unwrap()
+    };
+    // Few points: they are far apart, so that nodes near the luminaire look at points of their own.
+    let settings = SweepSettings { directions: 64, light_points: 4, max_bounces: 3, ..ONE_BOUNCE };
+    let [both, one] = [true, false].map(|both| run(&scene(both, 0.0), settings));
+    // Nodes near the luminaire take other points where both are stored.
+    let apart: Vec<f64> =
+        nodes(&scene(false, 0.0), 0).iter().map(|&o| radiosity(&both, o) - radiosity(&one, o)).collect();
+    let (mean, rms) = mean_rms(&apart);
+    let [most, inside] =
+        [&one.sides[0], &both.sides[1]].map(|side| side.irradiance.iter().flatten().fold(0f32, |m, x| m.max(*x)));
+    println!("outside {most}, apart {mean:.5}, RMS {rms:.5}, inside {inside}");
+    assert!(most > 0.1 && mean.abs() < 1e-3 && rms < 5e-3 && inside == 0.0);
+    let refused = sweep(&scene(true, 1.0), &settings, &|_| true).unwrap_err().to_string();
+    assert!(refused.contains("caps") && refused.contains("--engine photon"), "{refused}");
+    assert!(sweep(&scene(false, 1.0), &settings, &|_| true).is_ok());
+}
+
 #[test]
 fn holes_in_the_data_hold_no_surface_and_hide_nothing() {
     let f = |hole: bool| {
@@ -343,6 +369,32 @@ fn holes_in_the_data_hold_no_surface_and_hide_nothing() {
     let (mean, rms) = mean_rms(&errors);
     println!("holes: mean {mean:.6}, RMS {rms:.6}");
     assert!(mean.abs() < 1e-4 && rms < 1e-3);
+}
+
+/// Planes that glow, but for those in a gap in the middle of Ω: walls see those that there are from both sides, since
+/// light goes around the rims, and nothing at the isovalues of the others.
+#[test]
+fn walls_see_nothing_in_a_gap() {
+    let f = field(cube(21, 0.0, 1.0), (0.0, 1.0), |x| if (x.x - 0.5).abs() < 0.09 { f64::NAN } else { x.x });
+    let walls = closed_box(f.lattice(), 0.0, 0.5, 0.0);
+    let black = Surface { albedo: DVec3::ZERO.into(), emission: DVec3::ONE, ..Surface::default() };
+    let scene = Scene::new(f, black, Boundary::Open, walls).unwrap();
+    let got = run(&scene, SweepSettings { flat_resolution: (8, 20), ..ONE_BOUNCE });
+    for (face, wall) in got.flats.iter().take(6).enumerate() {
+        let wall = wall.as_ref().unwrap();
+        let [nu, nv, nc] = wall.dims;
+        let mean = |t: usize| {
+            let texels = &wall.texels[t * nu * nv..(t + 1) * nu * nv];
+            texels.iter().map(|x| f64::from(x[1])).sum::<f64>() / texels.len() as f64
+        };
+        let means: Vec<f64> = (0..nc).map(mean).collect();
+        println!("face {face}: {means:.3?}");
+        for (t, mean) in means.iter().enumerate() {
+            // The rims lie at 0.4 and 0.6.
+            let there = ((t as f64 + 0.5) / nc as f64 - 0.5).abs() > 0.1;
+            assert!(if there { *mean > 0.05 } else { *mean == 0.0 }, "face {face}, texel {t}: {mean}");
+        }
+    }
 }
 
 #[test]

@@ -135,7 +135,7 @@ impl<'a> Contacts<'a> {
         let scene = self.scene;
         let Wedge { tracer, cache, gather_rays, shadow_rays, seed } = *wedge;
         let x = local_position(&scene.field, scene.lattice(), o);
-        let isovalue = scene.field.is_whole(x).then(|| scene.field.value(x) as f32)?;
+        let isovalue = scene.field.is_whole_around(x).then(|| scene.field.value(x) as f32)?;
         let polygon = &scene.polygons()[wall as usize];
         // The share of either hemisphere that the other surface fills. \[Lambert1760\]
         let share = 0.5 * (1.0 - scene.normal(x, side)?.dot(polygon.normal()));

@@ -3,8 +3,9 @@
 
 use super::ends::Ends;
 use super::flats::{Arrivals, Flats, Stop, fill_column};
+use super::gaps::Crossing;
 use super::gather::{Pass, local_bounds};
-use super::half::{Half4, decode};
+use super::half::{Half4, colour, decode};
 use super::pack::{LANES, OUTSIDE, Pack, Plan};
 use crate::flattened::Side;
 use crate::rng::{Rng, Stage};
@@ -14,6 +15,29 @@ use std::ops::RangeInclusive;
 /// Lines per texel edge that report to walls. Each reports to four texels, so that one reaches every texel from every
 /// direction; half of one showed as a weave on the walls.
 const LINES_PER_TEXEL: f64 = 1.0;
+
+/// A line that meets Ω: its pack, B of this side and the other, its lane, and where it enters and leaves.
+type Samples<'a> = (&'a Pack, [&'a [Half4]; 2], usize, [f64; 2]);
+
+/// The rows of a pack that were read between two places τ of a line, which lies in Ω over `span`, in the order from one
+/// to the other: slice k is row k + 1, and the entry and exit rows belong to ends outside Ω.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to rows")]
+fn rows(pack: &Pack, span: [f64; 2], (from, to): (f64, f64)) -> impl Iterator<Item = usize> {
+    let forward = to > from;
+    let bound = |tau: f64, up: bool| -> usize {
+        if tau <= span[0] + 1e-6 {
+            0
+        } else if tau >= span[1] - 1e-6 {
+            pack.h.len()
+        } else {
+            (if up { tau.floor() + 2.0 } else { tau.ceil() + 1.0 }) as usize
+        }
+    };
+    let (lo, hi) = if forward { (bound(from, true), bound(to, false)) } else { (bound(to, true), bound(from, false)) };
+    let count = pack.awake.len();
+    let row = move |step: usize| pack.awake[if forward { step } else { count - 1 - step }] as usize;
+    (0..count).map(row).filter(move |row| (lo..hi).contains(row))
+}
 
 /// The walls' part of one family of lines.
 pub(super) struct Walls<'a> {
@@ -96,8 +120,8 @@ impl<'a> Walls<'a> {
         (start..=if reports { last } else { start - 1 }).step_by(stride.unsigned_abs())
     }
 
-    /// Reports of lines (first + lane, q), whose samples are in `pack`.
-    pub(super) fn through(&self, pack: &Pack, b: &[Half4], first: isize, q: isize, out: &mut Arrivals) {
+    /// Reports of lines (first + lane, q), whose samples are in `pack`, with B of this side and the other.
+    pub(super) fn through(&self, pack: &Pack, b: [&[Half4]; 2], first: isize, q: isize, out: &mut Arrivals) {
         for p in self.reporting(first..=first + LANES as isize - 1, q) {
             let lane = (p - first).unsigned_abs();
             let span = pack.spans.map(|tau| tau[lane]);
@@ -126,7 +150,7 @@ impl<'a> Walls<'a> {
 
     /// What every front on one line sees along it.
     #[inline(always)]
-    fn line(&self, samples: Option<(&Pack, &[Half4], usize, [f64; 2])>, p: isize, q: isize, out: &mut Arrivals) {
+    fn line(&self, samples: Option<Samples>, p: isize, q: isize, out: &mut Arrivals) {
         let nc = self.flats.isovalues;
         let (pf, qf) = (p as f64, q as f64);
         for (wall, forward) in self.ends.fronts(pf, qf) {
@@ -141,7 +165,12 @@ impl<'a> Walls<'a> {
                 fill_column(self.flats, next, values);
                 match samples {
                     Some((pack, b, lane, span)) if self.meets(wall.tau, reach, span) => {
-                        self.staircase((pack, b), lane, span, (wall.tau, reach), (pf, qf), values)
+                        let way = (wall.tau, reach);
+                        if pack.gapped >> lane & 1 == 1 {
+                            self.staircase_with_gaps((pack, b), lane, span, way, (pf, qf), values)
+                        } else {
+                            self.staircase((pack, b[0]), lane, span, way, (pf, qf), values)
+                        }
                     }
                     _ if self.primary => (0, nc),
                     _ => (0, 0),
@@ -156,7 +185,6 @@ impl<'a> Walls<'a> {
 
     /// Replaces in `values` (what the far end shows) the isovalues that meet a level set first, seen from τ = `from`.
     /// Returns the isovalues that lie on this side there.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to rows and texels")]
     fn staircase(
         &self,
         (pack, b): (&Pack, &[Half4]),
@@ -167,36 +195,17 @@ impl<'a> Walls<'a> {
         values: &mut [f32],
     ) -> (usize, usize) {
         let nc = self.flats.isovalues;
-        let rows = pack.h.len();
         let forward = to > from;
-        // Rows between the two ends: slice k is row k + 1; the entry and exit rows belong to ends outside Ω.
-        let bound = |tau: f64, up: bool| -> usize {
-            if tau <= span[0] + 1e-6 {
-                0
-            } else if tau >= span[1] - 1e-6 {
-                rows
-            } else {
-                (if up { tau.floor() + 2.0 } else { tau.ceil() + 1.0 }) as usize
-            }
-        };
-        let (lo, hi) =
-            if forward { (bound(from, true), bound(to, false)) } else { (bound(to, true), bound(from, false)) };
         let higher = self.plan.sign < 0.0;
-        // Isovalue number t in ascending order of sign · c.
-        let ordinal = |t: usize| if higher { nc - 1 - t } else { t };
-        let height = |t: usize| (t as f32 + 0.5) / nc as f32 - if higher { 1.0 } else { 0.0 };
+        let ordinal = |t: usize| self.ordinal(t);
+        let height = |t: usize| self.height(t);
         let mut t = 0;
         let mut first = None;
         let mut before: Option<(usize, f32)> = None;
         // Rows that were not read hold nothing at these isovalues.
-        let count = pack.awake.len();
-        for step in 0..count {
-            let row = pack.awake[if forward { step } else { count - 1 - step }] as usize;
-            if row < lo || row >= hi {
-                continue;
-            }
+        for row in rows(pack, span, (from, to)) {
             let h = pack.h[row][lane];
-            if h == OUTSIDE || h.is_nan() {
+            if h == OUTSIDE {
                 continue;
             }
             match before {
@@ -230,6 +239,66 @@ impl<'a> Walls<'a> {
             return if higher { (0, 0) } else { (0, nc) };
         }
         if higher { (0, nc - first) } else { (first, nc) }
+    }
+
+    /// [`Self::staircase`] along a line through samples that are not finite, with B of this side and the other: beyond
+    /// them isovalues may go on inside the solid, and meet level sets from there.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "slices in Ω")]
+    fn staircase_with_gaps(
+        &self,
+        (pack, b): (&Pack, [&[Half4]; 2]),
+        lane: usize,
+        span: [f64; 2],
+        (from, to): (f64, f64),
+        pq: (f64, f64),
+        values: &mut [f32],
+    ) -> (usize, usize) {
+        let nc = self.flats.isovalues;
+        let (forward, higher) = (to > from, self.plan.sign < 0.0);
+        let (first_slice, last_slice) = (span[0].ceil() as usize, span[1].floor() as usize);
+        let start = pack.h[if forward { first_slice } else { last_slice } + 1][lane];
+        let entry = rows(pack, span, (from, to)).map(|row| pack.h[row][lane]).find(|h| *h != OUTSIDE);
+        let asleep = (first_slice..=last_slice).any(|k| !pack.was_read(k + 1));
+        // Isovalues whose solid the line enters Ω in. Where there are nothing but gaps, one side takes all.
+        let inside = match entry {
+            Some(h) => (0..nc).take_while(|&t| self.height(t) <= h).count(),
+            None if asleep || self.primary => 0,
+            None => nc,
+        };
+        // Caps close Ω, but no gaps.
+        let mut first = inside;
+        if self.capped {
+            let covered = if start == OUTSIDE { 0 } else { inside };
+            self.cap(span[usize::from(!forward)], pq, covered, values);
+            first = covered;
+        }
+        for t in first..nc {
+            let mut ray = Crossing::new(self.height(t), false);
+            let met = rows(pack, span, (from, to)).find_map(|row| ray.step(row, pack.h[row][lane]));
+            if let Some((row, front)) = met {
+                let node = pack.node[row][lane] as usize;
+                let radiance = colour(b[usize::from(!front)].get(node).copied().unwrap_or_default());
+                for c in 0..3 {
+                    values[c * nc + self.ordinal(t)] = self.unit * radiance[c];
+                }
+            }
+        }
+        match (self.capped, higher) {
+            (true, true) => (0, 0),
+            (true, false) => (0, nc),
+            (false, true) => (0, nc - inside),
+            (false, false) => (inside, nc),
+        }
+    }
+
+    /// Isovalue number `t` of the textures in ascending order of sign · c.
+    fn ordinal(&self, t: usize) -> usize {
+        if self.plan.sign < 0.0 { self.flats.isovalues - 1 - t } else { t }
+    }
+
+    /// Its sign · c.
+    fn height(&self, t: usize) -> f32 {
+        (t as f32 + 0.5) / self.flats.isovalues as f32 - if self.plan.sign < 0.0 { 1.0 } else { 0.0 }
     }
 
     /// The first `count` isovalues meet the cap where the line crosses Ω's face at `tau`.

@@ -68,8 +68,13 @@ pub(super) fn direct(
             }
             let y = lattice.to_index(world);
             let inside = (0..3).all(|a| y[a] >= 0.0 && y[a] <= lattice.far()[a]);
-            let start = if inside { scene.field.value(y) as f32 } else { f32::NEG_INFINITY };
-            let start = if start.is_nan() { f32::NEG_INFINITY } else { start };
+            let start = if inside { scene.field.value(y) as f32 } else { f32::NAN };
+            let start = match start.is_nan() {
+                false => [start; 2],
+                // Caps let no light into solids.
+                true if !inside && capped(scene) => [f32::NEG_INFINITY; 2],
+                true => [f32::NEG_INFINITY, f32::INFINITY],
+            };
             fans.march((geometry, isa, sides), y, start);
             // Fourth powers of the world's lengths do not fit f32; the unit falls out.
             let axes = lattice.axes() / unit;
@@ -145,6 +150,18 @@ impl Staircases {
     fn add(&mut self, g: f64, from: usize, until: usize) {
         self.from[from] += g;
         self.until[until] += g;
+    }
+
+    /// `g` at all texels that no range of h of `hidden` hides, from texel `here` on on the lower side, before on the
+    /// higher; `below`: the number of texels at or below h.
+    fn add_beside(&mut self, g: f64, here: usize, hidden: &[[f32; 2]], below: impl Fn(f32) -> usize) {
+        let n = self.from.len() - 1;
+        let open = |t: &usize| !hidden.iter().any(|[least, most]| (below(*least)..below(*most)).contains(t));
+        for t in (0..n).filter(open) {
+            let (sums, begin, end) = if t < here { (&mut self.until, t + 1, t) } else { (&mut self.from, t, t + 1) };
+            sums[begin] += g;
+            sums[end] -= g;
+        }
     }
 
     /// Light of each texel, of the sides that count, times the factors of the lower and the higher one.
@@ -237,8 +254,15 @@ fn walls(
                     segments.set(lane, lattice, h, ly, lx);
                     seen[lane] = (g, here);
                 }
+                let seen = seen.iter().enumerate().filter(|(_, s)| s.0 != 0.0);
+                if geometry.has_gaps() {
+                    for (lane, &(g, here)) in seen {
+                        lit.add_beside(g, here, &segments.ranges(scene.field.samples(), lane), below);
+                    }
+                    continue;
+                }
                 isa.extrema(scene.field.samples(), &mut segments, clearance);
-                for (lane, &(g, here)) in seen.iter().enumerate().filter(|(_, s)| s.0 != 0.0) {
+                for (lane, &(g, here)) in seen {
                     let open = below(segments.most[lane]).max(here);
                     lit.add(g, open, below(segments.least[lane]).min(open));
                 }
@@ -249,9 +273,43 @@ fn walls(
             let rgb = (light.emission * e).to_array();
             for c in 0..3 {
                 for t in (0..nc).filter(|&t| all[t] > 0.0) {
-                    out[c * nc + t] += (rgb[c] * lit[t] / all[t]) as f32;
+                    out[c * nc + t] += (rgb[c] * lit[t].max(0.0) / all[t]) as f32;
                 }
             }
         });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What one range hides lies between the steps from its greatest on and up to its least; two also leave what is
+    /// between them.
+    #[test]
+    fn ranges_hide_texels() {
+        const N: usize = 8;
+        let even = [1.0; 2].map(|x| vec![x; N]);
+        let below = |h: f32| (h.max(0.0) as usize).min(N);
+        let beside = |here, hidden: &[[f32; 2]]| {
+            [(true, false), (false, true)].map(|(lower, higher)| {
+                let mut stairs = Staircases::new(N);
+                stairs.add_beside(2.0, here, hidden, below);
+                stairs.sums(lower, higher, &even)
+            })
+        };
+        for (least, most, here) in [(2.0, 5.0, 3), (2.0, 5.0, 2), (2.0, 5.0, 5), (-1.0, 3.0, 0), (6.0, 99.0, 8)] {
+            let expected = [(true, false), (false, true)].map(|(lower, higher)| {
+                let mut stairs = Staircases::new(N);
+                let open = below(most).max(here);
+                stairs.add(2.0, open, below(least).min(open));
+                stairs.sums(lower, higher, &even)
+            });
+            assert_eq!(beside(here, &[[least, most]]), expected, "{least} … {most}, {here}");
+        }
+        let [lower, higher] = beside(4, &[[1.0, 2.0], [5.0, 6.0]]);
+        assert_eq!(lower, [0.0, 0.0, 0.0, 0.0, 2.0, 0.0, 2.0, 2.0]);
+        assert_eq!(higher, [2.0, 0.0, 2.0, 2.0, 0.0, 0.0, 0.0, 0.0]);
+        assert_eq!(beside(8, &[]), [vec![0.0; N], vec![2.0; N]]);
     }
 }

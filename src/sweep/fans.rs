@@ -2,6 +2,7 @@
 //! which samples see the point on their own level set.
 
 use super::directions::Layout;
+use super::gaps::Hidden;
 use super::grid::{Blocks, Geometry};
 use crate::flattened::Side;
 use crate::isa::Isa;
@@ -80,9 +81,9 @@ impl Fan {
         isa: Isa,
         h: &[f32],
         awake: [Option<&Blocks>; 2],
-        start: f32,
+        start: [f32; 2],
         row: usize,
-        [most, least, mixed]: &mut [Vec<f32>; 3],
+        (hidden, [most, least, mixed]): &mut (Option<Hidden>, [Vec<f32>; 3]),
         (out, turn): (&mut [u8], u8),
     ) {
         let [nu, nv, _] = self.layout.dims;
@@ -90,8 +91,9 @@ impl Fan {
         let np = self.count[0];
         most.clear();
         least.clear();
-        most.resize(np, start);
-        least.resize(np, if start.is_finite() { start } else { f32::INFINITY });
+        most.resize(np, start[0]);
+        least.resize(np, start[1]);
+        hidden.iter_mut().for_each(|hidden| hidden.clear(np));
         let q = (self.first[1] + row as isize) as f64;
         for (step, out) in out.chunks_exact_mut(np).enumerate() {
             let k = self.slice(step);
@@ -125,6 +127,9 @@ impl Fan {
             mixed.extend(near.iter().zip(far).map(|(a, b)| a + fv * (b - a)));
             let place = [u0 + lo as f32 * du - i0 as f32, du];
             isa.march(mixed, place, [&mut most[lo..hi], &mut least[lo..hi]], &mut out[lo..hi], turn);
+            if let Some(hidden) = hidden {
+                hidden.look(mixed, place, lo, [&mut most[lo..hi], &mut least[lo..hi]], &mut out[lo..hi]);
+            }
         }
     }
 
@@ -167,10 +172,11 @@ pub(super) struct Fans {
 }
 
 impl Fans {
-    /// Marches along all lines of the fans of local point `y`, where h is `start`, side by side: the rows of one fan
-    /// alone are too few for threads to share well. They take the place of another point's: most of the lines of the
-    /// widest miss Ω, and memory that is new, or cleared, for every point would be written as a whole.
-    pub(super) fn march(&mut self, (geometry, isa, sides): (&Geometry, Isa, &[Side]), y: DVec3, start: f32) {
+    /// Marches along all lines of the fans of local point `y`, where `start` is the greatest and least h so far, side
+    /// by side: the rows of one fan alone are too few for threads to share well. They take the place of another
+    /// point's: most of the lines of the widest miss Ω, and memory that is new, or cleared, for every point would be
+    /// written as a whole.
+    pub(super) fn march(&mut self, (geometry, isa, sides): (&Geometry, Isa, &[Side]), y: DVec3, start: [f32; 2]) {
         self.source = y;
         self.fans = std::array::from_fn(|f| Fan::new(geometry.dims, y, f % 3, f >= 3));
         self.turn = self.turn.wrapping_add(TURN);
@@ -195,7 +201,7 @@ impl Fans {
             rest = after;
         }
         rows.into_par_iter().with_max_len(8).for_each_init(
-            || [const { Vec::new() }; 3],
+            || (geometry.has_gaps().then(Hidden::default), [const { Vec::new() }; 3]),
             |scratch, (fan, row, out)| {
                 let awake: [Option<&Blocks>; 2] =
                     std::array::from_fn(|s| Some(geometry.awake(&fan.layout, *sides.get(s)?)));
@@ -224,7 +230,6 @@ fn join(a: (usize, usize), b: (usize, usize)) -> (usize, usize) {
 /// What lines from number `start` on see that meet u = place\[0\] + n · place\[1\] (line n) in a row of samples, in
 /// this turn; takes the row into their extrema.
 #[inline(always)]
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the row")]
 pub(super) fn march_row(
     row: &[f32],
     [u0, du]: [f32; 2],
@@ -233,18 +238,24 @@ pub(super) fn march_row(
     out: &mut [u8],
     turn: u8,
 ) {
-    let last = row.len() - 2;
     for (n, ((most, least), out)) in most.iter_mut().zip(least).zip(out).enumerate().skip(start) {
-        let u = (u0 + n as f32 * du).max(0.0);
-        let i = (u as usize).min(last);
-        let (a, b) = (row[i], row[i + 1]);
-        let x = a + (u - i as f32) * (b - a);
+        let x = sample(row, [u0, du], n);
         let seen = u8::from(x > *most) * LOWER + u8::from(x <= *least) * HIGHER + SAMPLED;
         *out = if x.is_nan() { 0 } else { seen + turn };
         // f32::max and min pass over NaN.
         *most = most.max(x);
         *least = least.min(x);
     }
+}
+
+/// h where line `n` meets a row of samples, as [`march_row`] has them.
+#[inline(always)]
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the row")]
+pub(super) fn sample(row: &[f32], [u0, du]: [f32; 2], n: usize) -> f32 {
+    let u = (u0 + n as f32 * du).max(0.0);
+    let i = (u as usize).min(row.len() - 2);
+    let (a, b) = (row[i], row[i + 1]);
+    a + (u - i as f32) * (b - a)
 }
 
 #[cfg(test)]
@@ -275,7 +286,7 @@ mod tests {
         for to in [DVec3::Z, DVec3::new(0.3, -0.2, 1.0), DVec3::new(-1.0, 0.9, 0.0), DVec3::new(1.0, 1.0, -1.0)] {
             let fans = [1e5, 1e6, 1e7].map(|far| {
                 let mut fans = Fans::default();
-                fans.march((&geometry, isa, &sides), middle + far * to, f32::NEG_INFINITY);
+                fans.march((&geometry, isa, &sides), middle + far * to, [f32::NEG_INFINITY, f32::INFINITY]);
                 // A lattice for each pyramid that it may lie in, sheared by no more than its depth.
                 assert!(fans.seen.len() < 6 * 32 * 32 * 32, "{to} {far}: {}", fans.seen.len());
                 fans
@@ -312,8 +323,8 @@ mod tests {
                 y.z = 14.0 + rng.unit();
             }
             let mut new = Fans::default();
-            fans.march((&geometry, isa, &sides), y, 0.3);
-            new.march((&geometry, isa, &sides), y, 0.3);
+            fans.march((&geometry, isa, &sides), y, [0.3; 2]);
+            new.march((&geometry, isa, &sides), y, [0.3; 2]);
             for at in (0..geometry.h.len()).filter(|&at| geometry.lit(at)) {
                 let x = field.lattice().ijk(at).map(|i| i as f64);
                 let seen = fans.visibility(x);
@@ -322,7 +333,7 @@ mod tests {
             }
             // Until the next has the same turn.
             for _ in 0..if n % 2 == 0 { u8::MAX / TURN - 1 } else { 0 } {
-                fans.march((&small, isa, &sides), DVec3::splat(1.3), 0.3);
+                fans.march((&small, isa, &sides), DVec3::splat(1.3), [0.3; 2]);
             }
         }
         assert!(partial > 1000, "{partial}");

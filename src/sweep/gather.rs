@@ -3,13 +3,15 @@
 use super::arrive;
 use super::directions::Shear;
 use super::ends::{Ends, Standing};
-use super::flats::{Arrivals, Flats, Incoming};
+use super::flats::{Arrivals, Flats, Incoming, capped};
+use super::gaps::Around;
 use super::grid::{Geometry, Source};
 use super::half::Half4;
 use super::normals::decode;
-use super::pack::{LANES, Light, Pack, Plan, Way};
+use super::pack::{LANES, Pack, Plan};
 use super::planes::{Planes, Spare};
 use super::runs::Runs;
+use super::scan::{Light, Way};
 use super::simd::prefetch;
 use crate::flattened::Side;
 use crate::isa::Isa;
@@ -36,6 +38,9 @@ pub(super) struct Pass<'a> {
 /// The radiance that the samples of a row of lines meet: [channel][slice][line].
 type RowLight = [Vec<f32>; 3];
 
+/// Lines of a row without a sample, a bit each: [slice][pack]. Empty where all samples are finite.
+type RowGaps = Vec<u16>;
+
 /// The irradiance of a row of nodes, a slice per channel.
 type Row<'a> = [&'a mut [f32]; 3];
 
@@ -57,6 +62,7 @@ fn inwards(j: usize, n: usize) -> isize {
 pub(super) struct Workspace {
     pack: Pack,
     light: [RowLight; 2],
+    gaps: [RowGaps; 2],
     /// Slice and place along v of the rows of nodes beside a row of lines.
     nodes: Vec<[usize; 2]>,
 }
@@ -65,32 +71,36 @@ pub(super) struct Workspace {
 struct Family<'a> {
     plan: &'a Plan,
     source: Source<'a>,
+    /// B of the other side; nothing if that is dark.
+    back: &'a [Half4],
     /// In the memory order of its lines.
     normals: &'a [u32],
     ends: &'a Ends,
     flats: &'a Flats,
     walls: arrive::Walls<'a>,
     way: Way,
+    /// Whether caps close what lines run in: black from within.
+    closed: bool,
     /// The direction times what |ω·N| weighs.
     omega: [f32; 3],
 }
 
 impl Pass<'_> {
-    /// Irradiance of every node of `side` from the radiance `b` of the nodes (times `scale`) and the flats, along all
-    /// `lines` and both their directions. Flats receive too. `tick` is asked before every family; false stops with what
-    /// is done.
+    /// Irradiance of every node of `side` from the radiance `b` of the nodes' sides (times `scale`), this one's first,
+    /// and the flats, along all `lines` and both their directions. Flats receive too. `tick` is asked before every
+    /// family; false stops with what is done.
     #[allow(clippy::too_many_arguments, reason = "one caller")]
     pub(super) fn gather(
         &self,
         side: Side,
         lines: &[Shear],
-        b: &[Half4],
+        b: [&[Half4]; 2],
         scale: f32,
         flats: &Flats,
         incoming: &mut Incoming,
         tick: &mut dyn FnMut() -> bool,
     ) -> (Planes, bool) {
-        let mut e = self.spare.black(b.len());
+        let mut e = self.spare.black(b[0].len());
         let split = lines.partition_point(|s| !s.layout.transposed);
         let mut complete = true;
         // Walls receive what one family brought while the next is under way.
@@ -150,7 +160,7 @@ impl Pass<'_> {
         &self,
         (side, shear, lines): (Side, &Shear, usize),
         normals: &[u32],
-        (b, scale): (&[Half4], f32),
+        ([b, back], scale): ([&[Half4]; 2], f32),
         rows: &Rows,
         (flats, incoming, before): (&Flats, &mut Incoming, Vec<Arrivals>),
     ) -> Vec<Arrivals> {
@@ -162,10 +172,12 @@ impl Pass<'_> {
         let family = Family {
             plan: &plan,
             source: self.geometry.source(&shear.layout, side, b),
+            back,
             normals,
             ends: &ends,
             flats,
             way: Way { strict: side == Side::Higher, sign },
+            closed: side == Side::Higher && capped(self.scene),
             omega: (shear.omega * share).as_vec3().to_array(),
             // Rows that meet Ω, one behind them for the last row of nodes, and those that only walls see.
             walls,
@@ -212,10 +224,17 @@ impl Pass<'_> {
         let plan = family.plan;
         let size = plan.shear.layout.dims[2] * plan.width;
         let spare = self.workspaces.lock().expect("no thread panics").pop();
-        let empty = || Workspace { pack: Pack::with_rows(0), light: Default::default(), nodes: Vec::new() };
+        let empty = || Workspace {
+            pack: Pack::with_rows(0),
+            light: Default::default(),
+            gaps: Default::default(),
+            nodes: Vec::new(),
+        };
         let mut work = spare.unwrap_or_else(empty);
         work.pack.fit(plan.shear.layout.dims[2]);
         work.light.iter_mut().flatten().for_each(|l| l.resize(size, 0.0));
+        let packs = if family.source.gaps { size / LANES } else { 0 };
+        work.gaps.iter_mut().for_each(|g| g.resize(packs, 0));
         let mut walked = None;
         while let Some(n) = runs.next(own) {
             let q = first + n as isize;
@@ -227,12 +246,14 @@ impl Pass<'_> {
             }
             let mut arrivals = arrivals[n].lock().expect("no thread panics");
             self.row_of_lines(family, q, &mut work, n % 2, Some(&mut arrivals));
-            let light = [&work.light[n % 2], &work.light[1 - n % 2]];
+            let (this, before) = (n % 2, 1 - n % 2);
+            let light = [&work.light[this], &work.light[before]];
+            let gaps = [&work.gaps[this], &work.gaps[before]];
             let mut coming = nodes.first().map(|&at| self.ask(family, rows, at));
             for (i, &at) in nodes.iter().enumerate() {
                 let next = nodes.get(i + 1).map(|&at| self.ask(family, rows, at));
                 let row = std::mem::replace(&mut coming, next);
-                self.accumulate(family, light, &mut row.expect("asked for before"), at);
+                self.accumulate(family, (light, gaps), &mut row.expect("asked for before"), at);
             }
             work.nodes = nodes;
             walked = Some(n);
@@ -259,12 +280,20 @@ impl Pass<'_> {
             let p = plan.first[0] + start as isize;
             if self.isa.read(pack, plan, &family.source, p, q) {
                 self.isa.end(pack, plan, family.ends, family.flats, p, q);
+                if family.closed {
+                    pack.lasts = [[0; LANES]; 2];
+                }
                 let flats = family.flats;
                 let light = Light { b: family.source.b, flats: &flats.packed, isovalues: flats.isovalues };
-                self.isa.scan(pack, family.way, light, &mut work.light[which], (plan.width, start));
+                let place = (plan.width, start);
+                self.isa.scan(pack, family.way, light, &mut work.light[which], place);
+                if family.source.gaps {
+                    let (light, out) = ((family.way, light, family.back), &mut work.light[which]);
+                    self.isa.look_through_gaps(pack, light, out, &mut work.gaps[which], place);
+                }
             }
             if let Some(arrivals) = &mut arrivals {
-                family.walls.through(pack, family.source.b, p, q, arrivals);
+                family.walls.through(pack, [family.source.b, family.back], p, q, arrivals);
             }
         }
         if let Some(arrivals) = arrivals {
@@ -288,7 +317,13 @@ impl Pass<'_> {
 
     /// Adds what a row of lines and the one before it brought to a row of nodes: each node takes its four nearest lines
     /// by bilinear weights, which go on linearly on Ω's faces ([`inwards`]), times the cosine of its own normal.
-    fn accumulate(&self, family: &Family, light: [&RowLight; 2], row: &mut Row, [k, j]: [usize; 2]) {
+    fn accumulate(
+        &self,
+        family: &Family,
+        (light, gaps): ([&RowLight; 2], [&RowGaps; 2]),
+        row: &mut Row,
+        [k, j]: [usize; 2],
+    ) {
         let plan = family.plan;
         let layout = &plan.shear.layout;
         let [nu, nv, _] = layout.dims;
@@ -301,6 +336,8 @@ impl Pass<'_> {
             light.map(|light| std::array::from_fn(|c| &light[c][k * plan.width..][..plan.width]));
         let at = k * layout.stride[1] + j * layout.stride[0];
         let n = &family.normals[at..][..nu];
+        let gaps = gaps.map(|gaps| gaps.get(k * plan.width / LANES..).unwrap_or_default());
+        let rims = self.geometry.rims(layout);
         let lit = self.geometry.lit_blocks(layout);
         let [e0, e1, e2] = row;
         let mut bits = lit.rows[at / nu];
@@ -310,15 +347,25 @@ impl Pass<'_> {
             let run = (!(bits >> a)).trailing_zeros() as usize;
             bits = if a + run >= 64 { 0 } else { bits >> (a + run) << (a + run) };
             let (a, b) = (a * lit.size, ((a + run) * lit.size).min(nu));
-            self.isa.accumulate(
-                [&mut e0[..], &mut e1[..], &mut e2[..]],
-                n,
-                family.omega,
-                light,
-                line0,
-                [fu, fv],
-                (a, b),
-            );
+            let mut vectors = |a: usize, b: usize| {
+                let e = [&mut e0[..], &mut e1[..], &mut e2[..]];
+                self.isa.accumulate(e, n, family.omega, light, line0, [fu, fv], (a, b));
+            };
+            let mut from = a;
+            for &i in rims.map_or(&[][..], |rims| rims.within(at / nu, a, b)) {
+                let i = i as usize;
+                vectors(from, i);
+                from = i + 1;
+            }
+            vectors(from, b);
+        }
+        for &i in rims.map_or(&[][..], |rims| rims.within(at / nu, 0, nu)) {
+            let i = i as usize;
+            let cos = cosine(family.omega, n[i]);
+            let lines = Around::new((i, nu), line0, [fu, fv]);
+            for (c, e) in [&mut e0[..], &mut e1[..], &mut e2[..]].into_iter().enumerate() {
+                e[i] += cos * lines.mean([light[0][c], light[1][c]], gaps);
+            }
         }
     }
 }

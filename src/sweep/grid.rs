@@ -2,6 +2,7 @@
 //! without a surface.
 
 use super::directions::Layout;
+use super::gaps::Rims;
 use super::half::{Half4, decode, encode};
 use super::normals;
 use super::planes::{Planes, Spare, transpose, transposed};
@@ -23,6 +24,8 @@ pub(super) struct Geometry<'a> {
     /// Of lit nodes; the others have none.
     pub normals: Vec<u32>,
     rings: Vec<Vec<u32>>,
+    /// Per memory order, the lit nodes beside samples that are not finite; `None` if all are.
+    rims: Option<[Rims; 2]>,
     /// Per memory order, the blocks of lit nodes.
     lit_blocks: [Blocks; 2],
     /// Per side and memory order, the blocks of nodes within one node of those that reach the sweep.
@@ -134,6 +137,8 @@ pub(super) struct Source<'a> {
     pub h: &'a [f32],
     pub b: &'a [Half4],
     awake: &'a Blocks,
+    /// Whether some samples are not finite.
+    pub gaps: bool,
     /// Rows of nodes from one v or slice to the next.
     step: [usize; 2],
 }
@@ -176,6 +181,7 @@ impl<'a> Geometry<'a> {
         // Nodes that are not lit take no light whatever lines bring.
         normals.par_iter_mut().zip(&lit).with_min_len(1 << 14).filter(|(_, lit)| !**lit).for_each(|(n, _)| *n = 0);
         let rings = rings(dims, &lit);
+        let rims = field.has_gaps().then(|| Rims::both(dims, h, |at| lit[at]));
         let h_transposed = transposed(h, dims);
         // Whole vectors are accumulated; packs of lines start anywhere.
         let whole = |n: usize| (n.div_ceil(64).next_multiple_of(16), 0);
@@ -189,7 +195,7 @@ impl<'a> Geometry<'a> {
                 Blocks::across(dims, fine(ny), reaches).joined(nz),
             ]
         });
-        Self { dims, h, h_transposed, normals, rings, lit_blocks, awake }
+        Self { dims, h, h_transposed, normals, rings, rims, lit_blocks, awake }
     }
 
     /// Whether a node is lit.
@@ -219,7 +225,8 @@ impl<'a> Geometry<'a> {
     /// What lines of `side` read.
     pub(super) fn source<'s>(&'s self, layout: &Layout, side: Side, b: &'s [Half4]) -> Source<'s> {
         let nu = layout.dims[0];
-        Source { h: self.h(layout), b, awake: self.awake(layout, side), step: layout.stride.map(|s| s / nu) }
+        let (h, awake, gaps) = (self.h(layout), self.awake(layout, side), self.has_gaps());
+        Source { h, b, awake, gaps, step: layout.stride.map(|s| s / nu) }
     }
 
     /// The blocks where lines of `side` read, in the memory order of `layout`.
@@ -295,6 +302,16 @@ impl<'a> Geometry<'a> {
         &self.lit_blocks[usize::from(layout.transposed)]
     }
 
+    /// Whether some samples are not finite.
+    pub(super) fn has_gaps(&self) -> bool {
+        self.rims.is_some()
+    }
+
+    /// The lit nodes beside samples that are not finite, in the memory order of `layout`.
+    pub(super) fn rims(&self, layout: &Layout) -> Option<&Rims> {
+        self.rims.as_ref().map(|rims| &rims[usize::from(layout.transposed)])
+    }
+
     /// h in the memory order of `layout`.
     pub(super) fn h(&self, layout: &Layout) -> &[f32] {
         if layout.transposed { &self.h_transposed } else { self.h }
@@ -337,7 +354,7 @@ impl<'a> Geometry<'a> {
 
 /// Nodes that are not known but share a cell with one that is.
 #[allow(clippy::cast_possible_truncation, reason = "nodes are numbered in 32 bits")]
-fn ring([nx, ny, nz]: [usize; 3], known: &[bool]) -> Vec<u32> {
+pub(super) fn ring([nx, ny, nz]: [usize; 3], known: &[bool]) -> Vec<u32> {
     // One axis at a time.
     let along = |from: &[bool], stride: usize, n: usize| -> Vec<bool> {
         let mut to = from.to_vec();

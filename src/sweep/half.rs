@@ -26,6 +26,12 @@ pub(super) fn decode(x: u16) -> f32 {
     f32::from_bits(u32::from(x) << 13) * REBIAS
 }
 
+/// Red, green and blue.
+#[inline(always)]
+pub(super) fn colour([r, g, b, _]: Half4) -> [f32; 3] {
+    [decode(r), decode(g), decode(b)]
+}
+
 /// The power of two that brings `greatest` near the top of the range.
 pub(super) fn scale(greatest: f32) -> f32 {
     if !(greatest > 0.0 && greatest.is_finite()) {

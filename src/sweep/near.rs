@@ -3,6 +3,7 @@
 //! along segments.
 
 use super::blockers::Blockers;
+use super::flats::capped;
 use super::grid::Geometry;
 use super::pack::LANES;
 use super::points::Points;
@@ -63,7 +64,9 @@ pub(super) fn look(
                     let (y, g) = aim.sample(set.point2(n as u32, 0));
                     looks.sums[i * per + s][1] += g as f32;
                     let y = lattice.to_index(y);
-                    if g > 0.0 && !blockers.block(number, None, y, x) {
+                    // Caps let no light into solids.
+                    let closed = side == Side::Higher && capped(scene) && y.clamp(DVec3::ZERO, lattice.far()) != y;
+                    if g > 0.0 && !closed && !blockers.block(number, None, y, x) {
                         looks.add(&scene.field, [y, x], Look { place: i * per + s, side, h, g: g as f32 });
                     }
                 }

@@ -1,5 +1,4 @@
-//! Sixteen neighbouring lines in lock-step: h and B along them, what they end on, and the next value ≥ h of every
-//! sample.
+//! Sixteen neighbouring lines in lock-step: h and B along them, and what they end on.
 
 #![allow(clippy::needless_range_loop, reason = "a channel indexes several planes at once")]
 
@@ -10,7 +9,6 @@ use super::directions::Shear;
 use super::ends::Ends;
 use super::flats::{Flats, Stop};
 use super::grid::Source;
-use super::half::{Half4, decode};
 use super::simd::prefetch;
 
 /// Lines in a pack.
@@ -19,7 +17,7 @@ pub(super) const LANES: usize = 16;
 const AHEAD: usize = 6;
 /// One number for each line of a pack.
 pub(super) type Lanes = [f32; LANES];
-/// h where a line is outside Ω.
+/// h where a line is outside Ω, or in a cell that holds no surface.
 pub(super) const OUTSIDE: f32 = f32::NEG_INFINITY;
 /// h where it was not read, since nothing there reaches the sweep: below everything, so that no ray ends there.
 pub(super) const ASLEEP: f32 = f32::MIN;
@@ -146,25 +144,6 @@ pub(super) struct Cut {
     pub places: [u32; 2],
 }
 
-/// What rays meet.
-#[derive(Clone, Copy)]
-pub(super) struct Light<'a> {
-    /// B of the nodes.
-    pub b: &'a [Half4],
-    /// [`Flats::packed`], and its isovalues.
-    pub flats: &'a [Half4],
-    pub isovalues: usize,
-}
-
-/// How to scan.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Way {
-    /// The next value must be greater, not only as great: the higher side.
-    pub strict: bool,
-    /// The sign h was read with.
-    pub sign: f32,
-}
-
 /// The samples of sixteen lines. Row 0 and the last hold nothing but entry and exit points; row k + 1 is slice k. A
 /// line's entry and exit through Ω's sides stand in the rows before its first and after its last slice.
 pub(super) struct Pack {
@@ -186,6 +165,10 @@ pub(super) struct Pack {
     /// [`Plan::spans`] of the lines.
     pub spans: [[f64; LANES]; 2],
     pub cuts: Vec<Cut>,
+    /// The lanes with samples in cells that hold no surface.
+    pub gapped: u16,
+    /// Per direction (+, −), the row of the first sample beyond the gap after each.
+    pub reentries: [Vec<[u32; LANES]>; 2],
     /// Where in [`Flats::packed`] the ends of lines are, per direction (+, −).
     pub lasts: [[u32; LANES]; 2],
     scratch: Vec<(f64, [Stop; 2])>,
@@ -214,9 +197,19 @@ impl Pack {
             stripe: Vec::new(),
             spans: [[0.0; LANES]; 2],
             cuts: Vec::new(),
+            gapped: 0,
+            reentries: Default::default(),
             lasts: [[0; LANES]; 2],
             scratch: Vec::new(),
         }
+    }
+
+    /// Lets all rows count as read.
+    #[cfg(test)]
+    #[allow(clippy::cast_possible_truncation, reason = "rows of a pack")]
+    pub(super) fn read_all(&mut self) {
+        self.is_awake.fill(true);
+        self.awake = (0..self.h.len() as u32).collect();
     }
 
     /// Places from here on are ends.
@@ -292,6 +285,10 @@ impl Pack {
         }
         #[allow(clippy::cast_possible_truncation, reason = "rows of a pack")]
         self.awake.extend(self.is_awake.iter().enumerate().filter(|(_, a)| **a).map(|(row, _)| row as u32));
+        self.gapped = 0;
+        if source.gaps {
+            self.open_gaps();
+        }
         !self.awake.is_empty()
     }
 
@@ -331,12 +328,17 @@ impl Pack {
         }
     }
 
+    /// Whether a row was read: in the others nothing reaches the sweep.
+    pub(super) fn was_read(&self, row: usize) -> bool {
+        self.is_awake[row]
+    }
+
     /// h where line (p, q) in `lane` enters and leaves Ω, if it was read there.
     pub(super) fn border(&self, plan: &Plan, lane: usize, p: isize, q: isize) -> [Option<f32>; 2] {
         let slices = plan.shear.layout.dims[2];
         let sample = |row: usize| {
             let h = self.h[row][lane];
-            (self.is_awake[row] && h != OUTSIDE && !h.is_nan()).then_some(h)
+            (self.was_read(row) && h != OUTSIDE).then_some(h)
         };
         let inside = |k: &usize| plan.within(*k, (p, q)).0 == 0 && plan.within(*k, (p, q)).1 > 0;
         let first = (0..slices).find(inside).and_then(|k| sample(k).or(sample(k + 1)));
@@ -456,109 +458,6 @@ impl Pack {
     pub(super) fn last(&self, lane: usize, forward: bool) -> u32 {
         self.ends() as u32 + self.lasts[usize::from(!forward)][lane]
     }
-
-    /// For every sample, the radiance that its ray meets which leaves downhill: B where h is first back at the sample's
-    /// value, or what stands at the end. \[BSV93: all nearest greater values, one line per lane\]
-    ///
-    /// Uphill the ray of the same line runs inside the solid; which way is downhill tells the neighbouring samples, as
-    /// the receiver normal does. Writes slice k to `out` at k · width + start.
-    pub(super) fn scan(&mut self, way: Way, light: Light, out: &mut [Vec<f32>], place: (usize, usize)) {
-        self.link(way, true);
-        self.link(way, false);
-        self.look(way, light, out, place);
-    }
-
-    /// Finds for every sample the next value ≥ its own towards +τ (`forward`) or −τ; with `strict` it must be greater.
-    #[allow(clippy::cast_possible_truncation, reason = "places in a pack")]
-    fn link(&mut self, way: Way, forward: bool) {
-        let default: [u32; LANES] = std::array::from_fn(|lane| self.last(lane, forward));
-        let (mut at, mut top) = (default, [f32::INFINITY; LANES]);
-        let d = usize::from(!forward);
-        for step in 0..self.awake.len() {
-            let row = self.awake[if forward { self.awake.len() - 1 - step } else { step }] as usize;
-            self.close(row, forward, |lane, place| (at[lane], top[lane]) = (place, f32::INFINITY));
-            for lane in 0..LANES {
-                let value = self.h[row][lane];
-                if value == OUTSIDE {
-                    (at[lane], top[lane]) = (default[lane], f32::INFINITY);
-                    continue;
-                }
-                if !value.is_finite() {
-                    continue;
-                }
-                let (mut j, mut t) = (at[lane], top[lane]);
-                while t < value || (way.strict && t == value) {
-                    t = self.h_next[d].as_flattened()[j as usize];
-                    j = self.next[d].as_flattened()[j as usize];
-                }
-                self.next[d][row][lane] = j;
-                self.h_next[d][row][lane] = t;
-                (at[lane], top[lane]) = ((row * LANES + lane) as u32, value);
-            }
-        }
-    }
-
-    /// Calls `close` with the lanes of which cuts close what lies beyond them when a scan comes to `row`, and the place
-    /// of what they show. Rows between that were not read count.
-    #[inline(always)]
-    pub(super) fn close(&self, row: usize, forward: bool, mut close: impl FnMut(usize, u32)) {
-        if self.cuts.is_empty() {
-            return;
-        }
-        let position = self.awake.binary_search(&u32::try_from(row).expect("a row")).expect("a row that was read");
-        // Cuts after row r lie between r and r + 1; the nearest comes last.
-        let (from, to) = if forward {
-            (row, self.awake.get(position + 1).map_or(usize::MAX, |r| *r as usize))
-        } else {
-            (position.checked_sub(1).map_or(0, |p| self.awake[p] as usize), row)
-        };
-        let mut each = |cut: &Cut| {
-            if (from..to).contains(&cut.row) {
-                close(cut.lane, self.ends() as u32 + cut.places[usize::from(!forward)]);
-            }
-        };
-        if forward {
-            self.cuts.iter().rev().for_each(&mut each);
-        } else {
-            self.cuts.iter().for_each(&mut each);
-        }
-    }
-
-    /// Reads the radiance that the samples' downhill rays meet.
-    fn look(&self, way: Way, light: Light, out: &mut [Vec<f32>], (width, start): (usize, usize)) {
-        let (rows, ends) = (self.h.len(), self.ends());
-        for &row in &self.awake {
-            let row = row as usize;
-            if row == 0 || row == rows - 1 {
-                continue;
-            }
-            for lane in 0..LANES {
-                let value = self.h[row][lane];
-                let mut rgb = [0f32; 3];
-                if value.is_finite() {
-                    // Beyond the first and the last slice there is nothing to compare with.
-                    let forward = self.h[(row + 1).min(rows - 2)][lane] < self.h[(row - 1).max(1)][lane];
-                    let d = usize::from(!forward);
-                    let (j, t) = (self.next[d][row][lane] as usize, self.h_next[d][row][lane]);
-                    if j < ends {
-                        let near = if forward { j - LANES } else { j + LANES };
-                        let h0 = self.h.as_flattened()[near];
-                        // The nearer of the two samples around the hit; the later one if that before is missing (NaN).
-                        let first = (value - h0) < 0.5 * (t - h0);
-                        let node = self.node.as_flattened()[if first { near } else { j }];
-                        rgb = std::array::from_fn(|c| decode(light.b[node as usize][c]));
-                    } else {
-                        let (i, f) = isovalue(light.isovalues, way.sign * value);
-                        let (a, b) = (light.flats[j - ends + i], light.flats[j - ends + i + 1]);
-                        rgb = std::array::from_fn(|c| (1.0 - f) * decode(a[c]) + f * decode(b[c]));
-                    }
-                }
-                for c in 0..3 {
-                    out[c][(row - 1) * width + start + lane] = rgb[c];
-                }
-            }
-        }
-    }
 }
 
 /// A number in [0, 1) for a lane of a pack.
@@ -568,13 +467,4 @@ fn dither(seed: u32, lane: usize) -> f32 {
     let x = (seed ^ lane as u32).wrapping_mul(0x9e37_79b1);
     let x = (x ^ x >> 15).wrapping_mul(0x85eb_ca77);
     ((x ^ x >> 13) >> 8) as f32 / (1 << 24) as f32
-}
-
-/// Between which texels of n ≥ 2 isovalue c lies, and how far: linear between texel centres.
-#[inline]
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the texture")]
-fn isovalue(n: usize, c: f32) -> (usize, f32) {
-    let x = (c * n as f32 - 0.5).max(0.0).min((n - 1) as f32);
-    let i = (x as usize).min(n - 2);
-    (i, x - i as f32)
 }

@@ -205,7 +205,9 @@ impl Run<'_> {
                     self.spare.keep(indirect.drain(..).flatten());
                 }
                 let mut incoming = flats.open();
-                for (&side, b) in self.sides.iter().zip(&now.light.b) {
+                for (n, &side) in self.sides.iter().enumerate() {
+                    // Each and, where there are two, the other.
+                    let b = [n, 1 - n].map(|n| now.light.b.get(n).map_or(&[][..], |b| &b[..]));
                     let (e, all) = pass.gather(side, lines, b, now.light.unit, flats, &mut incoming, &mut ask);
                     complete &= all;
                     indirect.push(e);

@@ -22,6 +22,8 @@ pub(super) struct Segments {
     pub first: [i32; LANES],
     pub count: [i32; LANES],
     pub way: [i32; LANES],
+    /// h at the ends in Ω, that of the lesser slice first; NaN if it was not asked for.
+    pub ends: [[f32; LANES]; 2],
     /// Least and greatest h so far.
     pub least: [f32; LANES],
     pub most: [f32; LANES],
@@ -40,6 +42,7 @@ impl Segments {
         first: [0; LANES],
         count: [0; LANES],
         way: [1; LANES],
+        ends: [[f32::NAN; LANES]; 2],
         least: [f32::INFINITY; LANES],
         most: [f32::NEG_INFINITY; LANES],
         enough: [[f32::NEG_INFINITY; LANES], [f32::INFINITY; LANES]],
@@ -80,6 +83,7 @@ impl Segments {
         b: DVec3,
     ) {
         (self.least[lane], self.most[lane], self.count[lane]) = (f32::INFINITY, f32::NEG_INFINITY, 0);
+        let mut ends = [f32::NAN; 2];
         let far = lattice.far();
         let d = b - a;
         let (mut from, mut to) = (0f64, 1f64);
@@ -97,13 +101,17 @@ impl Segments {
         if !(from <= to) {
             return;
         }
-        for t in &[from, to][..if BEFORE { 1 } else { 2 }] {
-            let h = h(a + t * d);
-            self.least[lane] = self.least[lane].min(h);
-            self.most[lane] = self.most[lane].max(h);
+        for (end, t) in ends.iter_mut().zip([from, to]).take(if BEFORE { 1 } else { 2 }) {
+            *end = h(a + t * d);
+            self.least[lane] = self.least[lane].min(*end);
+            self.most[lane] = self.most[lane].max(*end);
         }
         let size = d.abs();
         let axis = if size.z >= size.x && size.z >= size.y { 2 } else { usize::from(size.y >= size.x) };
+        if d[axis] < 0.0 {
+            ends.reverse();
+        }
+        (self.ends[0][lane], self.ends[1][lane]) = ends.into();
         if d[axis] == 0.0 {
             return;
         }
@@ -134,24 +142,16 @@ impl Segments {
     /// Takes h of all slices into the extrema, bilinear in each, or of as many as a lane needs to find enough; NaN
     /// counts nothing. `h`: the samples of the fields of [`Segments::set`]. With `clearance`, where h is below the
     /// sweep some slices are left out.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
+    #[allow(clippy::cast_sign_loss, reason = "strides")]
     pub(super) fn march(&mut self, h: &[f32], clearance: Option<&Clearance>) {
         for lane in 0..LANES {
-            let [stride, blocks] = [self.stride, self.blocks].map(|all| all.map(|s| s[lane] as usize));
+            let blocks = self.blocks.map(|s| s[lane] as usize);
             let mut step = 0;
             while step < self.count[lane] {
                 if self.least[lane] < self.enough[0][lane] || self.most[lane] >= self.enough[1][lane] {
                     break;
                 }
-                let k = self.first[lane] + step * self.way[lane];
-                let x = [0, 1].map(|i| (self.start[i][lane] + k as f32 * self.slope[i][lane]).max(0.0));
-                let cell = [0, 1].map(|i| (x[i] as i32).min(self.last[i][lane]));
-                let [f, g] = [0, 1].map(|i| (x[i] - cell[i] as f32).min(1.0));
-                let [i, j, k] = [cell[0], cell[1], k].map(|x| x as usize);
-                let at = i * stride[0] + j * stride[1] + k * stride[2];
-                let line = |at: usize| h[at] + f * (h[at + stride[0]] - h[at]);
-                let (near, far) = (line(at), line(at + stride[1]));
-                let value = near + g * (far - near);
+                let (value, [i, j, k]) = self.sample(h, lane, step);
                 // f32::min and max pass over NaN.
                 self.least[lane] = self.least[lane].min(value);
                 self.most[lane] = self.most[lane].max(value);
@@ -160,6 +160,44 @@ impl Segments {
                 step += clearance.map_or(1, |clearance| i32::from(clearance.slices[block]));
             }
         }
+    }
+
+    /// h in a slice of a lane, bilinear, and the cell there by the two other axes and the slice.
+    #[inline(always)]
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
+    fn sample(&self, h: &[f32], lane: usize, step: i32) -> (f32, [usize; 3]) {
+        let stride = self.stride.map(|s| s[lane] as usize);
+        let k = self.first[lane] + step * self.way[lane];
+        let x = [0, 1].map(|i| (self.start[i][lane] + k as f32 * self.slope[i][lane]).max(0.0));
+        let cell = [0, 1].map(|i| (x[i] as i32).min(self.last[i][lane]));
+        let [f, g] = [0, 1].map(|i| (x[i] - cell[i] as f32).min(1.0));
+        let [i, j, k] = [cell[0], cell[1], k].map(|x| x as usize);
+        let at = i * stride[0] + j * stride[1] + k * stride[2];
+        let line = |at: usize| h[at] + f * (h[at + stride[0]] - h[at]);
+        let (near, far) = (line(at), line(at + stride[1]));
+        (near + g * (far - near), [i, j, k])
+    }
+
+    /// What h spans along a lane of [`Segments::set`], from one gap of samples that are not finite to the next.
+    pub(super) fn ranges(&self, h: &[f32], lane: usize) -> Vec<[f32; 2]> {
+        let slices = (0..self.count[lane]).map(|step| self.sample(h, lane, step).0);
+        let [before, behind] = self.ends.each_ref().map(|h| h[lane]);
+        let mut ranges = vec![];
+        let mut gap = true;
+        for h in std::iter::once(before).chain(slices).chain([behind]) {
+            if h.is_nan() {
+                gap = true;
+                continue;
+            }
+            if gap {
+                ranges.push([f32::INFINITY, f32::NEG_INFINITY]);
+            }
+            if let Some([least, most]) = ranges.last_mut() {
+                (*least, *most) = (least.min(h), most.max(h));
+            }
+            gap = false;
+        }
+        ranges
     }
 }
 
@@ -252,6 +290,51 @@ mod tests {
             }
         }
         assert!(told[0] > 500 && told[1] > 200, "{told:?}");
+    }
+
+    /// Through noise with gaps, both ways: the spans of the samples from one gap to the next.
+    #[test]
+    fn ranges_end_at_gaps() {
+        let mut rng = Rng::stream(6, Stage::Test, 0);
+        let noise = field([12, 9, 15], |_| if rng.unit() < 0.05 { f64::NAN } else { rng.unit() });
+        let far = noise.lattice().far();
+        let mut rng = Rng::stream(7, Stage::Test, 0);
+        let mut parts = [0; 3];
+        for _ in 0..500 {
+            let [a, b] = [0, 1].map(|_| DVec3::new(rng.unit(), rng.unit(), rng.unit()) * far);
+            let mut segments = Segments::NONE;
+            segments.set(5, noise.lattice(), |p| noise.value(p) as f32, a, b);
+            let found = segments.ranges(noise.samples(), 5);
+            let d = b - a;
+            let axis = d.abs().to_array().iter().position(|x| *x == d.abs().max_element()).unwrap();
+            let slices = (0..=far[axis] as usize).map(|k| (k as f64 - a[axis]) / d[axis]);
+            let inside = slices.filter(|t| (0.0..=1.0).contains(t)).map(|t| {
+                // In a slice, whatever the cells beside it hold.
+                let x = a + t * d;
+                let [u, v] = [(axis + 1) % 3, (axis + 2) % 3];
+                let corner = |n: usize| {
+                    let mut node = x.round();
+                    node[u] = x[u].floor().min(far[u] - 1.0) + (n % 2) as f64;
+                    node[v] = x[v].floor().min(far[v] - 1.0) + (n / 2) as f64;
+                    let [i, j, k] = node.to_array().map(|x| x as usize);
+                    f64::from(noise.samples()[noise.lattice().offset(i, j, k)])
+                };
+                let [f, g] = [u, v].map(|a| x[a] - x[a].floor().min(far[a] - 1.0));
+                (1.0 - g) * ((1.0 - f) * corner(0) + f * corner(1)) + g * ((1.0 - f) * corner(2) + f * corner(3))
+            });
+            // In rising order of slices, whichever way the segment runs.
+            let mut values: Vec<f64> = inside.collect();
+            values.insert(0, noise.value(if d[axis] > 0.0 { a } else { b }));
+            values.push(noise.value(if d[axis] > 0.0 { b } else { a }));
+            let expected: Vec<&[f64]> = values.split(|h| h.is_nan()).filter(|part| !part.is_empty()).collect();
+            assert_eq!(found.len(), expected.len(), "{a} to {b}: {found:?}, {values:?}");
+            for ([least, most], part) in found.iter().zip(&expected) {
+                let [lo, hi] = [f64::min, f64::max].map(|f| part.iter().copied().reduce(f).unwrap());
+                assert!((f64::from(*least) - lo).abs() < 1e-5 && (f64::from(*most) - hi).abs() < 1e-5, "{a} to {b}");
+            }
+            parts[expected.len().min(2)] += 1;
+        }
+        assert!(parts[1] > 50 && parts[2] > 100, "{parts:?}");
     }
 
     /// A segment that runs from outside through a ramp, and one that misses it.

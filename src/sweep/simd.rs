@@ -18,8 +18,9 @@ use super::flats::Flats;
 use super::gather::{COSINES, accumulate_row, sum_cosines};
 use super::grid::Source;
 use super::half::Half4;
-use super::pack::{Light, Pack, Plan, Way};
+use super::pack::{Pack, Plan};
 use super::reflect::{Job, Rows, reflect_row};
+use super::scan::{Light, Way};
 use super::segments::Segments;
 use super::settling::Sums;
 use crate::isa::{Isa, Kind};
@@ -76,6 +77,9 @@ macro_rules! dispatch {
 impl Isa {
     dispatch!(read, Pack::read, (pack: &mut Pack, plan: &Plan, source: &Source, first: isize, q: isize) -> bool);
     dispatch!(end, Pack::end, (pack: &mut Pack, plan: &Plan, ends: &Ends, flats: &Flats, first: isize, q: isize));
+    dispatch!(look_through_gaps, Pack::look_through_gaps, (
+        pack: &mut Pack, light: (Way, Light, &[Half4]), out: &mut [Vec<f32>], gaps: &mut [u16], place: (usize, usize)
+    ));
     dispatch!(cosines, sum_cosines, (omega: &[[f32; 3]], n: &[u32], sum: &mut [f32; COSINES]));
     dispatch!(accumulate, accumulate_row, (
         e: [&mut [f32]; 3], n: &[u32], omega: [f32; 3], light: [[&[f32]; 3]; 2], line0: usize,

@@ -5,7 +5,8 @@
 use crate::sweep::clearance::Clearance;
 use crate::sweep::fans::{HIGHER, LOWER, SAMPLED, march_row};
 use crate::sweep::half::Half4;
-use crate::sweep::pack::{LANES, Light, OUTSIDE, Pack, Way};
+use crate::sweep::pack::{LANES, OUTSIDE, Pack};
+use crate::sweep::scan::{Light, Way};
 use crate::sweep::segments::Segments;
 use std::arch::x86_64::*;
 

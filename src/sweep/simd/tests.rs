@@ -22,10 +22,8 @@ fn noise(seed: u64) -> Pack {
             let x = (rng.unit() * 12.0).floor() as f32 / 12.0;
             let out = row < lane % 5 || row + lane % 3 >= rows;
             let kind = rng.unit();
-            pack.h[row][lane] = if out {
+            pack.h[row][lane] = if out || kind < 0.03 {
                 OUTSIDE
-            } else if kind < 0.03 {
-                f32::NAN
             } else if row % 11 == 7 {
                 ASLEEP
             } else {
@@ -179,15 +177,13 @@ fn scans_find_the_next_greater_value() {
         for row in (1..49).filter(|r| r % 11 != 7) {
             let value = h(row, lane);
             let forward = h((row + 1).min(48), lane) < h((row - 1).max(1), lane);
-            let next = if forward {
-                (row + 1..50).find(|&r| h(r, lane) >= value)
-            } else {
-                (0..row).rev().find(|&r| h(r, lane) >= value)
-            };
-            if let (true, Some(r)) = (value.is_finite(), next) {
+            // Gaps are ends.
+            let met = |r: &usize| h(*r, lane) >= value || h(*r, lane) == OUTSIDE;
+            let next = if forward { (row + 1..50).find(met) } else { (0..row).rev().find(met) };
+            if let (true, Some(r)) = (value != OUTSIDE, next.filter(|&r| h(r, lane) != OUTSIDE)) {
                 let before = if forward { r - 1 } else { r + 1 };
                 let h0 = h(before, lane);
-                let first = !h0.is_nan() && (value - h0) < 0.5 * (h(r, lane) - h0);
+                let first = (value - h0) < 0.5 * (h(r, lane) - h0);
                 let node = reference.node[if first { before } else { r }][lane];
                 let expected = decode(b[node as usize][1]);
                 assert_eq!(out[1][(row - 1) * LANES + lane], expected, "lane {lane} row {row}");
