@@ -9,9 +9,8 @@ use super::pack::{LANES, OUTSIDE, Pack};
 use super::scan::{Light, Way};
 
 /// Nodes beside gaps that are lit, by rows of memory.
-#[derive(Default)]
 pub(super) struct Rims {
-    /// Where each row's nodes begin, and where the last one's end; empty if there are no gaps.
+    /// Where each row's nodes begin, and where the last one's end.
     starts: Vec<u32>,
     /// Places in their rows, in rising order.
     nodes: Vec<u32>,
@@ -43,8 +42,7 @@ impl Rims {
     /// The places in `row` that lie in from..to.
     #[inline]
     pub(super) fn within(&self, row: usize, from: usize, to: usize) -> &[u32] {
-        let Some(&[begin, end]) = self.starts.get(row..row + 2) else { return &[] };
-        let nodes = &self.nodes[begin as usize..end as usize];
+        let nodes = &self.nodes[self.starts[row] as usize..self.starts[row + 1] as usize];
         let place = |x: usize| nodes.partition_point(|&at| (at as usize) < x);
         &nodes[place(from)..place(to)]
     }
