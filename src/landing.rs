@@ -25,7 +25,7 @@ pub fn landing(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> Option<(
         Target::Cap(face, side) => {
             let n = scene.face_normal(face);
             let albedo = scene.face_surface(face).albedo.at(f64::from(ray.isovalue));
-            (if side == Side::Lower { n } else { -n }, Departure::Free, albedo, none)
+            (if side == Side::Lower { n } else { -n }, Departure::Cap(face, side), albedo, none)
         }
         Target::Polygon(id) => {
             let p = &scene.polygons()[id as usize];

@@ -2,13 +2,16 @@
 
 use crate::support::*;
 use glam::{DVec3, Vec3};
-use isolume::bake::BakeSettings;
+use isolume::bake::{BakeOptions, BakeSettings, Engine};
 use isolume::embree::{Device, GraphTracer};
 use isolume::flattened::{Departure, Side, Target};
+use isolume::landing::landing;
 use isolume::luminaire::unoccluded;
+use isolume::rng::{Rng, Stage};
 use isolume::scene::{Boundary, Scene};
 use isolume::stats::Moments;
 use isolume::tracer::Tracer;
+use isolume::warp::{Frame, cosine_hemisphere};
 
 /// A solid 0 ≤ z ≤ 1 − c in [0, 1]³, moved off the origin so that faces are no round f32 numbers, lamps beyond two
 /// faces.
@@ -84,6 +87,54 @@ fn no_photon_gets_through_a_cap() {
         }
     }
     assert!(at.is_finite());
+}
+
+/// A ray that leaves a cap where another one landed goes away from it, on either side of the cap: the place it starts
+/// from may be a rounding within the solid, or outside of it.
+#[test]
+fn rays_leave_a_cap_where_others_landed() {
+    let (scene, at) = solid();
+    let device = Device::new(1).unwrap();
+    let tracer = GraphTracer::new(&device, &scene).unwrap();
+    let mut rng = Rng::stream(7, Stage::Path, 0);
+    let mut landed = [0; 2];
+    for i in 0..1 << 14 {
+        let mut unit = || DVec3::new(rng.unit(), rng.unit(), rng.unit());
+        let (x, y) = (unit(), unit());
+        let from = if i % 2 == 0 { 6.0 * x - 3.0 } else { 0.1 + 0.8 * x };
+        let ray = scene.ray(local(&scene, at + from), at + y - (at + from), 0.0, Departure::Free);
+        let Some(hit) = tracer.intersect(&ray) else { continue };
+        let Target::Cap(_, side) = hit.target else { continue };
+        let (receiver, ..) = landing(&scene, &ray, hit).unwrap();
+        let away = Frame::new(receiver.normal).to_world(cosine_hemisphere([rng.unit(), rng.unit()]));
+        let ray = scene.ray(receiver.position, away, ray.isovalue, receiver.departure);
+        let next = tracer.intersect(&ray);
+        match side {
+            Side::Lower => assert!(!matches!(next, Some(h) if !matches!(h.target, Target::Polygon(_))), "{next:?}"),
+            Side::Higher => assert!(next.is_some_and(|h| h.t > 0.0 && h.target != hit.target), "{next:?}"),
+        }
+        landed[side.index()] += 1;
+    }
+    println!("{landed:?} rays landed on caps");
+    assert!(landed[0] > 1000 && landed[1] > 1000, "{landed:?}");
+}
+
+/// Caps light what they see: both engines find what path tracing does.
+#[test]
+fn capped_matter_is_lit_as_paths_say() {
+    let mut scene = waves(25, Boundary::Capped, false, |_| false);
+    scene.surface.albedo = DVec3::splat(0.5).into();
+    let inside = |o: &usize| (0.0..=1.0).contains(&scene.field.samples()[*o]);
+    let points: Vec<usize> = (0..scene.lattice().len()).filter(inside).step_by(7).collect();
+    // Of path tracing itself 4 %.
+    for (engine, bias, most) in [(Engine::Photon, 0.01, 0.06), (Engine::Sweep, 0.015, 0.08)] {
+        let options = BakeOptions { engine: Some(engine), ..BakeOptions::default() };
+        let baked = run(&scene, &BakeSettings::new(&options, &scene).unwrap());
+        let (side, grid) = &baked.sides[0];
+        let [mean, rms] = against_paths(&scene, *side, &grid.radiance, &points);
+        println!("{engine:?}: {} points, mean {mean:.4}, RMS {rms:.4}", points.len());
+        assert!(points.len() > 2000 && mean.abs() < bias && rms < most, "{engine:?}: {mean} {rms}");
+    }
 }
 
 /// With both sides stored, the inside of a capped solid without a lamp in it is black.

@@ -1,16 +1,13 @@
 //! Samples that are not finite: the cells around them hold no surface, those beside them hold theirs.
 
-use crate::support::{at_nodes, bumps, run};
+use crate::support::{against_paths, at_nodes, bumps, run, waves};
 use glam::DVec3;
 use isolume::bake::{BakeOptions, BakeSettings, Engine};
-use isolume::embree::{Device, GraphTracer};
 use isolume::field::{Field, Sweep};
 use isolume::illumination_grid::GridSize;
 use isolume::mask::Mask;
-use isolume::reference::{PathTracer, receiver};
-use isolume::scene::{Boundary, Scene, Surface, cornell_box};
+use isolume::scene::{Boundary, Scene, Surface};
 use isolume::volume::{Lattice, Samples, Volume};
-use rayon::prelude::*;
 
 /// The bumps with a ball of samples missing where many surfaces pass; or the same with all axes of the lattice turned
 /// round.
@@ -82,22 +79,6 @@ fn points_beside_a_gap_are_lit_on_all_its_sides() {
     }
 }
 
-/// Curved matter all over a box with a margin, both sides stored; samples are missing where `gap` says so.
-fn waves(gap: impl Fn([usize; 3]) -> bool) -> Scene {
-    const N: usize = 33;
-    let lattice = Lattice::aligned([N; 3], DVec3::ZERO, DVec3::splat(1.0 / (N - 1) as f64)).unwrap();
-    let samples = (0..lattice.len()).map(|o| {
-        let ijk = lattice.ijk(o);
-        let x = 0.5 * lattice.to_world(DVec3::from_array(ijk.map(|x| x as f64)));
-        let value = (17.0 * x.x + 3.0 * x.y).sin() * (13.0 * x.y - 5.0 * x.z).cos() + (11.0 * x.z).sin();
-        if gap(ijk) { f64::NAN } else { value }
-    });
-    let volume = Volume::new("waves", lattice.clone(), Samples::F64(samples.collect())).unwrap();
-    let field = Field::new(&volume, Sweep::new(-2.0, 2.0).unwrap()).unwrap();
-    let surface = Surface { both_sides: true, ..Surface::default() };
-    Scene::new(field, surface, Boundary::Open, cornell_box(&lattice, 0.1).unwrap()).unwrap()
-}
-
 /// Light goes through gaps, into solids and out of them: around a ball that is missing and among single samples that
 /// are, outside and inside, sweeps find what path tracing does.
 #[test]
@@ -109,12 +90,10 @@ fn lines_go_through_gaps_as_paths_do() {
     let specks = |[i, j, k]: [usize; 3]| (i * 7919 + j * 104_729 + k * 1_299_709) % 97 == 0;
     for (name, rms) in [("ball", [0.05, 0.15]), ("specks", [0.09, 0.15])] {
         let gap = |ijk| if name == "ball" { ball(ijk) } else { specks(ijk) };
-        let scene = waves(gap);
+        let scene = waves(33, Boundary::Open, true, gap);
         let options = BakeOptions { directions: Some(128), light_points: Some(64), ..BakeOptions::default() };
         let settings = BakeSettings::new(&BakeOptions { engine: Some(Engine::Sweep), ..options }, &scene).unwrap();
         let baked = run(&scene, &settings);
-        let device = Device::new(0).unwrap();
-        let tracer = GraphTracer::new(&device, &scene).unwrap();
         let lattice = scene.lattice();
         let place = |o: usize| DVec3::from_array(lattice.ijk(o).map(|x| x as f64));
         let points: Vec<usize> = (0..lattice.len())
@@ -133,20 +112,9 @@ fn lines_go_through_gaps_as_paths_do() {
         // Of path tracing itself 4 and 10 %; among specks the inside is lit by what single samples let in.
         for (stored, bias, most) in [(0, 0.015, rms[0]), (1, 0.03, rms[1])] {
             let (side, grid) = &baked.sides[stored];
-            let light: Vec<[f64; 2]> = points
-                .par_iter()
-                .map(|&o| {
-                    let receiver = receiver(&scene, place(o), scene.field.samples()[o], *side).unwrap();
-                    let exact = PathTracer::new(&scene, &tracer).outgoing(&receiver, 512, (5, o as u64));
-                    [f64::from(grid.radiance[o][1]), exact.y]
-                })
-                .collect();
-            let all = light.iter().map(|[_, exact]| exact).sum::<f64>();
-            let mean = light.iter().map(|[got, exact]| got - exact).sum::<f64>() / all;
-            let square = light.iter().map(|[got, exact]| (got - exact).powi(2)).sum::<f64>();
-            let found = (square * light.len() as f64).sqrt() / all;
-            println!("{name}, {side:?}: {} points, mean {mean:.4}, RMS {found:.4}", light.len());
-            assert!(light.len() >= 200 && mean.abs() < bias && found < most, "{name}, {side:?}: {mean} {found}");
+            let [mean, found] = against_paths(&scene, *side, &grid.radiance, &points);
+            println!("{name}, {side:?}: {} points, mean {mean:.4}, RMS {found:.4}", points.len());
+            assert!(points.len() >= 200 && mean.abs() < bias && found < most, "{name}, {side:?}: {mean} {found}");
         }
     }
 }

@@ -9,9 +9,11 @@ use isolume::mask::Mask;
 use isolume::photon::{PhotonSettings, Photons, trace_photons};
 use isolume::polygon::Polygon;
 use isolume::progress::Progress;
-use isolume::scene::{Boundary, Scene, Surface};
+use isolume::reference::{PathTracer, receiver};
+use isolume::scene::{Boundary, Scene, Surface, cornell_box};
 use isolume::stats::{Moments, normal_quantile, sidak};
 use isolume::volume::{Lattice, Samples, Volume};
+use rayon::prelude::*;
 
 /// An axis-aligned lattice of `dims` samples from `lo` to `hi`.
 pub(crate) fn lattice(dims: [usize; 3], lo: DVec3, hi: DVec3) -> Lattice {
@@ -165,4 +167,38 @@ pub(crate) fn bumps(lattice: Lattice) -> Scene {
     });
     let walls = isolume::scene::cornell_box(field.lattice(), 0.0).unwrap();
     scene(field, Surface::default(), walls)
+}
+
+/// Curved matter all over a box with a margin, n³ samples over [0, 1]³ but those that `gap` says are missing.
+pub(crate) fn waves(n: usize, boundary: Boundary, both_sides: bool, gap: impl Fn([usize; 3]) -> bool) -> Scene {
+    let lattice = Lattice::aligned([n; 3], DVec3::ZERO, DVec3::splat(1.0 / (n - 1) as f64)).unwrap();
+    let samples = (0..lattice.len()).map(|o| {
+        let x = 0.5 * world(&lattice, o);
+        let value = (17.0 * x.x + 3.0 * x.y).sin() * (13.0 * x.y - 5.0 * x.z).cos() + (11.0 * x.z).sin();
+        if gap(lattice.ijk(o)) { f64::NAN } else { value }
+    });
+    let volume = Volume::new("waves", lattice.clone(), Samples::F64(samples.collect())).unwrap();
+    let field = Field::new(&volume, Sweep::new(-2.0, 2.0).unwrap()).unwrap();
+    let surface = Surface { both_sides, ..Surface::default() };
+    Scene::new(field, surface, boundary, cornell_box(&lattice, 0.1).unwrap()).unwrap()
+}
+
+/// How far `radiance` at lattice points is from 512 paths each, of green light: the mean and the RMS, relative to the
+/// mean.
+pub(crate) fn against_paths(scene: &Scene, side: Side, radiance: &[[f32; 3]], points: &[usize]) -> [f64; 2] {
+    let device = Device::new(0).unwrap();
+    let tracer = GraphTracer::new(&device, scene).unwrap();
+    let light: Vec<[f64; 2]> = points
+        .par_iter()
+        .map(|&o| {
+            let place = DVec3::from_array(scene.lattice().ijk(o).map(|i| i as f64));
+            let receiver = receiver(scene, place, scene.field.samples()[o], side).unwrap();
+            let exact = PathTracer::new(scene, &tracer).outgoing(&receiver, 512, (5, o as u64));
+            [f64::from(radiance[o][1]), exact.y]
+        })
+        .collect();
+    let all = light.iter().map(|[_, exact]| exact).sum::<f64>();
+    let mean = light.iter().map(|[got, exact]| got - exact).sum::<f64>() / all;
+    let square = light.iter().map(|[got, exact]| (got - exact).powi(2)).sum::<f64>();
+    [mean, (square * light.len() as f64).sqrt() / all]
 }
