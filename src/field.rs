@@ -255,6 +255,12 @@ impl Field {
         })
     }
 
+    /// Whether a cell around sample `o` has finite ones only: elsewhere no level set passes through it.
+    #[inline]
+    pub fn is_in_whole_cell(&self, o: usize) -> bool {
+        !self.gaps || self.value(DVec3::from_array(self.lattice.ijk(o).map(|i| i as f64))).is_finite()
+    }
+
     /// Whether all cells that hold `p` have finite samples only.
     pub fn is_whole_around(&self, p: DVec3) -> bool {
         let (cell, u) = self.locate(p);

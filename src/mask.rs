@@ -12,7 +12,7 @@ use std::borrow::Cow;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Mask {
-    /// Nothing: no level set of the sweep passes near. Stored as 0.
+    /// Nothing: no level set of the sweep passes near, or no cell around has finite samples only. Stored as 0.
     Empty = 0,
     /// Radiance of the level set through the point.
     Valid = 1,
@@ -34,6 +34,8 @@ pub fn masks(field: &Field, lattice: &Lattice) -> Vec<Mask> {
     let values: Cow<'_, [f32]> =
         if lattice == field.lattice() { field.samples().into() } else { field.samples_at(lattice).into() };
     let rows = FieldRows::new(field, lattice);
+    // Values of other lattices are finite in whole cells only.
+    let gaps = lattice == field.lattice() && field.has_gaps();
     let area = dims[0] * dims[1];
     let mut out = vec![Mask::Empty; lattice.len()];
     out.par_chunks_mut(SLICES * area).enumerate().for_each(|(chunk, out)| {
@@ -50,11 +52,14 @@ pub fn masks(field: &Field, lattice: &Lattice) -> Vec<Mask> {
             let within = |h: f32| (0.0..=1.0).contains(&h);
             let own = values.iter().any(|h| within(*h));
             let gradients = if own { rows.gradients(j, first + z, &mut row) } else { &[] };
+            let start = (first + r / dims[1]) * area + j * dims[0];
             let (z, across) = (z + below, j * dims[0]);
             for (i, (mask, &h)) in out.iter_mut().zip(values).enumerate() {
                 let around = planes[z.saturating_sub(1)..(z + 2).min(planes.len())].iter();
                 let [lo, hi] = around.fold(NOTHING, |m, p| wider(m, p[across + i]));
-                *mask = if within(h) && has_direction(gradients[i]) {
+                *mask = if gaps && !field.is_in_whole_cell(start + i) {
+                    Mask::Empty
+                } else if within(h) && has_direction(gradients[i]) {
                     Mask::Valid
                 } else if lo <= 1.0 && hi >= 0.0 && lo < hi {
                     Mask::Filled
@@ -83,7 +88,10 @@ pub fn lights_itself(field: &Field, lattice: &Lattice, o: usize) -> bool {
         false => field.value(local_position(field, lattice, o)),
     };
     let h = value(o);
-    if !may_light_itself(h) || field.falling_normal(local_position(field, lattice, o)).is_none() {
+    if !may_light_itself(h)
+        || own && !field.is_in_whole_cell(o)
+        || field.falling_normal(local_position(field, lattice, o)).is_none()
+    {
         return false;
     }
     let (mut first, mut second, mut step) = (0.0, 0.0, 1);
@@ -240,6 +248,32 @@ mod tests {
     }
 
     /// A ball in a smooth field, and in one that jumps over the sweep within a step, all over or on one side.
+    /// Where Ω's faces leave a node no cell without a missing sample.
+    #[test]
+    fn points_without_a_whole_cell_hold_no_surface() {
+        let lattice = Lattice::aligned([6; 3], DVec3::ZERO, DVec3::ONE).unwrap();
+        let missing = |[i, j, k]: [usize; 3]| [[1, 1, 1], [3, 1, 0], [4, 3, 5]].contains(&[i, j, k]);
+        let h = |o: usize| lattice.ijk(o).map(|i| i as f64).iter().sum::<f64>();
+        let samples = (0..lattice.len()).map(|o| if missing(lattice.ijk(o)) { f64::NAN } else { h(o) });
+        let volume = Volume::new("x", lattice.clone(), Samples::F64(samples.collect())).unwrap();
+        let field = Field::new(&volume, Sweep::new(-1.0, 16.0).unwrap()).unwrap();
+        let got = masks(&field, &lattice);
+        let mut alone = Vec::new();
+        for (o, mask) in got.iter().enumerate() {
+            let at = lattice.ijk(o);
+            let whole = (0..8).any(|cell: usize| {
+                let first = [0, 1, 2].map(|a| (at[a] + (cell >> a & 1)).wrapping_sub(1));
+                first.iter().all(|i| *i < 5) && (0..8).all(|c| !missing([0, 1, 2].map(|a| first[a] + (c >> a & 1))))
+            });
+            assert_eq!(*mask, if whole { Mask::Valid } else { Mask::Empty }, "{at:?}");
+            assert!(whole || !lights_itself(&field, &lattice, o), "{at:?}");
+            if !(whole || missing(at)) {
+                alone.push(at);
+            }
+        }
+        assert!(alone.contains(&[0, 0, 0]) && alone.contains(&[2, 0, 0]) && alone.len() == 11, "{alone:?}");
+    }
+
     #[test]
     fn points_are_unknown_where_samples_jump_over_the_sweep() {
         let lattice = Lattice::aligned([24; 3], DVec3::ZERO, DVec3::ONE).unwrap();

@@ -173,8 +173,8 @@ impl<'a> Geometry<'a> {
             let nodes = normals.iter_mut().zip(h).zip(rows.gradients(row % ny, row / ny, gradients));
             nodes.filter(|((_, h), _)| wanted(**h)).for_each(|((normal, _), g)| *normal = normals::encode(-*g));
         });
-        let on_surface = |(h, n): (&f32, &u32)| (0.0..=1.0).contains(h) && *n != 0;
-        let mut lit: Vec<bool> = h.par_iter().zip(&normals).with_min_len(1 << 14).map(on_surface).collect();
+        let on_surface = |at: usize| (0.0..=1.0).contains(&h[at]) && normals[at] != 0 && field.is_in_whole_cell(at);
+        let mut lit: Vec<bool> = (0..h.len()).into_par_iter().with_min_len(1 << 14).map(on_surface).collect();
         let near = |at: &u32| normals[*at as usize] != 0 && lights_itself(field, field.lattice(), *at as usize);
         let near: Vec<u32> = ring(dims, &lit).into_par_iter().with_min_len(256).filter(near).collect();
         near.into_iter().for_each(|at| lit[at as usize] = true);

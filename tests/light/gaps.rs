@@ -79,6 +79,20 @@ fn points_beside_a_gap_are_lit_on_all_its_sides() {
     }
 }
 
+/// Nodes of Ω's faces that a missing sample leaves no cell hold nothing, with either engine: sweeps had them dark, as
+/// if a surface passed there.
+#[test]
+fn nodes_without_a_cell_hold_nothing() {
+    let scene = waves(12, Boundary::Open, false, |ijk| ijk == [0, 5, 6] || ijk == [1, 8, 5]);
+    let alone = [[0, 8, 5], [0, 5, 6]].map(|[i, j, k]| scene.lattice().offset(i, j, k));
+    for engine in [Engine::Photon, Engine::Sweep] {
+        let baked = run(&scene, &BakeSettings { engine, directions: 32, photons: 1 << 14, ..at_nodes(1) });
+        let grid = &baked.sides[0].1;
+        assert_eq!(alone.map(|o| (grid.mask[o], grid.radiance[o])), [(Mask::Empty, [0.0; 3]); 2], "{engine:?}");
+        assert_eq!(grid.mask[scene.lattice().offset(0, 8, 4)], Mask::Valid);
+    }
+}
+
 /// Light goes through gaps, into solids and out of them: around a ball that is missing and among single samples that
 /// are, outside and inside, sweeps find what path tracing does.
 #[test]
