@@ -1,9 +1,9 @@
-//! Final gather: one bounce of rays into the radiance cache, more where surfaces of several fields cross. \[Jensen01;
-//! Christensen99\]
+//! Final gather: one bounce of rays into the radiance cache, more where surfaces of several fields cross and within
+//! capped solids. \[Jensen01; Christensen99\]
 
 use crate::direct::{Estimate, Receiver, direct_once, luminance};
-use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Target};
-use crate::landing::landing;
+use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target};
+use crate::landing::{landing, touches};
 use crate::radiance_cache::RadianceCache;
 use crate::rng::{Rng, Sobol, Stage};
 use crate::scene::Scene;
@@ -102,6 +102,12 @@ fn near(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> bool {
     cells.length_squared() < NEAR * NEAR
 }
 
+/// Whether a hit is on the inside of a cap, whose light no cache holds: few scenes have any.
+#[inline]
+fn is_cap_from_within(hit: FlattenedHit) -> bool {
+    matches!(hit.target, Target::Cap(_, Side::Higher))
+}
+
 /// What gathers in corners know.
 struct Corners<'a, T> {
     scene: &'a Scene,
@@ -124,6 +130,9 @@ impl<T: Tracer> Corners<'_, T> {
         rays: &mut u64,
     ) -> DVec3 {
         let cached = self.cache.lookup(self.scene, hit.target, ray.at(hit.t), ray.isovalue, misses);
+        if is_cap_from_within(hit) {
+            return self.path(ray, hit, cached, &mut rng(), misses, rays);
+        }
         if cached == DVec3::ZERO || !near(self.scene, &ray, hit) {
             return cached;
         }
@@ -134,7 +143,8 @@ impl<T: Tracer> Corners<'_, T> {
         cached + (self.path(ray, hit, cached, &mut rng(), misses, rays) - cached) * SHARE as f64
     }
 
-    /// The same along a path from a near `hit`, for which the cache says `cached`.
+    /// The same along a path from a `hit` that is near or a cap from within, for which the cache says `cached`. Russian
+    /// roulette ends what goes from cap to cap.
     #[cold]
     fn path(
         &self,
@@ -147,17 +157,30 @@ impl<T: Tracer> Corners<'_, T> {
     ) -> DVec3 {
         let Self { scene, tracer, cache, .. } = *self;
         let (mut total, mut weight) = (DVec3::ZERO, DVec3::ONE);
-        for _ in 0..CORNERS {
-            if cached == DVec3::ZERO || !near(scene, &ray, hit) {
+        let mut corners = 0;
+        loop {
+            let cap = is_cap_from_within(hit);
+            if !cap && (corners == CORNERS || cached == DVec3::ZERO || !near(scene, &ray, hit)) {
                 break;
             }
-            let Some((receiver, albedo, emission)) = landing(scene, &ray, hit) else { return total };
+            corners += usize::from(!cap);
+            let Some((mut receiver, albedo, emission)) = landing(scene, &ray, hit) else { return total };
+            if touches(scene, &ray, hit) {
+                receiver.departure = ray.departure;
+            }
             total += weight * emission;
             if albedo == DVec3::ZERO {
                 return total;
             }
             weight *= albedo;
             total += weight * direct_once(scene, tracer, &receiver, rng, rays) / PI;
+            if cap {
+                let survival = weight.max_element();
+                if rng.unit() >= survival {
+                    return total;
+                }
+                weight /= survival;
+            }
             let direction = Frame::new(receiver.normal).to_world(cosine_hemisphere(rng.unit2()));
             ray = scene.ray(receiver.position, direction, ray.isovalue, receiver.departure);
             *rays += 1;

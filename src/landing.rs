@@ -36,3 +36,17 @@ pub fn landing(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> Option<(
     };
     Some((Receiver { position, normal, isovalue, departure }, albedo, emission))
 }
+
+/// Whether a ray from a level set meets a polygon or a cap where it starts, within the rounding of f32 coordinates.
+/// What leaves that there starts on the level set, too: it must not begin behind it. (The polygon itself is no obstacle
+/// if it is met from its front only.)
+pub fn touches(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> bool {
+    let opaque_back = match hit.target {
+        Target::Polygon(id) => scene.polygons()[id as usize].opaque_back,
+        Target::Cap(..) => false,
+        Target::Surface(_) | Target::Companion(..) => return false,
+    };
+    let on_surface = matches!(ray.departure, Departure::Surface(_) | Departure::Companion(..));
+    let rounding = 16.0 * f32::EPSILON * ray.origin.abs().max_element().max(1.0);
+    on_surface && !opaque_back && hit.t * ray.direction.length() <= rounding
+}

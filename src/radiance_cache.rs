@@ -237,6 +237,7 @@ impl RadianceCache {
                 let white = self.white(c.number, &c.member.field, side, c.to_index(position), misses);
                 surface.albedo.at(f64::from(isovalue)) * white + surface.emission
             }
+            // Rays go on from there.
             Target::Cap(_, Side::Higher) => DVec3::ZERO,
             Target::Cap(face, Side::Lower) => {
                 let uv = flat::face_texture(scene, face, position);

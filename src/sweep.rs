@@ -176,7 +176,7 @@ pub fn supported(scene: &Scene) -> Result<()> {
     let lamp = scene.luminaires().iter().any(|&number| inside[number as usize]);
     if scene.boundary == Boundary::Capped
         && scene.surface.stored_sides().contains(&Side::Higher)
-        && (lamp || scene.surface.emission != DVec3::ZERO)
+        && (lamp || scene.surface.emission != DVec3::ZERO || scene.field.has_gaps())
     {
         return Err(Error::NotSupported(
             "boundary = \"capped\": sweeps take caps for black from within, where this scene has light; use --engine photon"

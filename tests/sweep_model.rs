@@ -323,12 +323,15 @@ fn caps_close_level_sets() {
 /// if it alone were stored.
 #[test]
 fn the_inside_of_capped_solids_is_dark() {
-    let scene = |both_sides: bool, emission: f64| {
-        let f = field(cube(25, 0.0, 1.0), (3.6, 95.0), bumps);
+    let holed = |both_sides: bool, emission: f64, hole: bool| {
+        let missing = |x: DVec3| hole && x.length() < 0.1;
+        let value = move |x: DVec3| if missing(x) { f64::NAN } else { bumps(x) };
+        let f = field(cube(25, 0.0, 1.0), (3.6, 95.0), value);
         let walls = cornell_box(f.lattice(), 0.05).unwrap();
         let surface = Surface { both_sides, emission: DVec3::splat(emission), ..Surface::default() };
         Scene::new(f, surface, Boundary::Capped, walls).unwrap()
     };
+    let scene = |both_sides: bool, emission: f64| holed(both_sides, emission, false);
     // Few points: they are far apart, so that nodes near the luminaire look at points of their own.
     let settings = SweepSettings { directions: 64, light_points: 4, max_bounces: 3, ..ONE_BOUNCE };
     let [both, one] = [true, false].map(|both| run(&scene(both, 0.0), settings));
@@ -340,9 +343,12 @@ fn the_inside_of_capped_solids_is_dark() {
         [&one.sides[0], &both.sides[1]].map(|side| side.irradiance.iter().flatten().fold(0f32, |m, x| m.max(*x)));
     println!("outside {most}, apart {mean:.5}, RMS {rms:.5}, inside {inside}");
     assert!(most > 0.1 && mean.abs() < 1e-3 && rms < 5e-3 && inside == 0.0);
-    let refused = sweep(&scene(true, 1.0), &settings, &|_| true).unwrap_err().to_string();
-    assert!(refused.contains("caps") && refused.contains("--engine photon"), "{refused}");
-    assert!(sweep(&scene(false, 1.0), &settings, &|_| true).is_ok());
+    // What shines there, or lets light in.
+    for [lit, dark] in [[scene(true, 1.0), scene(false, 1.0)], [true, false].map(|both| holed(both, 0.0, true))] {
+        let refused = sweep(&lit, &settings, &|_| true).unwrap_err().to_string();
+        assert!(refused.contains("caps") && refused.contains("--engine photon"), "{refused}");
+        assert!(sweep(&dark, &settings, &|_| true).is_ok());
+    }
 }
 
 #[test]

@@ -5,7 +5,7 @@ use crate::direct::{Receiver, direct_once};
 use crate::error::Result;
 use crate::export::picture::Picture;
 use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Target};
-use crate::landing::landing;
+use crate::landing::{landing, touches};
 use crate::luminaire::{Aim, unoccluded};
 use crate::render::{Camera, trace_picture};
 use crate::rng::{Rng, Sobol, Stage};
@@ -125,16 +125,6 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
             ray = self.scene.ray(receiver.position, direction, ray.isovalue, receiver.departure);
         }
     }
-}
-
-/// Whether a ray from a level set meets a polygon where it starts, within the rounding of f32 coordinates. What leaves
-/// the polygon there starts on the level set, too: it must not begin behind it. (The polygon itself is no obstacle if
-/// it is met from its front only.)
-pub(super) fn touches(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> bool {
-    let Target::Polygon(id) = hit.target else { return false };
-    let on_surface = matches!(ray.departure, Departure::Surface(_) | Departure::Companion(..));
-    let rounding = 16.0 * f32::EPSILON * ray.origin.abs().max_element().max(1.0);
-    on_surface && !scene.polygons()[id as usize].opaque_back && hit.t * ray.direction.length() <= rounding
 }
 
 /// A picture of hyperplane `isovalue` by `samples` paths per pixel; luminaires are seen.

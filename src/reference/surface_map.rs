@@ -1,11 +1,11 @@
 //! A photon map of one isosurface in 3D: irradiance per area of mesh and walls, and final gather from it. \[Jensen01\]
 
-use super::path::{PathTracer, touches};
+use super::path::PathTracer;
 use crate::brdf::reflected;
 use crate::direct::Receiver;
 use crate::field::Field;
 use crate::flattened::{Departure, Side};
-use crate::landing::landing;
+use crate::landing::{landing, touches};
 use crate::nearest::{Neighbours, PointGrid};
 use crate::photon::Photons;
 use crate::rng::{Rng, Sobol, Stage};

@@ -272,6 +272,8 @@ impl<'a> Walls<'a> {
             self.cap(span[usize::from(!forward)], pq, covered, values);
             first = covered;
         }
+        // Inside the solid lines end on a cap, black from within.
+        let exit = if self.capped { pack.border(lane, forward) } else { None };
         for t in first..nc {
             let mut ray = Crossing::new(self.height(t), false);
             let met = rows(pack, span, (from, to)).find_map(|row| ray.step(row, pack.h[row][lane]));
@@ -281,6 +283,8 @@ impl<'a> Walls<'a> {
                 for c in 0..3 {
                     values[c * nc + self.ordinal(t)] = self.unit * radiance[c];
                 }
+            } else if exit.is_some_and(|h| self.height(t) <= h) {
+                (0..3).for_each(|c| values[c * nc + self.ordinal(t)] = 0.0);
             }
         }
         match (self.capped, higher) {
@@ -346,7 +350,7 @@ impl<'a> Walls<'a> {
     fn caps(&self, pack: &Pack, lane: usize, span: [f64; 2], (p, q): (isize, isize), out: &mut Arrivals) {
         let nc = self.flats.isovalues;
         let pq = (p as f64, q as f64);
-        for (end, h) in pack.border(self.plan, lane, p, q).into_iter().enumerate() {
+        for (end, h) in [false, true].map(|forward| pack.border(lane, forward)).into_iter().enumerate() {
             let Some(h) = h else { continue };
             let covered = ((h * nc as f32 + 0.5).floor().max(0.0) as usize).min(nc);
             if covered > 0 {

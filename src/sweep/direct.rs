@@ -257,7 +257,9 @@ fn walls(
                 let seen = seen.iter().enumerate().filter(|(_, s)| s.0 != 0.0);
                 if geometry.has_gaps() {
                     for (lane, &(g, here)) in seen {
-                        lit.add_beside(g, here, &segments.ranges(scene.field.samples(), lane), below);
+                        let y = lattice.to_index(points[lane]);
+                        let caps = [y.clamp(DVec3::ZERO, far) != y, true].map(|outside| outside && capped(scene));
+                        lit.add_beside(g, here, &segments.ranges(scene.field.samples(), lane, caps), below);
                     }
                     continue;
                 }

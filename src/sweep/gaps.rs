@@ -259,25 +259,25 @@ impl Pack {
             Ok(node) => Met::Front(node),
             // Cuts hide the gaps beyond.
             Err(end) if end != self.lasts[usize::from(!forward)][lane] as usize => Met::End(end),
-            Err(end) if self.cuts.iter().any(|cut| cut.lane == lane) => {
-                self.step_beyond(way, (row, lane), forward, end)
-            }
-            Err(end) => self.beyond(way, (row, lane), forward, end),
+            Err(_) if self.cuts.iter().any(|cut| cut.lane == lane) => self.step_beyond(way, (row, lane), forward),
+            Err(_) => self.beyond(way, (row, lane), forward),
         };
         match met {
             Met::Front(node) => colour(light.b[node as usize]),
             Met::Back(node) => colour(back.get(node as usize).copied().unwrap_or_default()),
             Met::End(place) => light.end(place, way.sign * value),
+            Met::Dark => [0.0; 3],
         }
     }
 
-    /// What the ray of a sample meets that meets nothing up to the next gap, or up to `end`, along a lane without cuts:
-    /// from run to run of samples, by links outside the solid.
-    fn beyond(&self, way: Way, (row, lane): (usize, usize), forward: bool, end: usize) -> Met {
+    /// What the ray of a sample meets that meets nothing up to the next gap, or up to the end of its line, along a lane
+    /// without cuts: from run to run of samples, by links outside the solid.
+    fn beyond(&self, way: Way, (row, lane): (usize, usize), forward: bool) -> Met {
         let d = usize::from(!forward);
         let value = self.h[row][lane];
         let above = |h: f32| if way.strict { h > value } else { h >= value };
         let mut row = self.reentries[d][row][lane];
+        let returned = row != NONE;
         while row != NONE {
             let mut at = row as usize;
             if !above(self.h[at][lane]) {
@@ -294,7 +294,7 @@ impl Pack {
                 loop {
                     let next = if forward { at + 1 } else { at.wrapping_sub(1) };
                     if next >= self.h.len() || !self.was_read(next) {
-                        return Met::End(end);
+                        return self.exit(way, (value, returned), lane, forward);
                     }
                     let h = self.h[next][lane];
                     if h == OUTSIDE {
@@ -309,7 +309,16 @@ impl Pack {
             }
             row = self.reentries[d][row as usize][lane];
         }
-        Met::End(end)
+        self.exit(way, (value, returned), lane, forward)
+    }
+
+    /// What a ray of isovalue `value` meets that meets no level set, whether it came back from a gap (`returned`) or
+    /// not: what stands at the end of its line, or a cap from within the solid, which is black.
+    fn exit(&self, way: Way, (value, returned): (f32, bool), lane: usize, forward: bool) -> Met {
+        match self.border(lane, forward) {
+            Some(h) if way.capped && returned && h >= value => Met::Dark,
+            _ => Met::End(self.lasts[usize::from(!forward)][lane] as usize),
+        }
     }
 
     /// Which of two samples with a level set between them is nearer to it: the second if in doubt.
@@ -320,14 +329,15 @@ impl Pack {
     }
 
     /// The same along a lane with cuts, sample by sample.
-    fn step_beyond(&self, way: Way, (row, lane): (usize, usize), forward: bool, end: usize) -> Met {
+    fn step_beyond(&self, way: Way, (row, lane): (usize, usize), forward: bool) -> Met {
         let d = usize::from(!forward);
-        let (mut from, mut gone) = (row, false);
-        let mut crossing = Crossing::new(self.h[from][lane], way.strict);
+        let (mut from, mut gone, mut returned) = (row, false, false);
+        let value = self.h[from][lane];
+        let mut crossing = Crossing::new(value, way.strict);
         let mut position = self.awake.binary_search(&u32::try_from(row).expect("a row")).expect("a row that was read");
         loop {
             position = if forward { position + 1 } else { position.wrapping_sub(1) };
-            let Some(&row) = self.awake.get(position) else { return Met::End(end) };
+            let Some(&row) = self.awake.get(position) else { return self.exit(way, (value, returned), lane, forward) };
             let row = row as usize;
             let between = from.min(row)..from.max(row);
             let mut cuts = self.cuts.iter().filter(|c| c.lane == lane && between.contains(&c.row));
@@ -336,6 +346,7 @@ impl Pack {
             }
             let h = self.h[row][lane];
             gone |= h == OUTSIDE;
+            returned |= gone && h != OUTSIDE;
             if gone && let Some((row, front)) = crossing.step(row, h) {
                 let node = self.node[row][lane];
                 return if front { Met::Front(node) } else { Met::Back(node) };
@@ -346,11 +357,12 @@ impl Pack {
 }
 
 /// What a ray meets beyond a gap: a level set from outside or from within the solid, by the node that stands for it, or
-/// what is at a place of the ends.
+/// what is at a place of the ends, or nothing that shines.
 enum Met {
     Front(u32),
     Back(u32),
     End(usize),
+    Dark,
 }
 
 #[cfg(test)]
@@ -403,7 +415,7 @@ mod tests {
         let number = |i: usize| encode(1.0 + i as f32 / 256.0);
         let [front, back] = [0, 1000].map(|first| (0..ROWS).map(|i| [number(first + i); 4]).collect::<Vec<_>>());
         let flats: Vec<Half4> = (0..64).map(|i| [number(2000 + 4 * (i / 4)); 4]).collect();
-        let mut counts = [0; 4];
+        let mut counts = [0; 5];
         for seed in 0..60 {
             let mut rng = Rng::stream(seed, Stage::Test, 1);
             let mut pack = Pack::with_rows(ROWS);
@@ -416,9 +428,10 @@ mod tests {
             }
             (0..ROWS).for_each(|row| pack.node[row] = [row as u32; LANES]);
             pack.lasts = [[4; LANES], [8; LANES]];
+            pack.spans = [[0.0; LANES], [(ROWS - 3) as f64; LANES]];
             pack.cuts = vec![Cut { row: 14, lane: 3, places: [12, 16] }, Cut { row: 27, lane: 3, places: [20, 24] }];
             pack.open_gaps();
-            let way = Way { strict: seed % 2 == 1, sign: 1.0 };
+            let way = Way { strict: seed % 2 == 1, sign: 1.0, capped: seed % 4 == 2 };
             let light = Light { b: &front, flats: &flats, isovalues: 4 };
             let mut out = vec![vec![0f32; (ROWS - 2) * LANES]; 3];
             pack.scan(way, light, &mut out, (LANES, 0));
@@ -441,7 +454,7 @@ mod tests {
                     let above = |row: usize| if way.strict { h(row) > value } else { h(row) >= value };
                     let rest: Vec<usize> = if forward { (row..ROWS).collect() } else { (0..=row).rev().collect() };
                     let mut expected = flats[if forward { 4 } else { 8 }];
-                    let mut gone = false;
+                    let (mut gone, mut returned) = (false, false);
                     for step in rest.windows(2) {
                         let (from, to) = (step[0], step[1]);
                         if lane == 3
@@ -451,6 +464,7 @@ mod tests {
                             counts[3] += usize::from(gone);
                             break;
                         }
+                        returned |= gone && h(to) != OUTSIDE;
                         gone |= h(to) == OUTSIDE;
                         // The ray leaves its own sample from outside the solid.
                         let from_above = from != row && above(from);
@@ -461,7 +475,13 @@ mod tests {
                             counts[usize::from(!above(to))] += usize::from(gone);
                             break;
                         }
-                        counts[2] += usize::from(gone && (to == 0 || to == ROWS - 1));
+                        if to == 0 || to == ROWS - 1 {
+                            counts[2] += usize::from(gone);
+                            if way.capped && returned && h(from) != OUTSIDE && above(from) {
+                                expected = [encode(0.0); 4];
+                                counts[4] += 1;
+                            }
+                        }
                     }
                     let found = out[1][(row - 1) * LANES + lane];
                     assert_eq!(found, decode(expected[0]), "seed {seed} lane {lane} row {row}");

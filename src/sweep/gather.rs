@@ -79,8 +79,6 @@ struct Family<'a> {
     flats: &'a Flats,
     walls: arrive::Walls<'a>,
     way: Way,
-    /// Whether caps close what lines run in: black from within.
-    closed: bool,
     /// The direction times what |ω·N| weighs.
     omega: [f32; 3],
 }
@@ -176,8 +174,7 @@ impl Pass<'_> {
             normals,
             ends: &ends,
             flats,
-            way: Way { strict: side == Side::Higher, sign },
-            closed: side == Side::Higher && capped(self.scene),
+            way: Way { strict: side == Side::Higher, sign, capped: capped(self.scene) },
             omega: (shear.omega * share).as_vec3().to_array(),
             // Rows that meet Ω, one behind them for the last row of nodes, and those that only walls see.
             walls,
@@ -280,7 +277,7 @@ impl Pass<'_> {
             let p = plan.first[0] + start as isize;
             if self.isa.read(pack, plan, &family.source, p, q) {
                 self.isa.end(pack, plan, family.ends, family.flats, p, q);
-                if family.closed {
+                if family.way.capped && family.way.strict {
                     pack.lasts = [[0; LANES]; 2];
                 }
                 let flats = family.flats;

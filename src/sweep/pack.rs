@@ -333,17 +333,13 @@ impl Pack {
         self.is_awake[row]
     }
 
-    /// h where line (p, q) in `lane` enters and leaves Ω, if it was read there.
-    pub(super) fn border(&self, plan: &Plan, lane: usize, p: isize, q: isize) -> [Option<f32>; 2] {
-        let slices = plan.shear.layout.dims[2];
-        let sample = |row: usize| {
-            let h = self.h[row][lane];
-            (self.was_read(row) && h != OUTSIDE).then_some(h)
-        };
-        let inside = |k: &usize| plan.within(*k, (p, q)).0 == 0 && plan.within(*k, (p, q)).1 > 0;
-        let first = (0..slices).find(inside).and_then(|k| sample(k).or(sample(k + 1)));
-        let last = (0..slices).rev().find(inside).and_then(|k| sample(k + 2).or(sample(k + 1)));
-        [first, last]
+    /// h where a line that meets Ω leaves it, or enters it if not `forward`; `None` if samples are missing there.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "slices in Ω")]
+    pub(super) fn border(&self, lane: usize, forward: bool) -> Option<f32> {
+        let tau = self.spans[usize::from(forward)][lane];
+        let row = 1 + if forward { tau.floor() } else { tau.ceil() } as usize;
+        let side = if forward { row + 1 } else { row - 1 };
+        [side, row].map(|row| self.h[row][lane]).into_iter().find(|h| *h != OUTSIDE)
     }
 
     /// Reads one row, lanes `lo..hi` of which lie in Ω.

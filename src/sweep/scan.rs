@@ -32,6 +32,8 @@ pub(super) struct Way {
     pub strict: bool,
     /// The sign h was read with.
     pub sign: f32,
+    /// Caps close Ω's faces, black from within.
+    pub capped: bool,
 }
 impl Pack {
     /// For every sample, the radiance that its ray meets which leaves downhill: B where h is first back at the sample's

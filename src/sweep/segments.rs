@@ -24,6 +24,8 @@ pub(super) struct Segments {
     pub way: [i32; LANES],
     /// h at the ends in Ω, that of the lesser slice first; NaN if it was not asked for.
     pub ends: [[f32; LANES]; 2],
+    /// Whether the lesser slice is that of the end.
+    falls: [bool; LANES],
     /// Least and greatest h so far.
     pub least: [f32; LANES],
     pub most: [f32; LANES],
@@ -43,6 +45,7 @@ impl Segments {
         count: [0; LANES],
         way: [1; LANES],
         ends: [[f32::NAN; LANES]; 2],
+        falls: [false; LANES],
         least: [f32::INFINITY; LANES],
         most: [f32::NEG_INFINITY; LANES],
         enough: [[f32::NEG_INFINITY; LANES], [f32::INFINITY; LANES]],
@@ -108,7 +111,8 @@ impl Segments {
         }
         let size = d.abs();
         let axis = if size.z >= size.x && size.z >= size.y { 2 } else { usize::from(size.y >= size.x) };
-        if d[axis] < 0.0 {
+        self.falls[lane] = d[axis] < 0.0;
+        if self.falls[lane] {
             ends.reverse();
         }
         (self.ends[0][lane], self.ends[1][lane]) = ends.into();
@@ -178,11 +182,16 @@ impl Segments {
         (near + g * (far - near), [i, j, k])
     }
 
-    /// What h spans along a lane of [`Segments::set`], from one gap of samples that are not finite to the next.
-    pub(super) fn ranges(&self, h: &[f32], lane: usize) -> Vec<[f32; 2]> {
+    /// What h spans along a lane of [`Segments::set`], from one gap of samples that are not finite to the next. It
+    /// falls to −∞ at caps, where the segment enters and leaves Ω if `caps` says so.
+    pub(super) fn ranges(&self, h: &[f32], lane: usize, mut caps: [bool; 2]) -> Vec<[f32; 2]> {
         let slices = (0..self.count[lane]).map(|step| self.sample(h, lane, step).0);
+        if self.falls[lane] {
+            caps.reverse();
+        }
         let [before, behind] = self.ends.each_ref().map(|h| h[lane]);
         let mut ranges = vec![];
+        let [enters, leaves] = [(caps[0], before), (caps[1], behind)].map(|(cap, h)| cap && !h.is_nan());
         let mut gap = true;
         for h in std::iter::once(before).chain(slices).chain([behind]) {
             if h.is_nan() {
@@ -196,6 +205,12 @@ impl Segments {
                 (*least, *most) = (least.min(h), most.max(h));
             }
             gap = false;
+        }
+        if let (true, Some(range)) = (enters, ranges.first_mut()) {
+            range[0] = f32::NEG_INFINITY;
+        }
+        if let (true, Some(range)) = (leaves, ranges.last_mut()) {
+            range[0] = f32::NEG_INFINITY;
         }
         ranges
     }
@@ -304,7 +319,9 @@ mod tests {
             let [a, b] = [0, 1].map(|_| DVec3::new(rng.unit(), rng.unit(), rng.unit()) * far);
             let mut segments = Segments::NONE;
             segments.set(5, noise.lattice(), |p| noise.value(p) as f32, a, b);
-            let found = segments.ranges(noise.samples(), 5);
+            let found = segments.ranges(noise.samples(), 5, [false; 2]);
+            let caps = [rng.unit() < 0.5, rng.unit() < 0.5];
+            let capped = segments.ranges(noise.samples(), 5, caps);
             let d = b - a;
             let axis = d.abs().to_array().iter().position(|x| *x == d.abs().max_element()).unwrap();
             let slices = (0..=far[axis] as usize).map(|k| (k as f64 - a[axis]) / d[axis]);
@@ -333,6 +350,13 @@ mod tests {
                 assert!((f64::from(*least) - lo).abs() < 1e-5 && (f64::from(*most) - hi).abs() < 1e-5, "{a} to {b}");
             }
             parts[expected.len().min(2)] += 1;
+            let caps = if d[axis] > 0.0 { caps } else { [caps[1], caps[0]] };
+            let ends = [(caps[0], 0, values[0]), (caps[1], found.len().saturating_sub(1), values[values.len() - 1])];
+            for (n, (capped, found)) in capped.iter().zip(&found).enumerate() {
+                let falls = ends.iter().any(|(cap, at, h)| *cap && *at == n && !h.is_nan());
+                assert_eq!(capped[1], found[1]);
+                assert_eq!(capped[0], if falls { f32::NEG_INFINITY } else { found[0] }, "{a} to {b}: {n}");
+            }
         }
         assert!(parts[1] > 50 && parts[2] > 100, "{parts:?}");
     }

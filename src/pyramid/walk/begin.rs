@@ -139,7 +139,11 @@ impl Pyramid {
         let n = self.cells;
         let mut o = ray.origin.as_dvec3().to_array();
         let d = ray.direction.as_dvec3().to_array();
-        // Faces from 6 on are another field's.
+        // What leaves a level set or a cap starts in Ω, whatever its f32 coordinates: an edge is no way out. Faces from
+        // 6 on are another field's.
+        if matches!(ray.departure, Departure::Surface(_) | Departure::Cap(0..6, _)) {
+            (0..3).for_each(|a| o[a] = o[a].clamp(0.0, n[a] as f64));
+        }
         if let Departure::Cap(face @ 0..6, side) = ray.departure {
             let (axis, far) = (usize::from(face % 3), face >= 3);
             let inward = if far { d[axis] < 0.0 } else { d[axis] > 0.0 };

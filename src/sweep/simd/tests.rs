@@ -49,7 +49,7 @@ fn random(seed: u64) -> Vec<Half4> {
 fn every_instruction_set_scans_to_the_same_bits() {
     for seed in 0..20 {
         for way in 0..4 {
-            let way = Way { strict: way & 2 == 2, sign: if way & 1 == 1 { 1.0 } else { -1.0 } };
+            let way = Way { strict: way & 2 == 2, sign: if way & 1 == 1 { 1.0 } else { -1.0 }, capped: false };
             let scan = |isa: Isa| {
                 let mut out = vec![vec![0f32; 48 * LANES]; 3];
                 let light = Light { b: &random(9), flats: &random(10), isovalues: 4 };
@@ -170,7 +170,7 @@ fn scans_find_the_next_greater_value() {
     let mut out = vec![vec![0f32; 48 * LANES]; 3];
     let b = random(9);
     let light = Light { b: &b, flats: &random(10), isovalues: 4 };
-    Isa::current().scan(&mut pack, Way { strict: false, sign: 1.0 }, light, &mut out, (LANES, 0));
+    Isa::current().scan(&mut pack, Way { strict: false, sign: 1.0, capped: false }, light, &mut out, (LANES, 0));
     let mut found = [0; 2];
     let h = |row: usize, lane: usize| reference.h[row][lane];
     for lane in 0..LANES {
