@@ -104,7 +104,9 @@ impl Segments {
         if !(from <= to) {
             return;
         }
-        for (end, t) in ends.iter_mut().zip([from, to]).take(if BEFORE { 1 } else { 2 }) {
+        // On Ω's faces a segment may enter where its node is, which hides nothing.
+        let asked = if !BEFORE { 2 } else { usize::from(from < 1.0 - 1e-9) };
+        for (end, t) in ends.iter_mut().zip([from, to]).take(asked) {
             *end = h(a + t * d);
             self.least[lane] = self.least[lane].min(*end);
             self.most[lane] = self.most[lane].max(*end);
