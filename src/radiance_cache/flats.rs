@@ -33,11 +33,14 @@ pub(super) fn fill_flat<T: Tracer>(
     let centres = FlatTexture::black(dims);
     let lattice = scene.lattice();
     let mut parts = flat.texels(dims);
-    hide(scene, number, &flat, dims, &mut parts);
+    let hidden = Hidden::new(scene, number, &flat);
+    hidden.take_off(dims, &mut parts);
     let solid = Solid::new(scene, number, &flat);
     let open = solid.as_ref().and_then(|s| Open::new(s, dims));
     // Where no solid stands, none holds photons.
     let solid = solid.filter(|_| open.is_some());
+    // What lights the hidden part is no light of what is left of a texel.
+    let photons = photons.filter(|p| !hidden.holds([p.uvc[0], p.uvc[1]].map(f64::from)));
     let Landings { powers, counts } = Landings::new(dims, &parts, photons, solid.as_ref());
     let outer = |i: usize| open.as_ref().is_none_or(|o| o.outer[i]);
     let direct: Vec<Option<DVec3>> = (0..centres.texels.len())
@@ -90,20 +93,37 @@ pub(super) fn fill_flat<T: Tracer>(
     (texture(GATHERED, f64::NEG_INFINITY), texture(SHOWN, 0.0))
 }
 
-/// Takes off each texel what luminaires closely before the flat hide of it.
-fn hide(scene: &Scene, number: usize, flat: &Flat, [nu, nv, _]: [usize; 3], parts: &mut [Texel]) {
-    let wall = u32::try_from(number).ok().filter(|_| number < scene.polygons().len());
-    let covering: Vec<&Polygon> = wall.into_iter().flat_map(|wall| scene.covering(wall)).collect();
-    if covering.is_empty() {
-        return;
+/// What luminaires closely before a flat hide of it.
+struct Hidden<'a> {
+    flat: &'a Flat,
+    covering: Vec<&'a Polygon>,
+}
+
+impl<'a> Hidden<'a> {
+    fn new(scene: &'a Scene, number: usize, flat: &'a Flat) -> Self {
+        let wall = u32::try_from(number).ok().filter(|_| number < scene.polygons().len());
+        Self { flat, covering: wall.into_iter().flat_map(|wall| scene.covering(wall)).collect() }
     }
-    for (texel, part) in parts.iter_mut().enumerate() {
-        let hidden = (0..PLACES * PLACES).filter(|n| {
-            let [a, b] = [n % PLACES, n / PLACES].map(|n| (n as f64 + 0.5) / PLACES as f64);
-            let x = flat.at([((texel % nu) as f64 + a) / nu as f64, ((texel / nu) as f64 + b) / nv as f64]);
-            covering.iter().any(|light| light.contains(x))
-        });
-        part.covered *= 1.0 - hidden.count() as f64 / (PLACES * PLACES) as f64;
+
+    fn holds(&self, uv: [f64; 2]) -> bool {
+        !self.covering.is_empty() && {
+            let x = self.flat.at(uv);
+            self.covering.iter().any(|light| light.contains(x))
+        }
+    }
+
+    /// Takes it off each texel.
+    fn take_off(&self, [nu, nv, _]: [usize; 3], parts: &mut [Texel]) {
+        if self.covering.is_empty() {
+            return;
+        }
+        for (texel, part) in parts.iter_mut().enumerate() {
+            let hidden = (0..PLACES * PLACES).filter(|n| {
+                let [a, b] = [n % PLACES, n / PLACES].map(|n| (n as f64 + 0.5) / PLACES as f64);
+                self.holds([((texel % nu) as f64 + a) / nu as f64, ((texel / nu) as f64 + b) / nv as f64])
+            });
+            part.covered *= 1.0 - hidden.count() as f64 / (PLACES * PLACES) as f64;
+        }
     }
 }
 
@@ -362,6 +382,48 @@ mod tests {
         fn occluded(&self, _: &FlattenedRay) -> bool {
             false
         }
+    }
+
+    /// Photons as dense everywhere on a ceiling, behind its luminaire, too, where some get in from within solids: it
+    /// shows the same irradiance all around, and no more behind. That was 10⁹ times as much.
+    #[test]
+    fn what_lights_a_hidden_part_shines_nowhere_else() {
+        let lattice = Lattice::aligned([17; 3], DVec3::ZERO, DVec3::splat(0.0625)).unwrap();
+        // The solid is one corner, far away.
+        let samples = (0..lattice.len()).map(|o| f32::from(u8::from(o == 0))).collect();
+        let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
+        let field = Field::new(&volume, Sweep::new(0.1, 1.0).unwrap()).unwrap();
+        let walls = cornell_box(field.lattice(), 0.0).unwrap();
+        let scene = Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap();
+        let ceiling = scene.covered_wall(0).unwrap();
+        let number = ceiling as usize;
+        let flat = flat::flat(&scene, number).unwrap();
+        let (irradiance, count) = (3.0, 200_000u64);
+        let power = Vec3::splat((irradiance * flat.area() / count as f64) as f32);
+        let photons = (0..count).map(|i| {
+            let mut rng = Rng::stream(1, Stage::Test, i);
+            FlatPhoton { flat: ceiling, uvc: [(); 3].map(|()| rng.unit() as f32), power, bounces: 1 }
+        });
+        let settings = CacheSettings {
+            node_shadow_rays: 1,
+            flat_shadow_rays: 1,
+            flat_resolution: 24,
+            isovalue_resolution: 8,
+            seed: 1,
+        };
+        let texture = fill_flat(&scene, &Nothing, number, photons, 1.0, &settings, &AtomicU64::new(0)).0.unwrap();
+        let (hidden, expected) = (Hidden::new(&scene, number, &flat), reflected(flat.albedo.at(0.5), DVec3::ONE).x);
+        let mut shown = [crate::stats::Moments::default(); 2];
+        let mut most = 0f64;
+        for i in 0..20_000 {
+            let mut rng = Rng::stream(2, Stage::Test, i);
+            let [u, v, c] = [(); 3].map(|()| rng.unit());
+            let x = texture.lookup([u, v, c]).x / (irradiance * expected);
+            shown[usize::from(hidden.holds([u, v]))].push(x);
+            most = most.max(x);
+        }
+        println!("{:.4}, behind the luminaire {:.4}, most {most:.3}", shown[0].mean(), shown[1].mean());
+        assert!((shown[0].mean() - 1.0).abs() < 0.01 && shown[1].count() > 500 && most < 2.0);
     }
 
     /// Photons as dense everywhere on that part of the floor where h < c: it shows the same irradiance up to the line
