@@ -144,7 +144,7 @@ impl<T: Tracer> Corners<'_, T> {
     }
 
     /// The same along a path from a `hit` that is near or a cap from within, for which the cache says `cached`. Russian
-    /// roulette ends what goes from cap to cap.
+    /// roulette ends what goes from cap to cap. \[Arvo90\]
     #[cold]
     fn path(
         &self,

@@ -403,6 +403,32 @@ fn walls_see_nothing_in_a_gap() {
     }
 }
 
+/// A hole in the face of a black capped solid shows walls what its cap does: nothing. Lines that come through it end on
+/// the caps behind, not on the walls beyond them.
+#[test]
+fn walls_do_not_see_through_capped_solids_with_a_hole() {
+    let lit = |hole: bool| {
+        // Above the sweep but in one corner.
+        let f = field(cube(17, 0.0, 1.0), (0.2, 0.8), |x| {
+            let in_hole = hole && x.x < 0.2 && (x.y - 0.5).abs() < 0.2 && (x.z - 0.5).abs() < 0.2;
+            if in_hole { f64::NAN } else { f64::from(u8::from(x.min_element() < 0.99)) }
+        });
+        let walls = closed_box(f.lattice(), 0.3, 0.5, 1.0);
+        let black = Surface { albedo: DVec3::ZERO.into(), ..Surface::default() };
+        run(&Scene::new(f, black, Boundary::Capped, walls).unwrap(), SweepSettings { max_bounces: 2, ..ONE_BOUNCE })
+            .flats
+    };
+    let [whole, holed] = [false, true].map(lit);
+    let (mut most, mut light) = (0f32, 0f32);
+    for (one, other) in whole.iter().flatten().zip(holed.iter().flatten()) {
+        for (a, b) in one.texels.iter().flatten().zip(other.texels.iter().flatten()) {
+            (most, light) = (most.max((a - b).abs()), light.max(*a));
+        }
+    }
+    println!("{most:.1e} apart, {light} at most");
+    assert!(light > 0.4 && most < 1e-3);
+}
+
 #[test]
 fn luminaires_add_up() {
     let square = |name: &str, at: DVec3, to: DVec3| {
