@@ -107,9 +107,7 @@ fn main() {
             let settings = EstimateSettings { estimator, photons: k, ..EstimateSettings::default() };
             let built = || PhotonMap::new(&scene, &photons.surface, Side::Lower, |p| p.bounces > 0, settings);
             let (map, building) = timed_often(built);
-            let estimate = |scratch: &mut Neighbours, r: &Receiver| {
-                map.irradiance(r.position.as_dvec3(), f64::from(r.isovalue), scratch).mean
-            };
+            let estimate = |scratch: &mut Neighbours, r: &Receiver| map.irradiance(r, scratch).mean;
             let (estimates, seconds): (Vec<DVec3>, f64) = timed_often(|| {
                 receivers.par_iter().with_min_len(256).map_init(Neighbours::default, estimate).collect()
             });

@@ -10,7 +10,7 @@ use crate::brdf::reflected;
 use crate::direct::{luminance, open_irradiance};
 use crate::flattened::Side;
 use crate::illumination_grid::{IlluminationGrid, from_nearest, point_grid};
-use crate::linear_fit::Moments;
+use crate::linear_fit::{Moments, Sums};
 use crate::mask::{Mask, local_position};
 use crate::radiance::RadianceSample;
 use crate::scene::Scene;
@@ -123,19 +123,16 @@ impl<'a> Around<'a> {
 
     /// The linear function fitted to `value` of the samples by `weight`, at the point; 0 if all weights are 0.
     fn fit(&self, weight: impl Fn(&Known) -> f32, value: impl Fn(&Known) -> Vec3) -> DVec3 {
-        let (mut moments, mut sums) = (Moments::default(), [Vec3::ZERO; 4]);
+        let (mut moments, mut sums) = (Moments::default(), Sums::default());
         for (d, kernel, k) in self.each() {
             let w = kernel * weight(k);
             moments.add(w, d);
-            let term = w * value(k);
-            sums.iter_mut().zip([1.0, d.x, d.y, d.z]).for_each(|(sum, t)| *sum += t * term);
+            sums.add(w * value(k), d);
         }
         if moments.weight() <= 0.0 {
             return DVec3::ZERO;
         }
-        let g = moments.at_origin();
-        let [s, x, y, z] = sums.map(|v| v.as_dvec3());
-        g.x * s + g.y * x + g.z * y + g.w * z
+        sums.fitted(moments.at_origin())
     }
 
     /// The visible share of direct light, by channel: samples count by the light they could get.

@@ -12,6 +12,7 @@ mod measure;
 mod density;
 mod points;
 
+use crate::direct::Receiver;
 use crate::flattened::Side;
 use crate::nearest::Neighbours;
 use crate::photon::SurfacePhoton;
@@ -90,7 +91,10 @@ pub struct Irradiance {
 }
 
 /// The photons of one side, arranged for estimates.
-pub struct PhotonMap<'a>(Arrangement<'a>);
+pub struct PhotonMap<'a> {
+    arrangement: Arrangement<'a>,
+    side: Side,
+}
 
 enum Arrangement<'a> {
     Points(PhotonPoints<'a>),
@@ -107,20 +111,26 @@ impl<'a> PhotonMap<'a> {
         settings: EstimateSettings,
     ) -> Self {
         let keep = |p: &SurfacePhoton| usize::from(p.field) == scene.number() && p.side == side && keep(p);
-        Self(match settings.estimator {
+        let arrangement = match settings.estimator {
             Estimator::Splat => Arrangement::Density(PhotonDensity::new(scene, photons, keep, settings)),
             Estimator::Nearest | Estimator::Radius => {
                 Arrangement::Points(PhotonPoints::new(scene, photons, keep, settings))
             }
-        })
+        };
+        Self { arrangement, side }
     }
 
-    /// Irradiance at local `position` on L(h, `isovalue`). `scratch` is reused between calls.
+    /// Irradiance at a receiver on a level set, whose normal is that of the map's side. `scratch` is reused between
+    /// calls.
     #[inline]
-    pub fn irradiance(&self, position: DVec3, isovalue: f64, scratch: &mut Neighbours) -> Irradiance {
-        match &self.0 {
-            Arrangement::Points(points) => points.irradiance(position, isovalue, scratch),
-            Arrangement::Density(density) => density.irradiance(position, isovalue),
+    pub fn irradiance(&self, receiver: &Receiver, scratch: &mut Neighbours) -> Irradiance {
+        let position = receiver.position.as_dvec3();
+        match &self.arrangement {
+            Arrangement::Points(points) => points.irradiance(position, f64::from(receiver.isovalue), scratch),
+            Arrangement::Density(density) => {
+                let falling = if self.side == Side::Lower { receiver.normal } else { -receiver.normal };
+                density.irradiance(position, receiver.isovalue, falling.as_vec3())
+            }
         }
     }
 }

@@ -135,7 +135,7 @@ impl<T: Tracer> Sampler<'_, T> {
         counts[0] += direct.rays;
         let (mean, variance, halves) = match self.indirect {
             Indirect::Map(map) => {
-                let e = map.irradiance(p, isovalue, scratch);
+                let e = map.irradiance(&receiver, scratch);
                 (e.mean, e.variance, [e.mean; 2])
             }
             Indirect::Gather(cache, rays) => {

@@ -406,7 +406,7 @@ impl<T: Tracer> Fill<'_, T> {
             let key = (settings.seed, Stage::Cache, index);
             let direct = direct_irradiance(scene, self.tracer, &receiver, settings.node_shadow_rays, key);
             *traced += direct.rays;
-            let indirect = map.irradiance(p, f64::from(isovalue), scratch).mean;
+            let indirect = map.irradiance(&receiver, scratch).mean;
             sum += reflected(DVec3::ONE, direct.mean + indirect);
             count += 1.0;
         }

@@ -13,7 +13,7 @@ pub use scattered::{Scattered, smooth_scattered};
 use crate::direct::luminance;
 use crate::field::Field;
 use crate::flattened::Side;
-use crate::linear_fit::Moments;
+use crate::linear_fit::{Moments, Sums};
 use crate::mask::local_position;
 use crate::scene::Scene;
 use crate::volume::Lattice;
@@ -57,18 +57,14 @@ trait Surroundings {
     /// What a linear fit of `values` around a place says there.
     fn fit(&self, at: Self::Place, values: impl Fn(Self::Place) -> Halves) -> Halves {
         let mut moments = Moments::default();
-        // Σ K v (1, d) of either half.
-        let mut sums = [[Vec3::ZERO; 4]; 2];
+        let mut sums = [Sums::default(); 2];
         self.around(at, |n, d, d2| {
             let w = 1.0 - d2;
             moments.add(w, d);
-            for (sums, v) in sums.iter_mut().zip(values(n)) {
-                let terms = [1.0, d.x, d.y, d.z];
-                sums.iter_mut().zip(terms).for_each(|(s, t)| *s += w * t * v);
-            }
+            sums.iter_mut().zip(values(n)).for_each(|(sums, v)| sums.add(w * v, d));
         });
-        let g = moments.at_origin().as_vec4();
-        sums.map(|[s, x, y, z]| g.x * s + g.y * x + g.z * y + g.w * z)
+        let g = moments.at_origin();
+        sums.map(|sums| sums.fitted(g).as_vec3())
     }
 
     /// [`Surroundings::fit`] to what it left of `raw` is added to it; `once`: the first fits.

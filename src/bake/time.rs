@@ -284,8 +284,8 @@ fn field_seconds(
         let p = position.as_dvec3();
         let isovalue = scene.field.value(p) as f32;
         let Some(normal) = scene.normal(p, side) else { return };
-        black_box(map.irradiance(p, f64::from(isovalue), scratch));
         let receiver = Receiver { position, normal, isovalue, departure: Departure::Surface(side) };
+        black_box(map.irradiance(&receiver, scratch));
         let key = (settings.seed, Stage::Cache, i as u64);
         black_box(direct_irradiance(scene, tracer, &receiver, settings.cache_shadow_rays, key));
     });

@@ -16,7 +16,8 @@ use super::measure::{self, Bin, octant};
 use super::{EstimateSettings, Irradiance};
 use crate::direct::luminance;
 use crate::field::Field;
-use crate::linear_fit::Moments;
+use crate::isa::{Isa, Work};
+use crate::linear_fit::{Moments, Sums};
 use crate::photon::SurfacePhoton;
 use crate::scene::Scene;
 use glam::{DVec3, DVec4, Vec3, Vec4};
@@ -70,14 +71,41 @@ pub(super) struct PhotonDensity<'a> {
     edge: f64,
 }
 
-/// Radii in bins: the least, which reaches the next bins, where photons are counted, the largest.
+/// Radii in bins: the least, which reaches the next bins, the largest.
 const LEAST: f32 = 1.05;
-const FIRST: f32 = 2.0;
 const MOST: f32 = 5.0;
+/// Bins one after the other want radii that are alike: photons are first counted in so many times the radius of the bin
+/// before,
+const MARGIN: f32 = 1.15;
+/// in runs of so many bins, so that the threads' number does not tell, the first of which has none before it.
+const RUN: usize = 512;
+const FIRST: f32 = 1.75;
 /// Photons of an estimate per photon of a bin, and how many photons bins are meant to hold on average. Fewer would take
 /// longer to fit than to trace.
 const SHARE: f64 = 8.0;
 const FILL: [f64; 2] = [4.0, 8.0];
+
+/// Bins one after the other whose light is to be found.
+struct RunOfBins<'a> {
+    density: &'a PhotonDensity<'a>,
+    bins: &'a [Bin],
+    tallies: &'a [Tally],
+    near: &'a mut Vec<Neighbour>,
+    light: &'a mut [Light],
+}
+
+impl Work for RunOfBins<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn work(self) {
+        let mut before = FIRST;
+        for (light, bin) in self.light.iter_mut().zip(self.bins) {
+            *light = self.density.fitted(bin, self.tallies, MARGIN * before, self.near);
+            before = light.radius;
+        }
+    }
+}
 
 impl<'a> PhotonDensity<'a> {
     /// Counts the photons that `keep` accepts. Cells hold whole voxels, as many as make for a few photons in each that
@@ -105,12 +133,12 @@ impl<'a> PhotonDensity<'a> {
         let edge = (volume * factor.iter().product::<usize>() as f64).cbrt();
         let mut density = Self { field, settings, cells, starts, bins, light: Vec::new(), edge };
         let tallies = density.tallies(photons, keep, lattice.unit().powi(-2) as f32);
-        density.light = density
-            .bins
-            .par_iter()
-            .with_max_len(4096)
-            .map_init(Vec::new, |near, bin| density.fitted(bin, &tallies, near))
-            .collect();
+        let (mut light, isa) = (vec![Light::default(); density.bins.len()], Isa::current());
+        let runs = light.par_chunks_mut(RUN).zip(density.bins.par_chunks(RUN));
+        runs.for_each_init(Vec::new, |near, (light, bins)| {
+            isa.run(RunOfBins { density: &density, bins, tallies: &tallies, near, light });
+        });
+        density.light = light;
         density
     }
 
@@ -177,6 +205,7 @@ impl<'a> PhotonDensity<'a> {
 
     /// The bins within `radius` of one that are alike.
     #[allow(clippy::cast_possible_truncation, reason = "numbers of bins are 32 bits wide")]
+    #[inline(always)]
     fn alike(&self, at: &Bin, radius: f32, near: &mut Vec<Neighbour>) {
         // How far a coordinate is from a cell's span.
         let beyond = |at: f32, cell: usize| (cell as f32 - at).max(at - cell as f32 - 1.0).max(0.0);
@@ -208,8 +237,9 @@ impl<'a> PhotonDensity<'a> {
     }
 
     /// The light that the bins around one that are alike have, within the radius that holds the photons asked for, so
-    /// far as bins allow.
-    fn fitted(&self, at: &Bin, tallies: &[Tally], near: &mut Vec<Neighbour>) -> Light {
+    /// far as bins allow. `first`: where photons are counted first.
+    #[inline(always)]
+    fn fitted(&self, at: &Bin, tallies: &[Tally], first: f32, near: &mut Vec<Neighbour>) -> Light {
         let wanted = self.settings.photons as f32;
         // Photons of equal power that would be as noisy as those around.
         let count = |near: &[Neighbour]| {
@@ -222,11 +252,11 @@ impl<'a> PhotonDensity<'a> {
             if squares > 0.0 { sum * sum / squares } else { 0.0 }
         };
         // Their number grows as the cube of the radius; where too few tell how fast, one more look.
-        let mut known = FIRST;
+        let mut known = first.min(MOST);
         self.alike(at, known, near);
         let mut photons = count(near);
-        if photons < 0.2 * wanted {
-            known = MOST;
+        while photons < 0.2 * wanted && known < MOST {
+            known = (2.0 * known).min(MOST);
             self.alike(at, known, near);
             photons = count(near);
         }
@@ -264,9 +294,8 @@ impl<'a> PhotonDensity<'a> {
     }
 
     /// See [`super::PhotonMap::irradiance`]: the light of the bins around that are alike, by their part of the place.
-    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-    pub(super) fn irradiance(&self, position: DVec3, isovalue: f64) -> Irradiance {
-        let normal = self.field.falling_normal(position).unwrap_or_default().as_vec3();
+    /// `normal` is towards falling h.
+    pub(super) fn irradiance(&self, position: DVec3, isovalue: f32, normal: Vec3) -> Irradiance {
         let place = self.cells.place(position);
         let (mut mean, mut variance, mut radius, mut weight) = (Vec3::ZERO, 0.0, 0.0, 0.0);
         let [across, rows, layers] = [self.beside(0, place.x), self.beside(1, place.y), self.beside(2, place.z)];
@@ -279,7 +308,7 @@ impl<'a> PhotonDensity<'a> {
                     }
                     for n in self.row(i, i, j, k) {
                         let (bin, light) = (&self.bins[n], &self.light[n]);
-                        if !self.accepts(bin, isovalue as f32, normal) {
+                        if !self.accepts(bin, isovalue, normal) {
                             continue;
                         }
                         let (d, w) = (place - bin.centroid, part * bin.measure);
@@ -312,19 +341,15 @@ impl<'a> PhotonDensity<'a> {
 struct Fit {
     /// Weighted by K D.
     measure: Moments,
-    /// Σ K P (1, d).
-    power: [Vec3; 4],
+    /// Of the bins' power, weighted by K.
+    power: Sums,
 }
 
 impl Fit {
-    #[inline]
+    #[inline(always)]
     fn add(&mut self, measure: f32, power: Vec3, kernel: f32, d: Vec3) {
         self.measure.add(kernel * measure, d);
-        let p = power * kernel;
-        self.power[0] += p;
-        self.power[1] += p * d.x;
-        self.power[2] += p * d.y;
-        self.power[3] += p * d.z;
+        self.power.add(kernel * power, d);
     }
 
     /// The value at d = 0, its slope, and what to multiply K P (1, d) with for a place's part of the value; `None`
@@ -335,12 +360,11 @@ impl Fit {
             return None;
         }
         let inverse = self.measure.inverse();
-        let p = self.power.map(|p| p.as_dvec3());
-        let of = |g: DVec4| (g.x * p[0] + g.y * p[1] + g.z * p[2] + g.w * p[3]).as_vec3();
+        let of = |g: DVec4| self.power.fitted(g).as_vec3();
         let value = of(inverse.x_axis);
         let lit = value.cmpge(Vec3::ZERO);
         let slope = [inverse.y_axis, inverse.z_axis, inverse.w_axis].map(|g| Vec3::select(lit, of(g), Vec3::ZERO));
-        Some((Vec3::select(lit, value, self.power[0] / weight), slope, inverse.x_axis.as_vec4()))
+        Some((Vec3::select(lit, value, self.power.total() / weight), slope, inverse.x_axis.as_vec4()))
     }
 }
 
@@ -403,7 +427,7 @@ mod tests {
                 for _ in 0..1000 {
                     let p = DVec3::new(from, 4.0, 4.0)
                         + DVec3::new(to - from, 33.0, 33.0) * DVec3::from_array(std::array::from_fn(|_| rng.unit()));
-                    *sum += luminance(density.irradiance(p, p.x / 41.0).mean) / 8000.0;
+                    *sum += luminance(density.irradiance(p, (p.x / 41.0) as f32, -Vec3::X).mean) / 8000.0;
                 }
             }
         }
@@ -411,6 +435,28 @@ mod tests {
             // Power per isovalue, of which there is half, on all of a level set.
             let off = sum / (70_000.0 * share / 0.5 / 20.5f64.powi(2)) - 1.0;
             assert!(off.abs() < 0.08, "{share}: {off}");
+        }
+    }
+
+    #[test]
+    fn every_instruction_set_and_number_of_threads_fits_the_same_light() {
+        let (scene, landed) = (ramp(30), landed(7, 30, 150_000, |p| p.z < 11.0));
+        let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+        let density = one.install(|| PhotonDensity::new(&scene, &landed, |_| true, splat(128)));
+        assert!(density.bins.len() > 4 * RUN && !density.bins.len().is_multiple_of(RUN));
+        let light = |density: &PhotonDensity<'_>| format!("{:?}", density.light);
+        let three = rayon::ThreadPoolBuilder::new().num_threads(3).build().unwrap();
+        let again = three.install(|| PhotonDensity::new(&scene, &landed, |_| true, splat(128)));
+        assert_eq!(light(&again), light(&density));
+        let tallies = density.tallies(&landed, |_| true, scene.lattice().unit().powi(-2) as f32);
+        for isa in Isa::found() {
+            let mut found = vec![Light::default(); density.bins.len()];
+            for (light, bins) in found.chunks_mut(RUN).zip(density.bins.chunks(RUN)) {
+                let near = &mut Vec::new();
+                isa.run(RunOfBins { density: &density, bins, tallies: &tallies, near, light });
+            }
+            // Numbers are written so that no two are alike.
+            assert_eq!(format!("{found:?}"), light(&density), "{}", isa.name());
         }
     }
 
@@ -430,7 +476,7 @@ mod tests {
                 for _ in 0..20_000 {
                     let p = DVec3::from_array(std::array::from_fn(|_| 8.0 + 24.0 * rng.unit()));
                     let p = DVec3::new(p.x, if side { p.y * 0.25 + 3.0 } else { p.y * 0.25 + 29.0 }, p.z);
-                    let found = density.irradiance(p, p.x / 40.0);
+                    let found = density.irradiance(p, (p.x / 40.0) as f32, -Vec3::X);
                     let off = luminance(found.mean) / expected - 1.0;
                     sums = [sums[0] + off, sums[1] + off * off];
                     told += found.variance / expected.powi(2);

@@ -1,10 +1,11 @@
 //! Closed forms: rectangles, integrating spheres, furnaces, an infinite wall.
 
 use crate::support::*;
-use glam::DVec3;
+use glam::{DVec3, Vec3};
 use isolume::bake::{BakeSettings, Engine};
+use isolume::direct::Receiver;
 use isolume::embree::{Device, GraphTracer};
-use isolume::flattened::Side;
+use isolume::flattened::{Departure, Side};
 use isolume::luminaire::unoccluded;
 use isolume::nearest::Neighbours;
 use isolume::photon::Photons;
@@ -294,7 +295,9 @@ fn occlusion_by_an_infinite_wall() {
     let tracer = GraphTracer::new(&device, &scene).unwrap();
     let dark = Photons::default();
     let map = PhotonMap::new(&scene, &dark.surface, Side::Lower, |_| true, EstimateSettings::default());
-    assert_eq!(map.irradiance(DVec3::ONE, 0.5, &mut Neighbours::default()).mean, DVec3::ZERO);
+    let departure = Departure::Surface(Side::Lower);
+    let receiver = Receiver { position: Vec3::ONE, normal: DVec3::X, isovalue: 0.5, departure };
+    assert_eq!(map.irradiance(&receiver, &mut Neighbours::default()).mean, DVec3::ZERO);
     let cases = [(0.6, 0.071_254), (2.0, 0.276_393), (10.0, 0.450_248)];
     let at: Vec<_> = cases.iter().map(|&(k, _)| local(&scene, DVec3::new(-1.0 / k, 0.0, 0.0))).collect();
     let got = sample_radiance(

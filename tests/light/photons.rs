@@ -57,7 +57,7 @@ fn against_next_event(
         #[allow(clippy::cast_possible_truncation)]
         let receiver = Receiver { position, normal, isovalue: c as f32, departure: Departure::Surface(Side::Higher) };
         let e = direct_irradiance(scene, &tracer, &receiver, 4, (1, Stage::Direct, bins[0].count())).mean.x;
-        let estimate = map.irradiance(position.as_dvec3(), c, &mut scratch).mean.x;
+        let estimate = map.irradiance(&receiver, &mut scratch).mean.x;
         bins[((c * 10.0) as usize).min(9)].push(estimate / e);
     }
     // The lamp side of Ω leaves the highest isovalues no points far from its faces.
