@@ -251,7 +251,7 @@ impl<'a> PhotonDensity<'a> {
             }
             if squares > 0.0 { sum * sum / squares } else { 0.0 }
         };
-        // Their number grows as the cube of the radius; where too few tell how fast, one more look.
+        // Their number grows as the cube of the radius; where too few tell how fast, look farther.
         let mut known = first.min(MOST);
         self.alike(at, known, near);
         let mut photons = count(near);
@@ -371,9 +371,11 @@ impl Fit {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::direct::Receiver;
     use crate::field::Sweep;
-    use crate::flattened::Side;
-    use crate::photon_map::Estimator;
+    use crate::flattened::{Departure, Side};
+    use crate::nearest::Neighbours;
+    use crate::photon_map::{Estimator, PhotonMap};
     use crate::rng::{Rng, Stage};
     use crate::scene::{Boundary, Surface};
     use crate::volume::{Lattice, Samples, Volume};
@@ -435,6 +437,42 @@ mod tests {
             // Power per isovalue, of which there is half, on all of a level set.
             let off = sum / (70_000.0 * share / 0.5 / 20.5f64.powi(2)) - 1.0;
             assert!(off.abs() < 0.08, "{share}: {off}");
+        }
+    }
+
+    /// Light on one flank of a ridge within a bin is not on the other, whichever side of surfaces it lands on.
+    #[test]
+    fn flanks_of_a_ridge_keep_their_light_on_either_side() {
+        let lattice = Lattice::aligned([17; 3], DVec3::ZERO, DVec3::splat(0.5)).unwrap();
+        let samples = (0..lattice.len()).map(|o| 1.0 - (lattice.ijk(o)[0] as f64 - 8.0).abs() / 8.0).collect();
+        let volume = Volume::new("ridge", lattice, Samples::F64(samples)).unwrap();
+        let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+        let scene = Scene::new(field, Surface::default(), Boundary::Open, Vec::new()).unwrap();
+        let mut rng = Rng::stream(8, Stage::Test, 0);
+        for side in [Side::Lower, Side::Higher] {
+            let photons: Vec<SurfacePhoton> = landed(9, 16, 80_000, |_| true)
+                .into_iter()
+                .filter(|p| p.position.x < 8.0)
+                .map(|p| SurfacePhoton { side, isovalue: p.position.x / 8.0, ..p })
+                .collect();
+            let map = PhotonMap::new(&scene, &photons, side, |_| true, splat(64));
+            let mut light = |from: f64, to: f64| {
+                let each = (0..2000).map(|_| {
+                    let p = DVec3::new(from, 3.0, 3.0)
+                        + DVec3::new(to - from, 10.0, 10.0) * DVec3::from_array(std::array::from_fn(|_| rng.unit()));
+                    let receiver = Receiver {
+                        position: p.as_vec3(),
+                        normal: scene.normal(p, side).unwrap(),
+                        isovalue: scene.field.value(p) as f32,
+                        departure: Departure::Surface(side),
+                    };
+                    luminance(map.irradiance(&receiver, &mut Neighbours::default()).mean)
+                });
+                each.sum::<f64>() / 2000.0
+            };
+            let [slope, lit, dark] = [light(3.0, 6.0), light(7.6, 7.9), light(8.1, 8.4)];
+            println!("{side:?}: {slope} below, {lit} beside the ridge, {dark} behind it");
+            assert!((lit / slope - 1.0).abs() < 0.1 && dark < 0.02 * slope);
         }
     }
 
