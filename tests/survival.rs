@@ -327,7 +327,10 @@ fn a_dry_run_takes_little_memory_whatever_the_walls() {
 
 /// Peak resident memory of a bake, bytes; and the estimate it printed.
 fn memory(dir: &Path, more: &[&str]) -> (f64, f64) {
-    let mut command = Command::new(PROGRAM);
+    peak(dir, more, &mut Command::new(PROGRAM))
+}
+
+fn peak(dir: &Path, more: &[&str], command: &mut Command) -> (f64, f64) {
     command.current_dir(dir).args(["bake", "b.vti", "-o", "m.vti", "--threads", "2"]);
     let mut child = command.args(more).stderr(Stdio::piped()).spawn().unwrap();
     let status = format!("/proc/{}/status", child.id());
@@ -358,11 +361,14 @@ fn sweeps_take_48_bytes_a_point() {
     let all = ["--isovalues", "-20", "120", "--engine", "sweep", "--directions", "8", "--light-points", "1"];
     let [small, large] = [128, 192].map(|size| {
         volume(dir.path(), &size.to_string());
-        memory(dir.path(), &[&all[..], &["--wall-resolution", "8"]].concat()).0
+        // Else glibc keeps what is freed, 25 of 165 MB at 128³ in one run of three; sizes above 32 MB it always returns.
+        let mut command = Command::new(PROGRAM);
+        command.env("MALLOC_MMAP_THRESHOLD_", "131072");
+        peak(dir.path(), &[&all[..], &["--wall-resolution", "8"]].concat(), &mut command).0
     });
     let each = (large - small) / (192f64.powi(3) - 128f64.powi(3));
     println!("{each:.1} bytes a point");
-    assert!((48.0..72.0).contains(&each), "{each:.1} bytes a point");
+    assert!((48.0..64.0).contains(&each), "{each:.1} bytes a point");
 }
 
 #[test]
