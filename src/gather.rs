@@ -108,6 +108,13 @@ fn is_cap_from_within(hit: FlattenedHit) -> bool {
     matches!(hit.target, Target::Cap(_, Side::Higher))
 }
 
+/// What the cache holds where a ray landed.
+#[inline]
+fn found(scene: &Scene, cache: &RadianceCache, ray: &FlattenedRay, hit: FlattenedHit, misses: &mut u64) -> DVec3 {
+    let target = (hit.target, scene.leaves_within(ray.departure));
+    cache.lookup(scene, target, ray.at(hit.t), ray.isovalue, misses)
+}
+
 /// What gathers in corners know.
 struct Corners<'a, T> {
     scene: &'a Scene,
@@ -129,7 +136,7 @@ impl<T: Tracer> Corners<'_, T> {
         misses: &mut u64,
         rays: &mut u64,
     ) -> DVec3 {
-        let cached = self.cache.lookup(self.scene, hit.target, ray.at(hit.t), ray.isovalue, misses);
+        let cached = found(self.scene, self.cache, &ray, hit, misses);
         if is_cap_from_within(hit) {
             return self.path(ray, hit, cached, &mut rng(), misses, rays);
         }
@@ -186,8 +193,76 @@ impl<T: Tracer> Corners<'_, T> {
             *rays += 1;
             let Some(next) = tracer.intersect(&ray) else { return total };
             hit = next;
-            cached = cache.lookup(scene, hit.target, ray.at(hit.t), ray.isovalue, misses);
+            cached = found(scene, cache, &ray, hit, misses);
         }
         total + weight * cached
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::checkpoint;
+    use crate::field::{Field, Sweep};
+    use crate::photon::{FlatPhoton, Photons};
+    use crate::photon_map::EstimateSettings;
+    use crate::radiance_cache::CacheSettings;
+    use crate::scene::{Boundary, Surface, cornell_box};
+    use crate::volume::{Lattice, Samples, Volume};
+
+    /// The floor, and nothing else.
+    struct Floor(u32);
+
+    impl Tracer for Floor {
+        fn intersect(&self, ray: &FlattenedRay) -> Option<FlattenedHit> {
+            let hit = FlattenedHit { t: -ray.origin.z / ray.direction.z, target: Target::Polygon(self.0) };
+            (ray.direction.z < 0.0).then_some(hit)
+        }
+        fn occluded(&self, _: &FlattenedRay) -> bool {
+            false
+        }
+    }
+
+    /// Low on both sides of an upright level set, where a texel of the floor lies on both, too.
+    #[test]
+    fn either_side_gathers_its_own_light() {
+        let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::splat(0.125)).unwrap();
+        let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[0] as f32).collect();
+        let volume = Volume::new("ramp", lattice, Samples::F32(samples)).unwrap();
+        let field = Field::new(&volume, Sweep::new(0.0, 8.0).unwrap()).unwrap();
+        let walls = cornell_box(field.lattice(), 0.0).unwrap();
+        let floor = walls.iter().position(|p| p.name == "z_min").unwrap() as u32;
+        // No luminaire: nothing is direct.
+        let walls = walls.into_iter().filter(|p| p.emission == DVec3::ZERO).collect();
+        let surface = Surface { both_sides: true, ..Surface::default() };
+        let scene = Scene::new(field, surface, Boundary::Open, walls).unwrap();
+        let photons = (0..400_000).filter_map(|i| {
+            let mut rng = Rng::stream(1, Stage::Test, i);
+            let [u, v, c] = [(); 3].map(|()| rng.unit());
+            let x = scene.polygons()[floor as usize].at([u, v]).x;
+            let uvc = [u, v, c].map(|x| x as f32);
+            (x < c || rng.unit() < 0.25).then_some(FlatPhoton { flat: floor, uvc, power: glam::Vec3::ONE, bounces: 1 })
+        });
+        let photons = Photons { flat: photons.collect(), ..Photons::default() };
+        let settings = CacheSettings {
+            node_shadow_rays: 1,
+            flat_shadow_rays: 1,
+            flat_resolution: 16,
+            isovalue_resolution: 8,
+            seed: 1,
+        };
+        let saved = [checkpoint::Stage::UNSAVED; 2];
+        let tracer = Floor(floor);
+        let estimate = EstimateSettings::default();
+        let cache = RadianceCache::new(&scene, &tracer, &photons, estimate, &settings, false, saved, &|_| true);
+        let light = [Side::Lower, Side::Higher].map(|side| {
+            let position = DVec3::new(8.0 * 0.47, 4.0, 0.05);
+            let normal = scene.normal(position, side).unwrap();
+            let departure = Departure::Surface(side);
+            let receiver = Receiver { position: position.as_vec3(), normal, isovalue: 0.47, departure };
+            gathered_irradiance(&scene, &tracer, &cache, &receiver, 1024, (1, 1)).estimate.mean.x
+        });
+        println!("{light:?}");
+        assert!((light[0] / light[1] / 4.0 - 1.0).abs() < 0.05, "{light:?}");
     }
 }

@@ -2,6 +2,7 @@
 //! flats as (u, v, c) textures. Direct light by shadow rays plus photons without their first landings.
 //! \[Christensen99\]
 
+mod openings;
 mod flats;
 mod pools;
 
@@ -116,6 +117,8 @@ pub struct RadianceCache {
     nodes: Vec<Option<FieldNodes>>,
     /// What gather rays find: photons under the narrowest kernel, since many rays average their noise.
     flats: Vec<Option<FlatTexture>>,
+    /// What those from within solids find, if not the same.
+    within: Vec<Option<FlatTexture>>,
     /// What pictures show, if not the same: photons smoothed until their noise is not seen.
     shown: Option<Vec<Option<FlatTexture>>>,
     /// Rays traced to fill it.
@@ -140,15 +143,14 @@ impl RadianceCache {
         let rays = AtomicU64::new(0);
         let photons_of = ByFlat::new(&photons.flat, flat::count(scene));
         let pools = Pools::new(scene, settings.flat_resolution);
-        let (flats, shown) = (0..flat::count(scene))
-            .into_par_iter()
-            .map(|n| {
-                let photons = pools.of(n).flat_map(|m| photons_of.flat(m));
-                fill_flat(scene, tracer, n, photons, pools.area(scene, n), settings, &rays)
-            })
-            .unzip();
+        let filled = (0..flat::count(scene)).into_par_iter().map(|n| {
+            let photons = pools.of(n).flat_map(|m| photons_of.flat(m));
+            let filled = fill_flat(scene, tracer, n, photons, pools.area(scene, n), settings, &rays);
+            (filled.gathered, (filled.within, filled.shown))
+        });
+        let (flats, (within, shown)) = filled.unzip();
         let nodes = (0..scene.fields()).map(|_| None).collect();
-        let mut cache = Self { nodes, flats, shown: Some(shown), rays: rays.into_inner() };
+        let mut cache = Self { nodes, flats, within, shown: Some(shown), rays: rays.into_inner() };
         if with_nodes {
             cache.fill(scene, tracer, photons, estimate, settings, saved, tick);
         }
@@ -219,12 +221,21 @@ impl RadianceCache {
     pub fn from_parts(nodes: Nodes, flats: Vec<Option<FlatTexture>>) -> Self {
         let points = nodes.iter().flatten().map(Vec::len).next();
         let nodes = points.map(|n| FieldNodes { filled: NodeSet::all(n), stored: NodeSet::all(n), sides: nodes });
-        Self { nodes: vec![nodes], flats, shown: None, rays: 0 }
+        let within = vec![None; flats.len()];
+        Self { nodes: vec![nodes], flats, within, shown: None, rays: 0 }
     }
 
-    /// Outgoing radiance where a ray of hyperplane `isovalue` landed, without what luminaires emit. Counts up `misses`
-    /// if no node of the cell is filled.
-    pub fn lookup(&self, scene: &Scene, target: Target, position: DVec3, isovalue: f32, misses: &mut u64) -> DVec3 {
+    /// Outgoing radiance where a ray of hyperplane `isovalue` landed, without what luminaires emit. `within`: whether
+    /// it comes from within a solid, where flats have light of their own. Counts up `misses` if no node of the cell is
+    /// filled.
+    pub fn lookup(
+        &self,
+        scene: &Scene,
+        (target, within): (Target, bool),
+        position: DVec3,
+        isovalue: f32,
+        misses: &mut u64,
+    ) -> DVec3 {
         match target {
             Target::Surface(side) => {
                 let surface = &scene.surface;
@@ -241,17 +252,18 @@ impl RadianceCache {
             Target::Cap(_, Side::Higher) => DVec3::ZERO,
             Target::Cap(face, Side::Lower) => {
                 let uv = flat::face_texture(scene, face, position);
-                self.flat(flat::cap(scene, face), uv, isovalue)
+                self.flat(flat::cap(scene, face), false, uv, isovalue)
             }
             Target::Polygon(id) => {
                 let uv = scene.polygons()[id as usize].texture(scene.lattice().to_world(position));
-                self.flat(id as usize, uv, isovalue)
+                self.flat(id as usize, within, uv, isovalue)
             }
         }
     }
 
-    fn flat(&self, number: usize, [u, v]: [f64; 2], isovalue: f32) -> DVec3 {
-        self.flats[number].as_ref().map_or(DVec3::ZERO, |t| t.lookup([u, v, f64::from(isovalue)]))
+    fn flat(&self, number: usize, within: bool, [u, v]: [f64; 2], isovalue: f32) -> DVec3 {
+        let within = if within { self.within[number].as_ref() } else { None };
+        within.or(self.flats[number].as_ref()).map_or(DVec3::ZERO, |t| t.lookup([u, v, f64::from(isovalue)]))
     }
 
     /// What a white surface of field `number` would reflect: trilinear over the filled nodes of the cell.
@@ -437,7 +449,7 @@ mod tests {
         let look = |x: f64| {
             let mut misses = 0;
             let at = DVec3::new(x, 0.5, 0.5);
-            let found = cache.lookup(&scene, Target::Surface(Side::Lower), at, 0.5, &mut misses).x;
+            let found = cache.lookup(&scene, (Target::Surface(Side::Lower), false), at, 0.5, &mut misses).x;
             (found, misses)
         };
         // In the cell; one step off; both nodes in reach; out of reach.

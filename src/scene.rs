@@ -211,6 +211,16 @@ impl Scene {
         FlattenedRay { departure, ..FlattenedRay::free(origin, direction, isovalue) }
     }
 
+    /// Whether rays that leave so start within a solid: on a level set, to the side that is not its outside.
+    #[inline]
+    pub fn leaves_within(&self, departure: Departure) -> bool {
+        match departure {
+            Departure::Surface(side) => side != self.surface.outside,
+            Departure::Companion(n, side) => side != self.companions[usize::from(n)].member.surface.outside,
+            Departure::Free | Departure::Polygon(_) | Departure::Cap(..) => false,
+        }
+    }
+
     /// E₀: the unoccluded irradiance of a patch at the centre of the (first) volume that faces the strongest luminaire;
     /// the largest channel of the sum over all luminaires. 0 without luminaires.
     pub fn reference_irradiance(&self) -> f64 {

@@ -361,7 +361,7 @@ fn sweeps_take_48_bytes_a_point() {
     let all = ["--isovalues", "-20", "120", "--engine", "sweep", "--directions", "8", "--light-points", "1"];
     let [small, large] = [128, 192].map(|size| {
         volume(dir.path(), &size.to_string());
-        // Else glibc keeps what is freed, 25 of 165 MB at 128³ in one run of three; sizes above 32 MB it always returns.
+        // Else glibc keeps what is freed, 25 of 165 MB at 128³ in one run of three; blocks above 32 MB never.
         let mut command = Command::new(PROGRAM);
         command.env("MALLOC_MMAP_THRESHOLD_", "131072");
         peak(dir.path(), &[&all[..], &["--wall-resolution", "8"]].concat(), &mut command).0

@@ -151,7 +151,8 @@ impl<'a> Contacts<'a> {
         let gathered = gathered_irradiance(scene, tracer, cache, &receiver, gather_rays, (seed, index)).estimate;
         counts.rays += direct.rays + gathered.rays;
         counts.misses += gathered.misses;
-        let shown = cache.lookup(scene, Target::Polygon(wall), x, isovalue, &mut counts.misses);
+        let target = (Target::Polygon(wall), scene.leaves_within(receiver.departure));
+        let shown = cache.lookup(scene, target, x, isovalue, &mut counts.misses);
         let level_set = scene.surface.albedo.at(f64::from(isovalue));
         // D_w/π, without what the level set has lit the wall by so far.
         let opening = ((direct.mean + gathered.mean) / PI - share * level_set * white).max(DVec3::ZERO);

@@ -2,14 +2,12 @@
 //! of it that light reaches.
 
 use super::CacheSettings;
+use super::openings::{Hidden, Open, Solid, is_open};
 use crate::brdf::reflected;
 use crate::direct::{Receiver, direct_irradiance};
-use crate::field::Field;
-use crate::flat::{self, Flat, FlatTexture, Texel};
-use crate::flattened::{Side, split_face};
+use crate::flat::{self, FlatTexture, Texel};
 use crate::neighbourhood::neighbourhood;
 use crate::photon::FlatPhoton;
-use crate::polygon::Polygon;
 use crate::rng::Stage;
 use crate::scene::Scene;
 use crate::tracer::Tracer;
@@ -17,8 +15,19 @@ use glam::DVec3;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Direct light of texels and photons of later landings, on so many times the flat's area, smoothed little for gathers
-/// and more for pictures.
+/// A flat's textures; `None` of what reflects nothing.
+#[derive(Default)]
+pub(super) struct Filled {
+    /// For gathers, smoothed little.
+    pub gathered: Option<FlatTexture>,
+    /// For gathers from within solids, where those stand on the flat: their own light in all texels that they cover,
+    /// whatever else lies in these; `gathered` elsewhere.
+    pub within: Option<FlatTexture>,
+    /// For pictures, smoothed more.
+    pub shown: Option<FlatTexture>,
+}
+
+/// Direct light of texels and photons of later landings, on so many times the flat's area.
 pub(super) fn fill_flat<T: Tracer>(
     scene: &Scene,
     tracer: &T,
@@ -27,8 +36,8 @@ pub(super) fn fill_flat<T: Tracer>(
     areas: f64,
     settings: &CacheSettings,
     rays: &AtomicU64,
-) -> (Option<FlatTexture>, Option<FlatTexture>) {
-    let Some(flat) = flat::flat(scene, number).filter(|f| !f.albedo.black()) else { return (None, None) };
+) -> Filled {
+    let Some(flat) = flat::flat(scene, number).filter(|f| !f.albedo.black()) else { return Filled::default() };
     let dims = flat.resolution(settings.flat_resolution, settings.isovalue_resolution);
     let centres = FlatTexture::black(dims);
     let lattice = scene.lattice();
@@ -43,7 +52,21 @@ pub(super) fn fill_flat<T: Tracer>(
     let photons = photons.filter(|p| !hidden.holds([p.uvc[0], p.uvc[1]].map(f64::from)));
     let Landings { powers, counts } = Landings::new(dims, &parts, photons, solid.as_ref());
     let outer = |i: usize| open.as_ref().is_none_or(|o| o.outer[i]);
-    let direct: Vec<Option<DVec3>> = (0..centres.texels.len())
+    let irradiance = |i: usize, at: [f64; 2]| {
+        let c = centres.centre(i)[2];
+        #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
+        let receiver = Receiver {
+            position: lattice.to_index(flat.at(at)).as_vec3(),
+            normal: flat.normal,
+            isovalue: c as f32,
+            departure: flat.departure,
+        };
+        let key = (settings.seed, Stage::Cache, !(((number as u64) << 40) | i as u64));
+        let direct = direct_irradiance(scene, tracer, &receiver, settings.flat_shadow_rays, key);
+        rays.fetch_add(direct.rays, Ordering::Relaxed);
+        direct.mean
+    };
+    let lit: Vec<Option<DVec3>> = (0..centres.texels.len())
         .into_par_iter()
         .with_min_len(256)
         .map(|i| {
@@ -53,21 +76,10 @@ pub(super) fn fill_flat<T: Tracer>(
                 Some(open) if open.outer[i] => open.at[i],
                 _ => Some(part.at),
             };
-            let c = centres.centre(i)[2];
-            #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
-            let receiver = Receiver {
-                position: lattice.to_index(flat.at(place?)).as_vec3(),
-                normal: flat.normal,
-                isovalue: c as f32,
-                departure: flat.departure,
-            };
-            let key = (settings.seed, Stage::Cache, !(((number as u64) << 40) | i as u64));
-            let direct = direct_irradiance(scene, tracer, &receiver, settings.flat_shadow_rays, key);
-            rays.fetch_add(direct.rays, Ordering::Relaxed);
-            Some(direct.mean)
+            Some(irradiance(i, place?))
         })
         .collect();
-    let direct = widened(&direct, dims, &outer);
+    let direct = widened(&lit, dims, &outer);
     let texel = areas * flat.area() / (dims[0] * dims[1]) as f64 / dims[2] as f64;
     let densities = powers.map(|power| power.into_iter().map(|p| p / texel).collect::<Vec<DVec3>>());
     // Of each texel, the outer part and that within solids.
@@ -76,162 +88,44 @@ pub(super) fn fill_flat<T: Tracer>(
     let outside: Vec<f64> = (0..direct.len()).map(|i| covered(i) * share(i)).collect();
     let within: Vec<f64> = (0..direct.len()).map(|i| covered(i) * (1.0 - share(i))).collect();
     let shares = [outside, within];
-    let texture = |kernel: Kernel, least: f64| {
-        let light = |n: usize| {
-            let per_texel = counts[n] as f64 / shares[n].iter().sum::<f64>().max(1.0);
-            smooth_twice(&densities[n], &shares[n], dims, kernel.passes(per_texel))
-        };
-        let indirect = [Some(light(0)), (counts[1] > 0).then(|| light(1))];
-        let texels = (0..direct.len()).map(|n| {
-            let from = n - n % parts.len() + parts[n % parts.len()].source;
-            let indirect = indirect[usize::from(!outer(n))].as_ref().map_or(DVec3::ZERO, |i| i[from]);
-            reflected(flat.albedo.at(centres.centre(n)[2]), (direct[from] + indirect).max(DVec3::splat(least)))
-        });
-        Some(FlatTexture { dims, texels: texels.map(|l| l.as_vec3().to_array()).collect() })
+    let indirect = |n: usize, kernel: &Kernel| {
+        let per_texel = counts[n] as f64 / shares[n].iter().sum::<f64>().max(1.0);
+        smooth_twice(&densities[n], &shares[n], dims, kernel.passes(per_texel))
     };
+    // The texel that stands for one.
+    let source = |n: usize| n - n % parts.len() + parts[n % parts.len()].source;
+    let texture = |reflects: &dyn Fn(usize) -> DVec3| {
+        let texels = (0..direct.len()).map(|n| reflected(flat.albedo.at(centres.centre(n)[2]), reflects(n)));
+        FlatTexture { dims, texels: texels.map(|l| l.as_vec3().to_array()).collect() }
+    };
+    let both = |kernel: &Kernel| [Some(indirect(0, kernel)), (counts[1] > 0).then(|| indirect(1, kernel))];
+    let of = |all: &[Option<Vec<DVec3>>; 2], n: usize, within: bool| {
+        all[usize::from(within)].as_ref().map_or(DVec3::ZERO, |i| i[source(n)])
+    };
+    let wide = both(&SHOWN);
+    let shown = Some(texture(&|n| (direct[source(n)] + of(&wide, n, !outer(n))).max(DVec3::ZERO)));
+    drop(wide);
     // A texture to be averaged is not clamped at 0: that would brighten what few photons reach.
-    (texture(GATHERED, f64::NEG_INFINITY), texture(SHOWN, 0.0))
+    let narrow = both(&GATHERED);
+    let light = |n: usize| direct[source(n)] + of(&narrow, n, !outer(n));
+    let gathered = Some(texture(&light));
+    let within = open.as_ref().filter(|_| number < scene.polygons().len() && any_both_sides(scene)).map(|open| {
+        let solid = |i: usize| parts[i % parts.len()].covered > 0.0 && open.shares[i] < 1.0;
+        let own = (0..lit.len()).into_par_iter().with_min_len(256).map(|i| match solid(i) {
+            true if outer(i) => open.closed[i].map(|at| irradiance(i, at)),
+            true => lit[i],
+            false => None,
+        });
+        let own = widened(&own.collect::<Vec<_>>(), dims, &solid);
+        let beside = |n: usize| neighbourhood(dims, source(n)).any(|mut run| run.any(solid));
+        texture(&|n| if beside(n) { own[source(n)] + of(&narrow, n, true) } else { light(n) })
+    });
+    Filled { gathered, within, shown }
 }
 
-/// What luminaires closely before a flat hide of it.
-struct Hidden<'a> {
-    flat: &'a Flat,
-    covering: Vec<&'a Polygon>,
-}
-
-impl<'a> Hidden<'a> {
-    fn new(scene: &'a Scene, number: usize, flat: &'a Flat) -> Self {
-        let wall = u32::try_from(number).ok().filter(|_| number < scene.polygons().len());
-        Self { flat, covering: wall.into_iter().flat_map(|wall| scene.covering(wall)).collect() }
-    }
-
-    fn holds(&self, uv: [f64; 2]) -> bool {
-        !self.covering.is_empty() && {
-            let x = self.flat.at(uv);
-            self.covering.iter().any(|light| light.contains(x))
-        }
-    }
-
-    /// Takes it off each texel.
-    fn take_off(&self, [nu, nv, _]: [usize; 3], parts: &mut [Texel]) {
-        if self.covering.is_empty() {
-            return;
-        }
-        for (texel, part) in parts.iter_mut().enumerate() {
-            let hidden = (0..PLACES * PLACES).filter(|n| {
-                let [a, b] = [n % PLACES, n / PLACES].map(|n| (n as f64 + 0.5) / PLACES as f64);
-                self.holds([((texel % nu) as f64 + a) / nu as f64, ((texel / nu) as f64 + b) / nv as f64])
-            });
-            part.covered *= 1.0 - hidden.count() as f64 / (PLACES * PLACES) as f64;
-        }
-    }
-}
-
-/// Where on a flat solids stand: light reaches a wall on Ω's faces where the level sets' outer sides are, and a cap
-/// where the solid is that it closes.
-struct Solid<'a> {
-    scene: &'a Scene,
-    flat: &'a Flat,
-    /// The field whose cap this is: the scene's own, or a companion's.
-    capped: Option<Option<u8>>,
-}
-
-/// The isovalues at which light reaches a place: above the first and up to the second.
-type Opening = [f64; 2];
-
-impl<'a> Solid<'a> {
-    /// `None` for flats that are no parallelograms, which count as open everywhere.
-    fn new(scene: &'a Scene, number: usize, flat: &'a Flat) -> Option<Self> {
-        let cap = number.checked_sub(scene.polygons().len());
-        let capped = cap.map(|n| split_face(scene.numbered_face(n).0).0);
-        flat.is_parallelogram().then_some(Self { scene, flat, capped })
-    }
-
-    /// What all fields around a place leave open.
-    fn opening(&self, uv: [f64; 2]) -> Opening {
-        let p = self.scene.lattice().to_index(self.flat.at(uv));
-        let mut open = [f64::NEG_INFINITY, f64::INFINITY];
-        let mut close = |number: Option<u8>, field: &Field, p: DVec3, outside: Side| {
-            let within = p.cmpge(DVec3::splat(-1e-6)).all() && p.cmple(field.lattice().far() + 1e-6).all();
-            let h = if within { field.value(p) } else { f64::NAN };
-            let below = (outside == Side::Lower) != (self.capped == Some(number));
-            // NaN: nothing is there.
-            open = if below { [open[0].max(h), open[1]] } else { [open[0], open[1].min(h)] };
-        };
-        close(None, &self.scene.field, p, self.scene.surface.outside);
-        for (n, c) in (0..).zip(self.scene.companions()) {
-            close(Some(n), &c.member.field, c.to_index(p), c.member.surface.outside);
-        }
-        open
-    }
-}
-
-/// Whether light reaches a place at isovalue `c`.
-fn is_open([above, up_to]: Opening, c: f64) -> bool {
-    c > above && c <= up_to
-}
-
-/// Places along each edge of a texel that are asked whether they are open.
-const PLACES: usize = 4;
-
-/// The part of each texel that light reaches.
-struct Open {
-    /// Its share, [0, 1].
-    shares: Vec<f64>,
-    /// Where it is, at the texel's middle isovalue; `None` if nowhere.
-    at: Vec<Option<[f64; 2]>>,
-    /// Texels that have such a part, and those around them, which are looked up together. The others hold what light
-    /// there is within solids.
-    outer: Vec<bool>,
-}
-
-impl Open {
-    /// `None` if all is open.
-    fn new(solid: &Solid, [nu, nv, nc]: [usize; 3]) -> Option<Self> {
-        const MOST: usize = PLACES * PLACES;
-        // The last place is the centre.
-        let place = |texel: usize, n: usize| {
-            let offset = |i: usize| if n == MOST { 0.5 } else { (i as f64 + 0.5) / PLACES as f64 };
-            [
-                ((texel % nu) as f64 + offset(n % PLACES)) / nu as f64,
-                ((texel / nu) as f64 + offset(n / PLACES)) / nv as f64,
-            ]
-        };
-        let openings: Vec<[Opening; MOST + 1]> = (0..nu * nv)
-            .into_par_iter()
-            .with_min_len(64)
-            .map(|texel| std::array::from_fn(|n| solid.opening(place(texel, n))))
-            .collect();
-        let (shares, at): (Vec<f64>, Vec<Option<[f64; 2]>>) = (0..nu * nv * nc)
-            .into_par_iter()
-            .with_min_len(1024)
-            .map(|i| {
-                let (texel, isovalue) = (i % (nu * nv), (i / (nu * nv)) as f64);
-                let [lo, hi] = [isovalue / nc as f64, (isovalue + 1.0) / nc as f64];
-                let (places, centre) = (&openings[texel][..MOST], openings[texel][MOST]);
-                let open = |[above, up_to]: Opening| (hi.min(up_to) - lo.max(above)).max(0.0) / (hi - lo);
-                let share = places.iter().map(|&p| open(p)).sum::<f64>() / MOST as f64;
-                let middle = (isovalue + 0.5) / nc as f64;
-                if is_open(centre, middle) {
-                    return (share, Some(place(texel, MOST)));
-                }
-                let open = (0..MOST).filter(|&n| is_open(places[n], middle));
-                let open: Vec<[f64; 2]> = open.map(|n| place(texel, n)).collect();
-                (share, central(&open))
-            })
-            .unzip();
-        let outer = |i: usize| neighbourhood([nu, nv, nc], i).any(|run| shares[run].iter().any(|s| *s > 0.0));
-        let outer = (0..shares.len()).map(outer).collect();
-        shares.iter().any(|&s| s < 1.0).then_some(Self { shares, at, outer })
-    }
-}
-
-/// The one of some places that is nearest to their centroid.
-fn central(places: &[[f64; 2]]) -> Option<[f64; 2]> {
-    let n = places.len() as f64;
-    let mean = [0, 1].map(|a| places.iter().map(|p| p[a]).sum::<f64>() / n);
-    let away = |p: &[f64; 2]| (p[0] - mean[0]).powi(2) + (p[1] - mean[1]).powi(2);
-    places.iter().copied().min_by(|p, q| away(p).total_cmp(&away(q)))
+/// Whether anything gathers from within solids.
+fn any_both_sides(scene: &Scene) -> bool {
+    scene.surface.both_sides || scene.companions().iter().any(|c| c.member.surface.both_sides)
 }
 
 /// Photons sorted by flat, in their order.
@@ -366,7 +260,7 @@ fn smooth_along(image: &[DVec3], out: &mut [DVec3], dims: [usize; 3], axis: usiz
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::Sweep;
+    use crate::field::{Field, Sweep};
     use crate::flattened::{FlattenedHit, FlattenedRay};
     use crate::rng::Rng;
     use crate::scene::{Boundary, Surface, cornell_box};
@@ -411,7 +305,8 @@ mod tests {
             isovalue_resolution: 8,
             seed: 1,
         };
-        let texture = fill_flat(&scene, &Nothing, number, photons, 1.0, &settings, &AtomicU64::new(0)).0.unwrap();
+        let texture =
+            fill_flat(&scene, &Nothing, number, photons, 1.0, &settings, &AtomicU64::new(0)).gathered.unwrap();
         let (hidden, expected) = (Hidden::new(&scene, number, &flat), reflected(flat.albedo.at(0.5), DVec3::ONE).x);
         let mut shown = [crate::stats::Moments::default(); 2];
         let mut most = 0f64;
@@ -464,7 +359,9 @@ mod tests {
             seed: 1,
         };
         let fill = |photons: &[FlatPhoton]| {
-            fill_flat(&scene, &Nothing, floor, photons.iter().copied(), 1.0, &settings, &AtomicU64::new(0)).0.unwrap()
+            fill_flat(&scene, &Nothing, floor, photons.iter().copied(), 1.0, &settings, &AtomicU64::new(0))
+                .gathered
+                .unwrap()
         };
         let texture = fill(&photons);
         let expected = reflected(flat.albedo.at(0.5), DVec3::splat(irradiance)).x;
@@ -495,5 +392,88 @@ mod tests {
         assert!(lit.lookup(deep).x > 3.0 * expected && texture.lookup(deep).x == 0.0, "{}", lit.lookup(deep));
         let open = Open::new(&solid, texture.dims).unwrap();
         assert!((0..texture.texels.len()).filter(|&i| open.outer[i]).all(|i| texture.texels[i] == lit.texels[i]));
+    }
+
+    /// Lets light through to what lies within solids only, and photons land there a third as densely as outside: who
+    /// gathers from within sees so much up to the line where surfaces stand on the floor, from outside none of it.
+    #[test]
+    fn light_within_solids_is_its_own_beside_surfaces() {
+        struct Outside<'a>(&'a Field);
+
+        impl Tracer for Outside<'_> {
+            fn intersect(&self, _: &FlattenedRay) -> Option<FlattenedHit> {
+                None
+            }
+            fn occluded(&self, ray: &FlattenedRay) -> bool {
+                self.0.value(ray.origin.as_dvec3()) < f64::from(ray.isovalue)
+            }
+        }
+
+        let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::splat(0.125)).unwrap();
+        let h = |o: usize| {
+            let [i, j, k] = lattice.ijk(o).map(|x| x as f32 / 8.0);
+            (3.0 * i).sin() * (2.0 * j + 0.3).cos() + 0.2 * k
+        };
+        let volume = Volume::new("h", lattice.clone(), Samples::F32((0..lattice.len()).map(h).collect())).unwrap();
+        let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+        let walls = cornell_box(field.lattice(), 0.0).unwrap();
+        let floor = walls.iter().position(|p| p.name == "z_min").unwrap();
+        let scene = |both_sides: bool| {
+            let surface = Surface { both_sides, ..Surface::default() };
+            Scene::new(field.clone(), surface, Boundary::Open, walls.clone()).unwrap()
+        };
+        let (one, scene) = (scene(false), scene(true));
+        let flat = flat::flat(&scene, floor).unwrap();
+        let solid = Solid::new(&scene, floor, &flat).unwrap();
+        let above = |u: f64, v: f64, c: f64| c - solid.opening([u, v])[0];
+        let (dense, count, number) = (3.0, 400_000, u32::try_from(floor).unwrap());
+        let power = Vec3::splat((dense * flat.area() / count as f64) as f32);
+        let photons: Vec<FlatPhoton> = (0..count)
+            .filter_map(|i| {
+                let mut rng = Rng::stream(1, Stage::Test, i as u64);
+                let uvc = [(); 3].map(|()| rng.unit());
+                (above(uvc[0], uvc[1], uvc[2]) > 0.0 || rng.unit() < 1.0 / 3.0).then(|| FlatPhoton {
+                    flat: number,
+                    uvc: uvc.map(|x| x as f32),
+                    power,
+                    bounces: 1,
+                })
+            })
+            .collect();
+        let settings = CacheSettings {
+            node_shadow_rays: 1,
+            flat_shadow_rays: 64,
+            flat_resolution: 24,
+            isovalue_resolution: 12,
+            seed: 1,
+        };
+        let tracer = Outside(&scene.field);
+        let fill = |scene: &Scene| {
+            fill_flat(scene, &tracer, floor, photons.iter().copied(), 1.0, &settings, &AtomicU64::new(0))
+        };
+        let (filled, without) = (fill(&scene), fill(&one));
+        let (within, gathered) = (filled.within.unwrap(), filled.gathered.unwrap());
+        assert!(without.within.is_none() && without.gathered.unwrap() == gathered, "nobody asks from within");
+        // Within 0.03 of the surface, and farther off: from within, and from outside.
+        let mut found = [crate::stats::Moments::default(); 4];
+        for i in 0..40_000 {
+            let mut rng = Rng::stream(2, Stage::Test, i);
+            let [u, v, c] = [(); 3].map(|()| rng.unit());
+            let gap = above(u, v, c);
+            let receiver = Receiver {
+                position: scene.lattice().to_index(flat.at([u, v])).as_vec3(),
+                normal: flat.normal,
+                isovalue: c as f32,
+                departure: flat.departure,
+            };
+            let direct = direct_irradiance(&scene, &Nothing, &receiver, 4, (3, Stage::Test, i)).mean;
+            let outside = gap > 0.0;
+            let expected = if outside { DVec3::splat(dense) } else { direct + dense / 3.0 };
+            let texture = if outside { &gathered } else { &within };
+            let x = texture.lookup([u, v, c]).x / reflected(flat.albedo.at(c), expected).x;
+            found[2 * usize::from(outside) + usize::from(gap.abs() > 0.03)].push(x);
+        }
+        println!("{:?}", found.map(|m| (m.mean(), m.count())));
+        assert!(found.iter().all(|m| m.count() > 500 && (m.mean() - 1.0).abs() < 0.02));
     }
 }
