@@ -26,11 +26,45 @@ pub struct SurfacePhoton {
     pub foreshortening: f32,
     /// The number of the field whose level set it is.
     pub field: u8,
-    /// Reflections before this landing: 0 is direct light of a luminaire. Light of emitting level sets starts at 1,
-    /// since no receiver counts it apart.
-    pub bounces: u16,
+    /// Reflections before this landing, 255 if more: 0 is direct light of a luminaire. Light of emitting level sets
+    /// starts at 1, since no receiver counts it apart.
+    pub bounces: u8,
     /// The side it landed on.
     pub side: Side,
+    /// The [`octant`] of the receiver normal towards falling h; 0 where there is none.
+    pub octant: u8,
+}
+
+impl SurfacePhoton {
+    /// The photon of `flight` at `position` of field number `field`, where its receiver normal towards `side` and its
+    /// gradient are these.
+    #[allow(clippy::cast_possible_truncation, reason = "storage is f32; there are few fields")]
+    fn landed(
+        flight: &Flight,
+        bounces: u16,
+        (field, side): (usize, Side),
+        position: Vec3,
+        normal: Option<DVec3>,
+        gradient: DVec3,
+    ) -> Self {
+        let falling = normal.map_or(DVec3::ZERO, |n| if side == Side::Lower { n } else { -n });
+        Self {
+            position,
+            isovalue: flight.isovalue,
+            power: flight.power.as_vec3(),
+            foreshortening: foreshortening(normal, gradient, flight.direction),
+            field: field as u8,
+            bounces: bounces.min(u16::from(u8::MAX)) as u8,
+            side,
+            octant: octant(falling.as_vec3()),
+        }
+    }
+}
+
+/// The octant of a direction: a bit per negative coordinate, x lowest.
+#[inline]
+pub fn octant(n: Vec3) -> u8 {
+    n.cmplt(Vec3::ZERO).bitmask() as u8
 }
 
 /// A photon that landed on a textured flat: a polygon or a cap.
@@ -262,15 +296,8 @@ fn trace_photon<T: Tracer>(
             Target::Surface(side) => {
                 let normal = scene.normal(position.as_dvec3(), side);
                 let gradient = scene.field.gradient(position.as_dvec3());
-                out.surface.push(SurfacePhoton {
-                    position,
-                    isovalue: photon.isovalue,
-                    power: photon.power.as_vec3(),
-                    foreshortening: foreshortening(normal, gradient, photon.direction),
-                    field: scene.number() as u8,
-                    bounces,
-                    side,
-                });
+                let field = (scene.number(), side);
+                out.surface.push(SurfacePhoton::landed(&photon, bounces, field, position, normal, gradient));
                 let albedo = scene.surface.albedo.at(f64::from(photon.isovalue));
                 (albedo, normal, Departure::Surface(side))
             }
@@ -279,15 +306,8 @@ fn trace_photon<T: Tracer>(
                 let normal = companion.normal(position.as_dvec3(), side);
                 let place = companion.to_index(position.as_dvec3()).as_vec3();
                 let gradient = companion.member.field.gradient(place.as_dvec3());
-                out.surface.push(SurfacePhoton {
-                    position: place,
-                    isovalue: photon.isovalue,
-                    power: photon.power.as_vec3(),
-                    foreshortening: foreshortening(normal, gradient, photon.direction),
-                    field: companion.number as u8,
-                    bounces,
-                    side,
-                });
+                let field = (companion.number, side);
+                out.surface.push(SurfacePhoton::landed(&photon, bounces, field, place, normal, gradient));
                 let albedo = companion.member.surface.albedo.at(f64::from(photon.isovalue));
                 (albedo, normal, Departure::Companion(n, side))
             }

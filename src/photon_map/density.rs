@@ -12,13 +12,13 @@
 //! of the eight cells around it say of its place.
 
 use super::cells::Cells;
-use super::measure::{self, Bin, octant};
+use super::measure::{self, Bin};
 use super::{EstimateSettings, Irradiance};
 use crate::direct::luminance;
 use crate::field::Field;
 use crate::isa::{Isa, Work};
 use crate::linear_fit::{Moments, Sums};
-use crate::photon::SurfacePhoton;
+use crate::photon::{SurfacePhoton, octant};
 use crate::scene::Scene;
 use glam::{DVec3, DVec4, Vec3, Vec4};
 use rayon::prelude::*;
@@ -152,7 +152,8 @@ impl<'a> PhotonDensity<'a> {
     ) -> Vec<Tally> {
         let landing = |p: &SurfacePhoton| -> Option<(u32, Vec3)> {
             let position = p.position.as_dvec3();
-            let own = self.own(position, || self.field.falling_normal(position).unwrap_or_default().as_vec3())?;
+            let normal = || self.field.falling_normal(position).unwrap_or_default().as_vec3();
+            let own = self.own(position, p.octant, normal)?;
             // Squares of a photon's power, of the world's fourth power of length, do not fit f32.
             Some((own as u32, scale * p.power * p.foreshortening))
         };
@@ -181,20 +182,18 @@ impl<'a> PhotonDensity<'a> {
 
     /// The bin that a local position belongs to: of the octant of its normal, or the one that faces most alike.
     #[inline]
-    fn own(&self, position: DVec3, normal: impl FnOnce() -> Vec3) -> Option<usize> {
+    fn own(&self, position: DVec3, octant: u8, normal: impl FnOnce() -> Vec3) -> Option<usize> {
         let place = self.cells.place(position);
         let [i, j, k] = [0, 1, 2].map(|a| self.cells.cell(a, place[a]));
-        let bins = self.row(i, i, j, k);
+        let mut bins = self.row(i, i, j, k);
         if bins.len() < 2 {
-            return bins.into_iter().next();
+            return bins.next();
+        }
+        if let Some(own) = bins.clone().find(|&n| self.bins[n].octant == octant) {
+            return Some(own);
         }
         let normal = normal();
-        let octant = octant(normal);
-        let likeness = |n: usize| {
-            let bin = &self.bins[n];
-            if bin.octant == octant { 2.0 } else { bin.normal.dot(normal) }
-        };
-        bins.map(|n| (likeness(n), n)).max_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, n)| n)
+        bins.map(|n| (self.bins[n].normal.dot(normal), n)).max_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, n)| n)
     }
 
     /// Whether light at `isovalue` and `normal` is `bin`'s.
@@ -322,7 +321,7 @@ impl<'a> PhotonDensity<'a> {
         }
         if weight > 0.0 {
             (mean, variance, radius) = (mean / weight, variance / weight, radius / weight);
-        } else if let Some(own) = self.own(position, || normal) {
+        } else if let Some(own) = self.own(position, octant(normal), || normal) {
             // A tip or a crease, whose bin has another mean normal than the place itself.
             Light { value: mean, variance, radius, .. } = self.light[own];
         } else {
@@ -404,6 +403,7 @@ mod tests {
                     field: 0,
                     bounces: 1,
                     side: Side::Lower,
+                    octant: octant(-Vec3::X),
                 });
             }
         }

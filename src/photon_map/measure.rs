@@ -9,6 +9,7 @@ use super::shares::{Block, Point};
 use super::slots::{Along, LANES, Slot};
 use crate::field::Field;
 use crate::isa::{Isa, Work};
+use crate::photon::octant;
 use glam::{DVec3, DVec4, Mat3, Vec3};
 use rayon::prelude::*;
 
@@ -28,12 +29,6 @@ pub(super) struct Bin {
     pub reach: f32,
     /// Signs of the normal.
     pub octant: u8,
-}
-
-/// The octant of a normal: a bit per negative coordinate.
-#[inline]
-pub(super) fn octant(n: Vec3) -> u8 {
-    n.cmplt(Vec3::ZERO).bitmask() as u8
 }
 
 /// The bins of all cells, in the cells' order, and the first bin of each cell, with one more entry than cells. `tau`:
@@ -235,12 +230,11 @@ impl<'a> Points<'a> {
             dz[i] = (1.0 - v) * (c - a) + v * (d - b);
         }
         for (out, rows) in [(&mut ry[..len], across), (&mut rz[..len], up)] {
-            out.fill(0.0);
-            for ((before, after, scale), weight) in rows.into_iter().zip(weights) {
-                let (before, after, weight) = (&before[..len], &after[..len], weight * scale);
-                for i in 0..len {
-                    out[i] += weight * (after[i] - before[i]);
-                }
+            let [a, b, c, d] = rows.map(|(before, after, _)| (&before[..len], &after[..len]));
+            let w: [f32; 4] = std::array::from_fn(|n| weights[n] * rows[n].2);
+            for i in 0..len {
+                let rise = |(before, after): (&[f32], &[f32])| after[i] - before[i];
+                out[i] = w[0] * rise(a) + w[1] * rise(b) + w[2] * rise(c) + w[3] * rise(d);
             }
         }
         for i in 1..len - 1 {

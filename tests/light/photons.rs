@@ -7,7 +7,7 @@ use isolume::embree::{Device, GraphTracer};
 use isolume::flattened::{Departure, Side};
 use isolume::gather::gathered_irradiance;
 use isolume::nearest::Neighbours;
-use isolume::photon::{ENERGY_BINS, PhotonSettings, Photons};
+use isolume::photon::{ENERGY_BINS, PhotonSettings, Photons, octant};
 use isolume::photon_map::{EstimateSettings, Estimator, Normalisation, PhotonMap};
 use isolume::radiance_cache::{CacheSettings, RadianceCache};
 use isolume::rng::{Rng, Stage};
@@ -242,4 +242,23 @@ fn forward_is_backward() {
         }
     }
     family.accept();
+}
+
+/// A saddle lit from above and from below: photons on either side of it know to which octant it falls.
+#[test]
+fn photons_know_to_where_their_level_sets_fall() {
+    let saddle = |x: DVec3| 0.5 + 2.0 * (x.x - 0.5) * (x.y - 0.5) + 0.3 * (x.z - 0.5);
+    let lamps = [(1.5, DVec3::Y, DVec3::X), (-0.5, DVec3::X, DVec3::Y)]
+        .map(|(z, s, t)| rectangle("lamp", DVec3::new(0.5, 0.5, z), s, t, 0.0, 1.0));
+    let unit = lattice([17; 3], DVec3::ZERO, DVec3::ONE);
+    let scene = scene(field(unit, 0.0, 1.0, saddle), grey(0.5, Side::Lower), lamps.to_vec());
+    let photons = photons(&scene, &emission(50_000, 1));
+    let mut seen = [[0; 8]; 2];
+    for p in &photons.surface {
+        let falling = scene.field.falling_normal(p.position.as_dvec3()).unwrap();
+        assert_eq!(p.octant, octant(falling.as_vec3()), "{p:?}: {falling}");
+        seen[p.side.index()][usize::from(p.octant)] += 1;
+    }
+    println!("{seen:?}");
+    assert!(seen.iter().all(|side| side.iter().filter(|n| **n > 100).count() >= 4), "{seen:?}");
 }
