@@ -172,17 +172,16 @@ pub fn supported(scene: &Scene) -> Result<()> {
             "{nx}×{ny}×{nz} points: sweeps number points in 31 bits; take a coarser grid or --engine photon"
         )));
     }
-    let inside = ends::inside(scene);
-    let lamp = scene.luminaires().iter().any(|&number| inside[number as usize]);
     if scene.boundary == Boundary::Capped
         && scene.surface.stored_sides().contains(&Side::Higher)
-        && (lamp || scene.surface.emission != DVec3::ZERO || scene.field.has_gaps())
+        && lit_within_solids(scene)
     {
         return Err(Error::NotSupported(
             "boundary = \"capped\": sweeps take caps for black from within, where this scene has light; use --engine photon"
                 .into(),
         ));
     }
+    let inside = ends::inside(scene);
     if let Some((_, p)) = inside.iter().zip(scene.polygons()).find(|(inside, p)| **inside && !p.opaque_back) {
         return Err(Error::NotSupported(format!(
             "polygon '{}' stands inside the volume, where sweeps cannot see it; use --engine photon",
@@ -190,6 +189,14 @@ pub fn supported(scene: &Scene) -> Result<()> {
         )));
     }
     Ok(())
+}
+
+/// Whether there may be light within solids that nothing leaves open: of a luminaire in Ω, of surfaces that emit, or
+/// through samples that are not finite.
+pub fn lit_within_solids(scene: &Scene) -> bool {
+    let inside = ends::inside(scene);
+    let lamp = scene.luminaires().iter().any(|&number| inside[number as usize]);
+    lamp || scene.surface.emission != DVec3::ZERO || scene.field.has_gaps()
 }
 
 /// Whether 31 bits number all points, and those that the sixteen lines of a pack would meet beyond the last.

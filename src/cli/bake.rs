@@ -9,11 +9,13 @@ use crate::checkpoint::Checkpoint;
 use crate::error::{Error, Result};
 use crate::export::bake_file;
 use crate::field::Sweep;
+use crate::flattened::Side;
 use crate::isa::Isa;
 use crate::progress::{Progress, say};
-use crate::scene::{Policy, Scene};
+use crate::scene::{Boundary, Policy, Scene};
 use crate::scene_file::{Inputs, SceneOptions, load, load_series};
 use crate::series::{Series, write_collection};
+use crate::sweep::lit_within_solids;
 use crate::volume::Volume;
 use glam::DVec3;
 use std::collections::BTreeMap;
@@ -187,6 +189,14 @@ impl Bake {
             let dark = members.iter().all(|m| m.surface.emission == DVec3::ZERO);
             if loaded.scene.luminaires().is_empty() && dark {
                 say!("warning: nothing emits light; everything will be black");
+            }
+            let scene = &loaded.scene;
+            let sealed = scene.boundary == Boundary::Capped && scene.surface.outside == Side::Higher;
+            if sealed && scene.fields() == 1 && !lit_within_solids(scene) {
+                say!(
+                    "warning: boundary = \"capped\" closes the higher side of surfaces off, which is to be their outside: it \
+                     will be black; use outside = \"lower\" or boundary = \"open\""
+                );
             }
             // Sweeps that nobody asked for were chosen because they leave out nothing to speak of.
             if settings.engine == Engine::Sweep

@@ -261,11 +261,30 @@ fn smooth_along(image: &[DVec3], out: &mut [DVec3], dims: [usize; 3], axis: usiz
 mod tests {
     use super::*;
     use crate::field::{Field, Sweep};
-    use crate::flattened::{FlattenedHit, FlattenedRay};
+    use crate::flattened::{FlattenedHit, FlattenedRay, Side};
     use crate::rng::Rng;
     use crate::scene::{Boundary, Surface, cornell_box};
     use crate::volume::{Lattice, Samples, Volume};
     use glam::Vec3;
+
+    const SETTINGS: CacheSettings = CacheSettings {
+        node_shadow_rays: 1,
+        flat_shadow_rays: 64,
+        flat_resolution: 24,
+        isovalue_resolution: 12,
+        seed: 1,
+    };
+
+    /// Its level sets stand on the floor.
+    fn wavy() -> Field {
+        let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::splat(0.125)).unwrap();
+        let h = |o: usize| {
+            let [i, j, k] = lattice.ijk(o).map(|x| x as f32 / 8.0);
+            (3.0 * i).sin() * (2.0 * j + 0.3).cos() + 0.2 * k
+        };
+        let volume = Volume::new("h", lattice.clone(), Samples::F32((0..lattice.len()).map(h).collect())).unwrap();
+        Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap()
+    }
 
     struct Nothing;
 
@@ -298,15 +317,8 @@ mod tests {
             let mut rng = Rng::stream(1, Stage::Test, i);
             FlatPhoton { flat: ceiling, uvc: [(); 3].map(|()| rng.unit() as f32), power, bounces: 1 }
         });
-        let settings = CacheSettings {
-            node_shadow_rays: 1,
-            flat_shadow_rays: 1,
-            flat_resolution: 24,
-            isovalue_resolution: 8,
-            seed: 1,
-        };
         let texture =
-            fill_flat(&scene, &Nothing, number, photons, 1.0, &settings, &AtomicU64::new(0)).gathered.unwrap();
+            fill_flat(&scene, &Nothing, number, photons, 1.0, &SETTINGS, &AtomicU64::new(0)).gathered.unwrap();
         let (hidden, expected) = (Hidden::new(&scene, number, &flat), reflected(flat.albedo.at(0.5), DVec3::ONE).x);
         let mut shown = [crate::stats::Moments::default(); 2];
         let mut most = 0f64;
@@ -325,13 +337,7 @@ mod tests {
     /// where surfaces stand on it.
     #[test]
     fn density_does_not_fall_off_where_surfaces_stand_on_walls() {
-        let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::splat(0.125)).unwrap();
-        let h = |o: usize| {
-            let [i, j, k] = lattice.ijk(o).map(|x| x as f32 / 8.0);
-            (3.0 * i).sin() * (2.0 * j + 0.3).cos() + 0.2 * k
-        };
-        let volume = Volume::new("h", lattice.clone(), Samples::F32((0..lattice.len()).map(h).collect())).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+        let field = wavy();
         let walls = cornell_box(field.lattice(), 0.0).unwrap();
         let floor = walls.iter().position(|p| p.name == "z_min").unwrap();
         // No luminaire: nothing is direct.
@@ -351,15 +357,8 @@ mod tests {
             .filter(|p| is_open(solid.opening([f64::from(p.uvc[0]), f64::from(p.uvc[1])]), f64::from(p.uvc[2])))
             .collect();
         assert!(photons.len() > 100_000 && photons.len() < 300_000, "{}", photons.len());
-        let settings = CacheSettings {
-            node_shadow_rays: 1,
-            flat_shadow_rays: 1,
-            flat_resolution: 24,
-            isovalue_resolution: 12,
-            seed: 1,
-        };
         let fill = |photons: &[FlatPhoton]| {
-            fill_flat(&scene, &Nothing, floor, photons.iter().copied(), 1.0, &settings, &AtomicU64::new(0))
+            fill_flat(&scene, &Nothing, floor, photons.iter().copied(), 1.0, &SETTINGS, &AtomicU64::new(0))
                 .gathered
                 .unwrap()
         };
@@ -409,13 +408,7 @@ mod tests {
             }
         }
 
-        let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::splat(0.125)).unwrap();
-        let h = |o: usize| {
-            let [i, j, k] = lattice.ijk(o).map(|x| x as f32 / 8.0);
-            (3.0 * i).sin() * (2.0 * j + 0.3).cos() + 0.2 * k
-        };
-        let volume = Volume::new("h", lattice.clone(), Samples::F32((0..lattice.len()).map(h).collect())).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+        let field = wavy();
         let walls = cornell_box(field.lattice(), 0.0).unwrap();
         let floor = walls.iter().position(|p| p.name == "z_min").unwrap();
         let scene = |both_sides: bool| {
@@ -440,16 +433,9 @@ mod tests {
                 })
             })
             .collect();
-        let settings = CacheSettings {
-            node_shadow_rays: 1,
-            flat_shadow_rays: 64,
-            flat_resolution: 24,
-            isovalue_resolution: 12,
-            seed: 1,
-        };
         let tracer = Outside(&scene.field);
         let fill = |scene: &Scene| {
-            fill_flat(scene, &tracer, floor, photons.iter().copied(), 1.0, &settings, &AtomicU64::new(0))
+            fill_flat(scene, &tracer, floor, photons.iter().copied(), 1.0, &SETTINGS, &AtomicU64::new(0))
         };
         let (filled, without) = (fill(&scene), fill(&one));
         let (within, gathered) = (filled.within.unwrap(), filled.gathered.unwrap());
@@ -475,5 +461,39 @@ mod tests {
         }
         println!("{:?}", found.map(|m| (m.mean(), m.count())));
         assert!(found.iter().all(|m| m.count() > 500 && (m.mean() - 1.0).abs() < 0.02));
+    }
+
+    /// Photons as dense everywhere on a cap: it shows the same irradiance up to its edges, whichever side is stored.
+    #[test]
+    fn caps_are_lit_up_to_their_edges() {
+        let field = wavy();
+        for outside in [Side::Lower, Side::Higher] {
+            let surface = Surface { outside, both_sides: true, ..Surface::default() };
+            let scene = Scene::new(field.clone(), surface, Boundary::Capped, Vec::new()).unwrap();
+            // z = 0.
+            let number = 2;
+            let flat = flat::flat(&scene, number).unwrap();
+            let depth = |[u, v, c]: [f64; 3]| field.value(field.lattice().to_index(flat.at([u, v]))) - c;
+            let (irradiance, count) = (3.0, 400_000);
+            let power = Vec3::splat((irradiance * flat.area() / count as f64) as f32);
+            let place = |seed: u64, i: u64| {
+                let mut rng = Rng::stream(seed, Stage::Test, i);
+                [(); 3].map(|()| rng.unit())
+            };
+            let photons = (0..count).map(|i| place(1, i)).filter(|&p| depth(p) >= 0.0);
+            let photons = photons.map(|p| FlatPhoton { flat: 2, uvc: p.map(|x| x as f32), power, bounces: 1 });
+            let filled = fill_flat(&scene, &Nothing, number, photons, 1.0, &SETTINGS, &AtomicU64::new(0));
+            let texture = filled.gathered.unwrap();
+            assert!(filled.within.is_none(), "no light is within");
+            let expected = reflected(flat.albedo.at(0.5), DVec3::splat(irradiance)).x;
+            let mut found = [crate::stats::Moments::default(); 2];
+            for p in (0..40_000).map(|i| place(2, i)) {
+                if depth(p) > 0.0 {
+                    found[usize::from(depth(p) > 0.03)].push(texture.lookup(p).x / expected);
+                }
+            }
+            println!("{outside:?}: {:?}", found.map(|m| (m.mean(), m.count())));
+            assert!(found.iter().all(|m| m.count() > 500 && (m.mean() - 1.0).abs() < 0.02), "{outside:?}");
+        }
     }
 }

@@ -73,7 +73,8 @@ impl<'a> Solid<'a> {
         let mut close = |number: Option<u8>, field: &Field, p: DVec3, outside: Side| {
             let within = p.cmpge(DVec3::splat(-1e-6)).all() && p.cmple(field.lattice().far() + 1e-6).all();
             let h = if within { field.value(p) } else { f64::NAN };
-            let below = (outside == Side::Lower) != (self.capped == Some(number));
+            // A cap is the outer side of what is higher.
+            let below = outside == Side::Lower && self.capped != Some(number);
             // NaN: nothing is there.
             open = if below { [open[0].max(h), open[1]] } else { [open[0], open[1].min(h)] };
         };

@@ -71,6 +71,29 @@ fn binary_volumes_are_baked_by_exact_rays() {
     assert!(lines.contains("engine  sweep") && !lines.contains("warning"), "{lines}");
 }
 
+/// Caps close the higher side off: what is stored of it alone is black, unless there is light within.
+#[test]
+fn an_outside_that_caps_close_off_is_warned_of() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "13", "-o", "b.vti", "-q"]);
+    let bake = ["bake", "b.vti", "--isovalues", "3.6", "95", "--margin", "0.1", "-o", "lit.vti", "--dry-run"];
+    for (more, warned) in [
+        (&["--boundary", "capped", "--outside", "higher"][..], true),
+        (&["--boundary", "capped", "--outside", "higher", "--sides", "both"], true),
+        (&["--boundary", "capped", "--outside", "higher", "--emission", "1"], false),
+        (&["--boundary", "capped"], false),
+        (&["--outside", "higher"], false),
+    ] {
+        let lines = text(&ok(dir, &[&bake[..], more].concat()).stderr);
+        assert_eq!(
+            lines.contains("warning: boundary = \"capped\" closes the higher side"),
+            warned,
+            "{more:?}: {lines}"
+        );
+    }
+}
+
 /// A closed room whose surfaces absorb nothing, and its walls a half or a thousandth: where bounces end before light
 /// has settled, a bake says so.
 #[test]
