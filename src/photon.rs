@@ -465,4 +465,21 @@ mod tests {
             assert!((mean - expected).abs() < 5e-4, "{angle}: {mean}, {expected}");
         }
     }
+
+    /// A photon of many reflections is no first landing.
+    #[test]
+    fn bounces_are_counted_up_to_255() {
+        let flight = Flight {
+            origin: Vec3::ZERO,
+            direction: DVec3::NEG_Z,
+            isovalue: 0.5,
+            departure: Departure::Free,
+            power: DVec3::ONE,
+            bounces: 0,
+        };
+        let landed = |n: u16| {
+            SurfacePhoton::landed(&flight, n, (0, Side::Lower), Vec3::ZERO, Some(DVec3::Z), DVec3::NEG_Z).bounces
+        };
+        assert_eq!([0, 1, 254, 255, 256, 257, u16::MAX].map(landed), [0, 1, 254, 255, 255, 255, 255]);
+    }
 }

@@ -221,6 +221,11 @@ impl Scene {
         }
     }
 
+    /// Whether light within solids is stored, of any field.
+    pub fn gathers_within(&self) -> bool {
+        self.surface.both_sides || self.companions.iter().any(|c| c.member.surface.both_sides)
+    }
+
     /// E₀: the unoccluded irradiance of a patch at the centre of the (first) volume that faces the strongest luminaire;
     /// the largest channel of the sum over all luminaires. 0 without luminaires.
     pub fn reference_irradiance(&self) -> f64 {

@@ -330,6 +330,7 @@ fn memory(dir: &Path, more: &[&str]) -> (f64, f64) {
     peak(dir, more, &mut Command::new(PROGRAM))
 }
 
+/// The same by a `command` of its own, such as in another environment.
 fn peak(dir: &Path, more: &[&str], command: &mut Command) -> (f64, f64) {
     command.current_dir(dir).args(["bake", "b.vti", "-o", "m.vti", "--threads", "2"]);
     let mut child = command.args(more).stderr(Stdio::piped()).spawn().unwrap();

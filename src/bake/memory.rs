@@ -251,8 +251,8 @@ impl Parts {
         Ok(Self {
             engine: settings.engine,
             base,
-            // For gathers, maybe others from within solids, and for pictures.
-            flats: texels * if scene.surface.both_sides { 36 } else { 24 },
+            // For gathers, of photons maybe others from within solids, and for pictures.
+            flats: texels * if settings.engine == Engine::Photon && scene.gathers_within() { 36 } else { 24 },
             photons: (landings * photon) as u64,
             maps: ((lower + higher) * MAP) as u64,
             cached: if gather { 2 } else { 0 },

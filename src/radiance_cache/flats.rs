@@ -73,7 +73,7 @@ pub(super) fn fill_flat<T: Tracer>(
             let part = parts[i % parts.len()];
             let place = match &open {
                 _ if part.covered == 0.0 => None,
-                Some(open) if open.outer[i] => open.at[i],
+                Some(open) if open.outer[i] => open.place(i, true),
                 _ => Some(part.at),
             };
             Some(irradiance(i, place?))
@@ -98,21 +98,22 @@ pub(super) fn fill_flat<T: Tracer>(
         let texels = (0..direct.len()).map(|n| reflected(flat.albedo.at(centres.centre(n)[2]), reflects(n)));
         FlatTexture { dims, texels: texels.map(|l| l.as_vec3().to_array()).collect() }
     };
-    let both = |kernel: &Kernel| [Some(indirect(0, kernel)), (counts[1] > 0).then(|| indirect(1, kernel))];
+    // Outside solids and within.
+    let smoothed = |kernel: &Kernel| [Some(indirect(0, kernel)), (counts[1] > 0).then(|| indirect(1, kernel))];
     let of = |all: &[Option<Vec<DVec3>>; 2], n: usize, within: bool| {
         all[usize::from(within)].as_ref().map_or(DVec3::ZERO, |i| i[source(n)])
     };
-    let wide = both(&SHOWN);
+    let wide = smoothed(&SHOWN);
     let shown = Some(texture(&|n| (direct[source(n)] + of(&wide, n, !outer(n))).max(DVec3::ZERO)));
     drop(wide);
     // A texture to be averaged is not clamped at 0: that would brighten what few photons reach.
-    let narrow = both(&GATHERED);
+    let narrow = smoothed(&GATHERED);
     let light = |n: usize| direct[source(n)] + of(&narrow, n, !outer(n));
     let gathered = Some(texture(&light));
-    let within = open.as_ref().filter(|_| number < scene.polygons().len() && any_both_sides(scene)).map(|open| {
+    let within = open.as_ref().filter(|_| number < scene.polygons().len() && scene.gathers_within()).map(|open| {
         let solid = |i: usize| parts[i % parts.len()].covered > 0.0 && open.shares[i] < 1.0;
         let own = (0..lit.len()).into_par_iter().with_min_len(256).map(|i| match solid(i) {
-            true if outer(i) => open.closed[i].map(|at| irradiance(i, at)),
+            true if outer(i) => open.place(i, false).map(|at| irradiance(i, at)),
             true => lit[i],
             false => None,
         });
@@ -121,11 +122,6 @@ pub(super) fn fill_flat<T: Tracer>(
         texture(&|n| if beside(n) { own[source(n)] + of(&narrow, n, true) } else { light(n) })
     });
     Filled { gathered, within, shown }
-}
-
-/// Whether anything gathers from within solids.
-fn any_both_sides(scene: &Scene) -> bool {
-    scene.surface.both_sides || scene.companions().iter().any(|c| c.member.surface.both_sides)
 }
 
 /// Photons sorted by flat, in their order.

@@ -29,16 +29,13 @@ impl<'a> Hidden<'a> {
     }
 
     /// Takes it off each texel.
-    pub(super) fn take_off(&self, [nu, nv, _]: [usize; 3], parts: &mut [Texel]) {
+    pub(super) fn take_off(&self, dims: [usize; 3], parts: &mut [Texel]) {
         if self.covering.is_empty() {
             return;
         }
         for (texel, part) in parts.iter_mut().enumerate() {
-            let hidden = (0..PLACES * PLACES).filter(|n| {
-                let [a, b] = [n % PLACES, n / PLACES].map(|n| (n as f64 + 0.5) / PLACES as f64);
-                self.holds([((texel % nu) as f64 + a) / nu as f64, ((texel / nu) as f64 + b) / nv as f64])
-            });
-            part.covered *= 1.0 - hidden.count() as f64 / (PLACES * PLACES) as f64;
+            let hidden = (0..MOST).filter(|&n| self.holds(place(dims, texel, n)));
+            part.covered *= 1.0 - hidden.count() as f64 / MOST as f64;
         }
     }
 }
@@ -96,59 +93,60 @@ const PLACES: usize = 4;
 
 /// The part of each texel that light reaches.
 pub(super) struct Open {
+    dims: [usize; 3],
+    /// Per texel of one isovalue: at its places, the last of which is its centre.
+    openings: Vec<[Opening; MOST + 1]>,
     /// Its share, [0, 1].
     pub shares: Vec<f64>,
-    /// Where it is, at the texel's middle isovalue; `None` if nowhere.
-    pub at: Vec<Option<Place>>,
-    /// Where the rest is.
-    pub closed: Vec<Option<Place>>,
     /// Texels that have such a part, and those around them, which are looked up together. The others hold what light
     /// there is within solids.
     pub outer: Vec<bool>,
 }
 
+/// Places of a texel beside its centre.
+const MOST: usize = PLACES * PLACES;
+
 impl Open {
     /// `None` if all is open.
-    pub(super) fn new(solid: &Solid, [nu, nv, nc]: [usize; 3]) -> Option<Self> {
-        const MOST: usize = PLACES * PLACES;
-        // The last place is the centre.
-        let place = |texel: usize, n: usize| {
-            let offset = |i: usize| if n == MOST { 0.5 } else { (i as f64 + 0.5) / PLACES as f64 };
-            [
-                ((texel % nu) as f64 + offset(n % PLACES)) / nu as f64,
-                ((texel / nu) as f64 + offset(n / PLACES)) / nv as f64,
-            ]
-        };
+    pub(super) fn new(solid: &Solid, dims: [usize; 3]) -> Option<Self> {
+        let [nu, nv, nc] = dims;
         let openings: Vec<[Opening; MOST + 1]> = (0..nu * nv)
             .into_par_iter()
             .with_min_len(64)
-            .map(|texel| std::array::from_fn(|n| solid.opening(place(texel, n))))
+            .map(|texel| std::array::from_fn(|n| solid.opening(place(dims, texel, n))))
             .collect();
-        let (shares, places): (Vec<f64>, Vec<[Option<Place>; 2]>) = (0..nu * nv * nc)
+        let shares: Vec<f64> = (0..nu * nv * nc)
             .into_par_iter()
             .with_min_len(1024)
             .map(|i| {
-                let (texel, isovalue) = (i % (nu * nv), (i / (nu * nv)) as f64);
+                let isovalue = (i / (nu * nv)) as f64;
                 let [lo, hi] = [isovalue / nc as f64, (isovalue + 1.0) / nc as f64];
-                let (places, centre) = (&openings[texel][..MOST], openings[texel][MOST]);
                 let open = |[above, up_to]: Opening| (hi.min(up_to) - lo.max(above)).max(0.0) / (hi - lo);
-                let share = places.iter().map(|&p| open(p)).sum::<f64>() / MOST as f64;
-                let middle = (isovalue + 0.5) / nc as f64;
-                let somewhere = |opened: bool| {
-                    if is_open(centre, middle) == opened {
-                        return Some(place(texel, MOST));
-                    }
-                    let these = (0..MOST).filter(|&n| is_open(places[n], middle) == opened);
-                    central(&these.map(|n| place(texel, n)).collect::<Vec<_>>())
-                };
-                (share, [true, false].map(somewhere))
+                openings[i % (nu * nv)][..MOST].iter().map(|&p| open(p)).sum::<f64>() / MOST as f64
             })
-            .unzip();
-        let (at, closed) = places.into_iter().map(|[at, closed]| (at, closed)).unzip();
-        let outer = |i: usize| neighbourhood([nu, nv, nc], i).any(|run| shares[run].iter().any(|s| *s > 0.0));
+            .collect();
+        let outer = |i: usize| neighbourhood(dims, i).any(|run| shares[run].iter().any(|s| *s > 0.0));
         let outer = (0..shares.len()).map(outer).collect();
-        shares.iter().any(|&s| s < 1.0).then_some(Self { shares, at, closed, outer })
+        shares.iter().any(|&s| s < 1.0).then_some(Self { dims, openings, shares, outer })
     }
+
+    /// Where texel `i` is open at its middle isovalue, or where it is not: its centre if that is so, else the place
+    /// nearest to the centroid of those that are; `None` if it is nowhere so.
+    pub(super) fn place(&self, i: usize, open: bool) -> Option<Place> {
+        let [nu, nv, nc] = self.dims;
+        let (texel, middle) = (i % (nu * nv), ((i / (nu * nv)) as f64 + 0.5) / nc as f64);
+        let of = |n: usize| is_open(self.openings[texel][n], middle) == open;
+        if of(MOST) {
+            return Some(place(self.dims, texel, MOST));
+        }
+        central(&(0..MOST).filter(|&n| of(n)).map(|n| place(self.dims, texel, n)).collect::<Vec<_>>())
+    }
+}
+
+/// Place `n` of a texel.
+fn place([nu, nv, _]: [usize; 3], texel: usize, n: usize) -> Place {
+    let offset = |i: usize| if n == MOST { 0.5 } else { (i as f64 + 0.5) / PLACES as f64 };
+    [((texel % nu) as f64 + offset(n % PLACES)) / nu as f64, ((texel / nu) as f64 + offset(n / PLACES)) / nv as f64]
 }
 
 /// The one of some places that is nearest to their centroid.
