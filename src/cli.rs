@@ -145,6 +145,9 @@ struct Render {
     /// Path-trace the isosurface's triangles instead of using the bake's light
     #[arg(long, conflicts_with = "local")]
     reference: bool,
+    /// Path-trace the trilinear surface itself instead of triangles, caps included
+    #[arg(long, requires = "reference")]
+    trilinear: bool,
     /// Pixels from top to bottom
     #[arg(long, default_value_t = 600, value_name = "PIXELS")]
     height: usize,
@@ -351,7 +354,7 @@ impl Render {
             ));
         }
         let rendered = if self.reference {
-            let picture = reference::picture(scene, isovalue, &camera, self.samples, &device()?)?;
+            let picture = reference::picture(scene, isovalue, &camera, self.samples, self.trilinear, &device()?)?;
             Rendered { picture, unbaked: 0.0 }
         } else {
             let shading = match &baked {

@@ -150,8 +150,19 @@ pub(super) fn compute(
     Ok((mesh, result, inside))
 }
 
-/// A path-traced picture of the triangles at `isovalue` (source units).
-pub(super) fn picture(scene: &Scene, isovalue: f64, camera: &Camera, samples: u32, device: &Device) -> Result<Picture> {
+/// A path-traced picture of the level set of `isovalue` (source units): of its triangles, or of the trilinear surface.
+pub(super) fn picture(
+    scene: &Scene,
+    isovalue: f64,
+    camera: &Camera,
+    samples: u32,
+    trilinear: bool,
+    device: &Device,
+) -> Result<Picture> {
     let isovalue = unit_isovalue(&scene.field, isovalue)?;
-    path_picture(scene, &SurfaceTracer::new(device, scene, isovalue, 1)?, isovalue, camera, samples)
+    if trilinear {
+        path_picture(scene, &GraphTracer::new(device, scene)?, isovalue, camera, samples)
+    } else {
+        path_picture(scene, &SurfaceTracer::new(device, scene, isovalue, 1)?, isovalue, camera, samples)
+    }
 }

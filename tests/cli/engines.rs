@@ -94,6 +94,44 @@ fn an_outside_that_caps_close_off_is_warned_of() {
     }
 }
 
+/// A solid that caps close towards the camera: its reference is no triangles, and a bake shows the same.
+#[test]
+fn capped_solids_have_a_path_traced_picture() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let lattice = Lattice::aligned([13; 3], glam::DVec3::ZERO, glam::DVec3::splat(1.0 / 12.0)).unwrap();
+    let falling = (0..lattice.len()).map(|o| 1.0 - lattice.ijk(o)[1] as f32 / 12.0);
+    Volume::new("b", lattice.clone(), Samples::F32(falling.collect())).unwrap().write(dir.join("b.vti")).unwrap();
+    let scene = ["b.vti", "--isovalues", "0.1", "0.9", "--margin", "0.4", "--boundary"];
+    let draw = |file: &[&str], more: &[&str]| {
+        let fixed = ["--isovalue", "0.5", "--height", "40", "-o", "p.exr", "-q"];
+        ok(dir, &[&["render"], file, &fixed, more].concat());
+        let image = exr::prelude::read_all_flat_layers_from_file(dir.join("p.exr")).unwrap();
+        // The middle fifth.
+        let red = image.layer_data[0].channel_data.list.iter().find(|c| c.name.to_string() == "R").unwrap();
+        let [w, h] = [image.layer_data[0].size.x(), image.layer_data[0].size.y()];
+        let values: Vec<f32> = red.sample_data.values_as_f32().collect();
+        let middle = |n: usize| n * 2 / 5..n * 3 / 5;
+        let of = |y: usize| middle(w).map(move |x| (x, y));
+        let pixels: Vec<f32> = middle(h).flat_map(of).map(|(x, y)| values[x + y * w]).collect();
+        pixels.iter().sum::<f32>() / pixels.len() as f32
+    };
+    let capped = [&scene[..], &["capped"]].concat();
+    refused(
+        dir,
+        &[&["render"], &capped[..], &["--isovalue", "0.5", "-o", "p.png", "--reference"]].concat(),
+        &["--trilinear"],
+    );
+    let path_traced = ["--reference", "--trilinear", "--samples", "256"];
+    let truth = draw(&capped, &path_traced);
+    let open = draw(&[&scene[..], &["open"]].concat(), &path_traced);
+    ok(dir, &[&["bake"], &capped[..], &["-o", "lit.vti", "--directions", "256", "-q"]].concat());
+    let baked = draw(&["lit.vti"], &["--samples", "4"]);
+    println!("cap {truth}, baked {baked}, open {open}");
+    assert!(truth > 0.0 && (baked / truth - 1.0).abs() < 0.05, "{truth}, {baked}");
+    assert!((open / truth - 1.0).abs() > 0.2, "{open}: the solid's back is no cap");
+}
+
 /// A closed room whose surfaces absorb nothing, and its walls a half or a thousandth: where bounces end before light
 /// has settled, a bake says so.
 #[test]
