@@ -38,7 +38,7 @@ impl ReferenceMesh {
     pub fn from_ply(mesh: &PlyMesh) -> Result<Self> {
         let triple = |names: [&str; 3]| -> Option<Vec<DVec3>> {
             let values = mesh.triple(names)?;
-            Some(values.into_iter().map(|v| DVec3::from_array(v.map(f64::from))).collect())
+            Some(values.into_iter().map(DVec3::from_array).collect())
         };
         let missing = |what: &str| Error::Invalid(format!("has no {what}; make it with `isolume reference`"));
         let radiance = triple(["radiance_r", "radiance_g", "radiance_b"])

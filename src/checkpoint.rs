@@ -28,6 +28,9 @@ pub const MOST_WAITING: usize = 128 << 20;
 /// Writing may take this share of the time.
 const WRITING_SHARE: u32 = 20;
 
+/// Between writing, at most: a year, since the end of time can be computed from now.
+const LONGEST: Duration = Duration::from_secs(365 * 24 * 60 * 60);
+
 /// A checkpoint of one job.
 #[derive(Debug)]
 pub struct Checkpoint {
@@ -107,8 +110,8 @@ impl Stage<'_> {
 }
 
 impl Checkpoint {
-    /// A new checkpoint, without a file until `every` has passed (or [`Checkpoint::save`] is called). `job` says what
-    /// determines the blocks' bits, in lines of `key: value`.
+    /// A new checkpoint, without a file until `every` (a year at most) has passed (or [`Checkpoint::save`] is called).
+    /// `job` says what determines the blocks' bits, in lines of `key: value`.
     ///
     /// # Errors
     /// `Invalid` if there is a file at `path` that is no checkpoint: it is not to be overwritten.
@@ -121,6 +124,7 @@ impl Checkpoint {
                 return Err(Error::invalid(path, "exists and is no checkpoint; give --checkpoint another name"));
             }
         }
+        let every = every.min(LONGEST);
         let due = Instant::now() + every;
         let state = State { waiting: BTreeMap::new(), waiting_bytes: 0, log: None, resumed: false, due, warned: false };
         Ok(Self { path: path.to_path_buf(), job, every, state: Mutex::new(state) })
@@ -433,7 +437,8 @@ mod tests {
     fn blocks_come_back_whole_and_only_to_the_same_job() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.checkpoint");
-        let first = Checkpoint::new(&path, job(1), Duration::from_secs(3600)).unwrap();
+        // Never.
+        let first = Checkpoint::new(&path, job(1), Duration::MAX).unwrap();
         assert!(!first.resume().unwrap(), "there is none yet");
         first.stage(1).save(7, || vec![1, 2, 3]);
         first.stage(2).save(7, || vec![4]);

@@ -229,11 +229,11 @@ fn writable(path: &Path) -> Result<()> {
 
 /// Fails now if one of `outputs` could not be written later, is another of them, or would take the place of one of
 /// `inputs`.
-fn outputs<'p>(outputs: impl IntoIterator<Item = &'p Path>, inputs: &Inputs) -> Result<()> {
-    let outputs: Vec<&Path> = outputs.into_iter().collect();
-    for (n, output) in outputs.iter().enumerate() {
+fn outputs<P: AsRef<Path>>(outputs: impl IntoIterator<Item = P>, inputs: &Inputs) -> Result<()> {
+    let outputs: Vec<P> = outputs.into_iter().collect();
+    for (n, output) in outputs.iter().map(AsRef::as_ref).enumerate() {
         inputs.spare(output)?;
-        if outputs[..n].iter().any(|other| scene_file::same(other, output)) {
+        if outputs[..n].iter().any(|other| scene_file::same(other.as_ref(), output)) {
             return Err(Error::invalid(output, "is to be two outputs at once; give each a name of its own"));
         }
         writable(output)?;

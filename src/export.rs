@@ -20,6 +20,16 @@ fn colour_bytes(colour: [f32; 3]) -> [u8; 3] {
     colour.map(|v| (v * 255.0).round() as u8)
 }
 
+/// Steps of f32 this large, in what is to be told apart, are steps to be seen.
+const COARSE: f64 = 1e-5;
+
+/// Whether f32 is too coarse for numbers up to `largest` that span `extent`.
+fn coarse_in_f32(largest: f64, extent: f64) -> bool {
+    // Its smallest numbers have steps of 2⁻¹⁴⁹.
+    let step = (largest * f64::from(f32::EPSILON)).max(f64::from(f32::from_bits(1)));
+    extent > 0.0 && step > COARSE * extent
+}
+
 /// A mesh to be written, in world units. All vertex arrays are in the order of `positions`.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Mesh<'a> {

@@ -48,10 +48,10 @@ impl Sweep {
         (value - self.lo) / (self.hi - self.lo)
     }
 
-    /// [0, 1] to source units.
+    /// [0, 1] to source units; 0 and 1 are the sweep's ends, bit for bit.
     #[inline]
     pub fn from_unit(&self, s: f64) -> f64 {
-        self.lo + s * (self.hi - self.lo)
+        if s == 1.0 { self.hi } else { self.lo + s * (self.hi - self.lo) }
     }
 
     /// The unit isovalue of a source value exactly as samples are stored, so that a sample equal to `value` compares

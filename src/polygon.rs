@@ -33,20 +33,26 @@ pub struct Polygon {
 
 impl Polygon {
     /// A polygon of at least three vertices; `albedo` in [0, 1], `emission` as [`emission::check`] takes it. Emitters
-    /// block light from both sides.
+    /// block light from both sides. Of neighbouring vertices that coincide (1e-12 of its size) one is kept.
     ///
     /// # Errors
     /// `Invalid` if it has no area, is not planar (1e-5 of its size), not convex, or a coefficient is out of range.
-    pub fn new(name: &str, vertices: Vec<DVec3>, albedo: DVec3, emission: DVec3) -> Result<Self> {
+    pub fn new(name: &str, mut vertices: Vec<DVec3>, albedo: DVec3, emission: DVec3) -> Result<Self> {
         let fail = |what: String| Err(Error::Invalid(format!("polygon '{name}': {what}")));
         if vertices.len() < 3 || !vertices.iter().all(|v| v.is_finite()) {
             return fail(format!("{} vertices; it needs at least 3 finite ones", vertices.len()));
         }
+        let base = vertices[0];
+        let size = vertices.iter().map(|&v| (v - base).length()).fold(0.0, f64::max);
+        // An edge of no length has no direction.
+        let coincide = |a: DVec3, b: DVec3| (a - b).length() <= 1e-12 * size;
+        vertices.dedup_by(|a, b| coincide(*a, *b));
+        while vertices.len() > 1 && coincide(vertices[vertices.len() - 1], base) {
+            vertices.pop();
+        }
         // Twice the vector area: independent of which vertex comes first.
         let n = vertices.len();
-        let base = vertices[0];
-        let twice: DVec3 = (1..n - 1).map(|i| (vertices[i] - base).cross(vertices[i + 1] - base)).sum();
-        let size = vertices.iter().map(|&v| (v - base).length()).fold(0.0, f64::max);
+        let twice: DVec3 = (2..n).map(|i| (vertices[i - 1] - base).cross(vertices[i] - base)).sum();
         let area = 0.5 * twice.length();
         if !(area > 1e-12 * size * size) {
             return fail(format!(

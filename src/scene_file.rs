@@ -101,6 +101,21 @@ pub struct VolumeSource {
     pub size: Option<usize>,
 }
 
+impl VolumeSource {
+    /// That no key means nothing beside another.
+    fn check(&self) -> Result<()> {
+        let fail = |what: &str| Err(Error::Invalid(what.into()));
+        match (&self.file, &self.files, &self.generator) {
+            (Some(_), Some(_), _) => fail("[volume] needs either file or files"),
+            (_, Some(_), Some(_)) => fail("[volume] needs either files or generator"),
+            (Some(_), _, Some(_)) => fail("[volume] needs either file or generator"),
+            (.., None) if self.size.is_some() => fail("size is for a generator: a file has the samples that it has"),
+            (.., Some(_)) if self.raw.is_some() => fail("raw is for a file, a generated volume has no layout"),
+            _ => Ok(()),
+        }
+    }
+}
+
 /// The layout of a headerless file.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize, clap::Args)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
@@ -357,6 +372,10 @@ fn parse(input: &Path) -> Result<(Option<Source>, SceneFile, PathBuf)> {
 }
 
 fn load_volume(source: &VolumeSource, folder: &Path, raw: &RawOptions) -> Result<Volume> {
+    source.check()?;
+    if source.generator.is_some() && raw.given() {
+        return Err(Error::Invalid("--raw-…: a generated volume has no file with a layout".into()));
+    }
     match (&source.file, &source.generator) {
         (Some(file), None) => frames::read_volume(&folder.join(file), source, raw),
         (None, Some(name)) => Generator::from_name(name)?.sample([source.size.unwrap_or(101); 3]),
@@ -475,6 +494,13 @@ mod tests {
         let e = error_of("[volume]\ngenerator = \"bumps\"\nsize = 9\n[box]\nmargin = -1.0\n");
         assert!(e.contains("scene.toml:5: margin"), "{e}");
         assert!(error_of("[volume]\n").contains("file or generator"));
+        let e = error_of("[volume]\nfiles = [\"a.vti\", \"b.vti\"]\ngenerator = \"bumps\"\n");
+        assert!(e.contains("scene.toml:2: files") && e.contains("files or generator"), "{e}");
+        assert!(error_of("[volume]\nfile = \"a.vti\"\nsize = 9\n").contains("size is for a generator"));
+        let e = error_of("[volume]\ngenerator = \"bumps\"\nraw = { dims = [2, 2, 2], type = \"u8\" }\n");
+        assert!(e.contains("raw is for a file"), "{e}");
+        let e = error_of("[volume]\ngenerator = \"bumps\"\nsize = 100000\n");
+        assert!(e.contains("100000") && e.contains("2048"), "{e}");
         let e = error_of("isovalues = [200, 300]\n[volume]\ngenerator = \"bumps\"\nsize = 9\n");
         assert!(e.contains("outside the data"), "{e}");
     }

@@ -3,6 +3,7 @@
 use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
 use crate::volume::statistics::VolumeStatistics;
+use crate::volume::vti::escape;
 use crate::volume::{Samples, Volume};
 use rayon::prelude::*;
 use std::io::Write;
@@ -109,10 +110,19 @@ impl Series {
 
     /// `name.vti` as that of frame `n`: `name_0000.vti`.
     pub fn numbered(path: &Path, n: usize) -> PathBuf {
-        let stem = path.file_stem().unwrap_or_default().to_string_lossy();
-        let extension = path.extension().unwrap_or_default().to_string_lossy();
-        path.with_file_name(format!("{stem}_{n:04}.{extension}"))
+        suffixed(path, &format!("_{n:04}"))
     }
+}
+
+/// `name.vti` as `name<suffix>.vti`.
+pub(crate) fn suffixed(path: &Path, suffix: &str) -> PathBuf {
+    let mut name = path.file_stem().unwrap_or_default().to_os_string();
+    name.push(suffix);
+    if let Some(extension) = path.extension() {
+        name.push(".");
+        name.push(extension);
+    }
+    path.with_file_name(name)
 }
 
 /// Whether files stand for a path that is no file itself: its name holds `%d`.
@@ -179,7 +189,7 @@ pub fn write_collection(path: &Path, frames: &[(f64, PathBuf)]) -> Result<()> {
     );
     for (time, file) in frames {
         let name = file.file_name().unwrap_or_default().to_string_lossy();
-        let name = name.replace('&', "&amp;").replace('<', "&lt;").replace('"', "&quot;");
+        let name = escape(&name);
         text += &format!("    <DataSet timestep=\"{time}\" group=\"\" part=\"0\" file=\"{name}\"/>\n");
     }
     text += "  </Collection>\n</VTKFile>\n";
@@ -213,6 +223,7 @@ mod tests {
         let missing = Series::find(&dir.path().join("s_%d.vti"), None).unwrap_err().to_string();
         assert!(missing.contains("s_%d.vti") && missing.contains("two or more"), "{missing}");
         assert_eq!(Series::numbered(Path::new("a/b.vti"), 7), Path::new("a/b_0007.vti"));
+        assert_eq!(Series::numbered(Path::new("a.b/c"), 7), Path::new("a.b/c_0007"));
     }
 
     #[test]

@@ -167,6 +167,7 @@ fn describe_flat(baked: &BakedVolume, frame: &Frame, n: usize, factor: f32, byte
         "normal": f.normal.to_array(),
         "albedo": f.albedo.stops(),
         "emission": emission.to_array(),
+        "opaqueBack": polygon.is_some_and(|p| p.opaque_back),
         "corner": frame.point(corner),
         "du": dual(e, g),
         "dv": dual(g, e),

@@ -301,9 +301,10 @@ fn obj_through_tobj() {
     let (models, _) = tobj::load_obj(&path, &options).unwrap();
     let mesh = &models[0].mesh;
     // Vertices come in the order in which triangles name them first.
-    let positions: Vec<DVec3> = vectors(&mesh.positions);
-    let held: Vec<DVec3> = mesh.vertex_color.as_chunks().0.iter().map(|c| case.place(*c)).collect();
-    let normals = vectors(&mesh.normals);
+    let triples = |x: &[f64]| -> Vec<DVec3> { x.as_chunks().0.iter().map(|v| DVec3::from_array(*v)).collect() };
+    let positions = triples(&mesh.positions);
+    let held: Vec<DVec3> = triples(&mesh.vertex_color).iter().map(|c| case.place(c.as_vec3().to_array())).collect();
+    let normals = triples(&mesh.normals);
     let mut order = vec![None; case.vertices.len()];
     for (read, own) in mesh.indices.iter().zip(case.triangles.as_flattened()) {
         order[*own as usize] = Some(*read as usize);

@@ -105,9 +105,15 @@ fn frames_are_single_bakes_and_blends_those_of_blended_volumes() {
     let before: Vec<_> = (0..3).map(written).collect();
     let first = light(&dir.join("lit_0001.vti"));
     fs::remove_file(dir.join("lit_0001.vti")).unwrap();
-    let text = ok(dir, &with(&["bake", "ball_%03d.nrrd", "-o", "lit.vti", "--resume"]));
+    let text = ok(dir, &with(&["bake", "ball_%03d.nrrd", "-o", "lit.vti", "--resume", "--report", "r.json"]));
     assert!(text.contains("lit_0000.vti is complete") && !text.contains("lit_0001.vti is complete"), "{text}");
     assert_eq!((written(0), written(2)), (before[0], before[2]));
+    // Reports tell of all frames.
+    let report = |n: usize| -> serde_json::Value {
+        serde_json::from_slice(&fs::read(dir.join(format!("r_{n:04}.json"))).unwrap()).unwrap()
+    };
+    assert!((0..3).all(|n| report(n)["photons"]["emitted"] == 4000 && report(n)["job"].is_string()));
+    assert_ne!(report(0)["job"], report(1)["job"]);
     assert!(light(&dir.join("lit_0001.vti")) == first);
     let text = ok(dir, &with(&["bake", "ball_%03d.nrrd", "-o", "lit.vti", "--resume", "--seed", "2"]));
     assert!(!text.contains("is complete"), "{text}");

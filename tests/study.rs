@@ -80,7 +80,9 @@ fn strategies_are_not_baked_again_where_there_is_no_surface_to_compare() {
     let study = |range: &str| {
         let text = format!("isovalues = [{range}]\n[volume]\nfile = \"b.vti\"\n");
         fs::write(dir.join("s.toml"), text).unwrap();
-        let common = ["-o", "st", "--quick", "--photons", "2000", "--gather", "2", "--wall-resolution", "4"];
+        // On another grid than the volume's: figures of it once read beyond its end.
+        let common =
+            ["-o", "st", "--quick", "--photons", "2000", "--gather", "2", "--wall-resolution", "4", "--grid", "6,6,6"];
         let output = isolume(dir, &[&["study", "strategies", "s.toml"][..], &common].concat());
         (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
     };

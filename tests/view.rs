@@ -90,6 +90,11 @@ fn the_page_holds_the_bake_and_nothing_from_elsewhere() {
     }
     let walls = description["flats"].as_array().unwrap();
     assert_eq!(walls.len(), 6);
+    // Of the luminaire only: the back of other walls, and of what is two polygons back to back, is not there.
+    for (wall, polygon) in walls.iter().zip(baked.scene.polygons()) {
+        assert_eq!(wall["opaqueBack"], polygon.opaque_back, "{}", polygon.name);
+        assert_eq!(polygon.opaque_back, polygon.emission != DVec3::ZERO);
+    }
     assert!(walls.iter().filter(|w| !w["texture"].is_null()).count() >= 5);
     // Real data: 181×217×181 in 40 MB are 5.6 bytes a point; two sides and the fixed parts stay below that here.
     assert!(page.len() < 60_000 + 56 * n / 10, "{} bytes for {n} points", page.len());

@@ -200,7 +200,8 @@ impl Parts {
             let beyond = settings.engine == Engine::Sweep || settings.gather_rays > 0;
             let lit = own_light(&member.field, member.field.lattice(), &masks, beyond);
             let count = |is: &(dyn Fn(usize) -> bool + Sync)| {
-                (0..masks.len()).into_par_iter().filter(|&o| is(o)).count() as u64 * own_points / own_voxels
+                let count = (0..masks.len()).into_par_iter().filter(|&o| is(o)).count();
+                (count as f64 / own_voxels as f64 * own_points as f64) as u64
             };
             let own = count(&lit);
             let own_filled = count(&|o| masks[o] != Mask::Empty) - own;

@@ -7,7 +7,7 @@ use crate::bake::{
 };
 use crate::checkpoint::Checkpoint;
 use crate::error::{Error, Result};
-use crate::export::bake_file;
+use crate::export::bake_file::{self, BakedVolume};
 use crate::field::Sweep;
 use crate::flattened::Side;
 use crate::isa::Isa;
@@ -19,7 +19,7 @@ use crate::sweep::lit_within_solids;
 use crate::volume::Volume;
 use glam::DVec3;
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 #[derive(clap::Args, Clone, Debug)]
@@ -81,6 +81,7 @@ impl Bake {
             ));
         }
         expect_extension(&self.output, &["vti", "vtm"])?;
+        self.every()?;
         let inputs = Inputs::of(&self.input, &self.scene)?;
         let series = if self.scene.time.is_none() { load_series(&self.input, &self.scene)? } else { None };
         let Some(series) = series else {
@@ -89,13 +90,28 @@ impl Bake {
         };
         let frames: Vec<Self> = (0..series.times().len()).map(|n| self.frame(n)).collect();
         let collection = self.output.with_extension("pvd");
-        outputs(frames.iter().flat_map(Self::outputs).chain([&*collection]), &inputs)?;
+        outputs(frames.iter().flat_map(Self::outputs).chain([collection]), &inputs)?;
         self.frames(&series, frames, progress)
     }
 
     /// What it writes, but for the files of several volumes.
-    fn outputs(&self) -> impl Iterator<Item = &Path> {
-        [Some(&self.output), self.report.as_ref(), self.checkpoint.as_ref()].into_iter().flatten().map(PathBuf::as_path)
+    fn outputs(&self) -> impl Iterator<Item = PathBuf> {
+        [Some(self.output.clone()), self.report.clone(), Some(self.checkpoint_path())].into_iter().flatten()
+    }
+
+    /// The time between checkpoints.
+    fn every(&self) -> Result<Duration> {
+        Duration::try_from_secs_f64(self.checkpoint_every).map_err(|_| {
+            Error::Invalid(format!("--checkpoint-every {}: must be seconds, 0 or more", self.checkpoint_every))
+        })
+    }
+
+    fn checkpoint_path(&self) -> PathBuf {
+        self.checkpoint.clone().unwrap_or_else(|| {
+            let mut name = self.output.as_os_str().to_owned();
+            name.push(".checkpoint");
+            name.into()
+        })
     }
 
     /// The bake of frame `n` of a series.
@@ -134,10 +150,23 @@ impl Bake {
         Ok(())
     }
 
-    /// Whether the output is there, whole and of this job.
-    fn complete(&self, job: &str) -> bool {
-        let found = self.output.exists().then(|| bake_file::BakedVolume::read(&self.output).ok()).flatten();
-        found.is_some_and(|b| b.report.get("job").and_then(|j| j.as_str()) == Some(&digest(job)))
+    /// The output, if it is there, whole and of this job.
+    fn complete(&self, job: &str) -> Option<BakedVolume> {
+        let found = self.output.exists().then(|| BakedVolume::read(&self.output).ok()).flatten();
+        found.filter(|b| b.report.get("job").and_then(|j| j.as_str()) == Some(&digest(job)))
+    }
+
+    /// Writes or prints the report, if that is wanted.
+    fn hand_out(&self, report: &serde_json::Value) -> Result<()> {
+        if let Some(path) = &self.report {
+            let mut file = crate::atomic::AtomicFile::create(path)?;
+            serde_json::to_writer_pretty(&mut file, report).map_err(|e| Error::io(path, e.into()))?;
+            file.commit()?;
+        }
+        if self.json {
+            println!("{report:#}");
+        }
+        Ok(())
     }
 
     /// One bake; returns its sweep.
@@ -162,8 +191,7 @@ impl Bake {
             _ => {
                 let files: Vec<PathBuf> =
                     loaded.scene.members().iter().map(|m| bake_file::field_file(&self.output, &m.name)).collect();
-                let all = self.outputs().chain(files.iter().map(PathBuf::as_path));
-                outputs(all, &Inputs::of(&self.input, &self.scene)?)?;
+                outputs(self.outputs().chain(files), &Inputs::of(&self.input, &self.scene)?)?;
             }
         }
         let volumes: Vec<&Volume> = [&loaded.volume].into_iter().chain(&loaded.companions).collect();
@@ -245,8 +273,12 @@ impl Bake {
             return Ok(sweep);
         }
         let job = job(&loaded.scene, &settings);
-        if self.resume && self.scene.time.is_some() && self.complete(&job) {
+        if self.resume
+            && self.scene.time.is_some()
+            && let Some(baked) = self.complete(&job)
+        {
             say!("{:>14}  {} is complete", "resumed", self.output.display());
+            self.hand_out(&baked.report)?;
             return Ok(sweep);
         }
         let checkpoint = self.checkpoint(job)?;
@@ -273,14 +305,7 @@ impl Bake {
             all => serde_json::to_value(members.iter().map(|m| &m.name).zip(all).collect::<BTreeMap<_, _>>()),
         };
         let json = json.expect("the report is plain data");
-        if let Some(path) = &self.report {
-            let mut file = crate::atomic::AtomicFile::create(path)?;
-            serde_json::to_writer_pretty(&mut file, &json).map_err(|e| Error::io(path, e.into()))?;
-            file.commit()?;
-        }
-        if self.json {
-            println!("{json:#}");
-        }
+        self.hand_out(&json)?;
         if progress == Progress::Shown {
             self.summarise(&loaded.scene, &reports);
         }
@@ -329,15 +354,8 @@ impl Bake {
 
     /// The checkpoint of this bake, with what an interrupted run left if that is wanted.
     fn checkpoint(&self, job: String) -> Result<Checkpoint> {
-        let path = self.checkpoint.clone().unwrap_or_else(|| {
-            let mut name = self.output.as_os_str().to_owned();
-            name.push(".checkpoint");
-            name.into()
-        });
-        let every = Duration::try_from_secs_f64(self.checkpoint_every).map_err(|_| {
-            Error::Invalid(format!("--checkpoint-every {}: must be seconds, 0 or more", self.checkpoint_every))
-        })?;
-        let checkpoint = Checkpoint::new(&path, job, every)?;
+        let path = self.checkpoint_path();
+        let checkpoint = Checkpoint::new(&path, job, self.every()?)?;
         let label = if self.resume { "resumed" } else { "note" };
         if !self.resume {
             if path.exists() {

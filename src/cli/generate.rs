@@ -3,6 +3,7 @@
 use super::{expect_extension, writable};
 use crate::error::{Error, Result};
 use crate::progress::{Progress, say};
+use crate::series::suffixed;
 use crate::volume::Volume;
 use crate::volume::generate::fluid::{self, Fluid};
 use crate::volume::generate::molecular_dynamics::MolecularDynamics;
@@ -120,8 +121,8 @@ impl Generate {
             Species::Proton => vec![(self.output.clone(), "proton", &[pasta::PROTON])],
             Species::Neutron => vec![(self.output.clone(), "neutron", &[pasta::NEUTRON])],
             Species::Both => vec![
-                (with_suffix(&self.output, "proton"), "proton", &[pasta::PROTON]),
-                (with_suffix(&self.output, "neutron"), "neutron", &[pasta::NEUTRON]),
+                (suffixed(&self.output, "-proton"), "proton", &[pasta::PROTON]),
+                (suffixed(&self.output, "-neutron"), "neutron", &[pasta::NEUTRON]),
             ],
         };
         for (path, ..) in &files {
@@ -180,10 +181,10 @@ impl Generate {
     /// Samples per edge, checked before minutes of work.
     fn samples(&self, default: usize) -> Result<usize> {
         let size = self.size.unwrap_or(default);
-        if (2..=2048).contains(&size) {
+        if (2..=Generator::MOST).contains(&size) {
             return Ok(size);
         }
-        Err(Error::Invalid(format!("--size {size}: 2 to 2048 samples along each edge of a simulation")))
+        Err(Error::Invalid(format!("--size {size}: 2 to {} samples along each edge of a simulation", Generator::MOST)))
     }
 
     fn summary(&self, md: &MolecularDynamics, link: f64, unit: &str, progress: Progress) {
@@ -204,18 +205,6 @@ impl Generate {
 /// The positions of some species.
 fn points(md: &MolecularDynamics, species: &[u8]) -> Vec<DVec3> {
     md.positions.iter().zip(&md.species).filter(|(_, s)| species.contains(s)).map(|(x, _)| *x).collect()
-}
-
-/// `pasta.vti` to `pasta-proton.vti`.
-fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
-    let mut name = path.file_stem().unwrap_or_default().to_os_string();
-    name.push(format!("-{suffix}"));
-    let mut named = path.with_file_name(name).into_os_string();
-    if let Some(extension) = path.extension() {
-        named.push(".");
-        named.push(extension);
-    }
-    named.into()
 }
 
 /// Writes a simulated volume with what it is and how to make it again.

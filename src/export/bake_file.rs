@@ -106,13 +106,11 @@ pub fn field_file(path: &Path, name: &str) -> PathBuf {
     path.with_file_name(format!("{stem}-{name}.vti"))
 }
 
-/// Steps of f32 this large, in sweeps, are steps to be seen in a surface.
-const COARSE: f64 = 1e-5;
-
-/// Writes a bake. Point data: `value` (source units, active scalars; in f64 where the sweep is narrow for its
-/// isovalues' size), `radiance` (linear RGB), `rgb` (exposed, clamped, sRGB-encoded), `std_error` (of luminance),
-/// `mask` ([`Mask`]); with both sides also `radiance_inside` and so on. Field data: `wall_<name>` radiance over (u, v,
-/// isovalue), `context` the same of all context geometry, exposure, every number of the report, and all of it as JSON.
+/// Writes a bake. Point data: `value` (source units, active scalars; in f64 where f32 is too coarse for the sweep, or
+/// does not hold all samples), `radiance` (linear RGB), `rgb` (exposed, clamped, sRGB-encoded), `std_error` (of
+/// luminance), `mask` ([`Mask`]); with both sides also `radiance_inside` and so on. Field data: `wall_<name>` radiance
+/// over (u, v, isovalue), `context` the same of all context geometry, exposure, every number of the report, and all of
+/// it as JSON.
 ///
 /// # Errors
 /// `Io` if the file cannot be written.
@@ -187,8 +185,8 @@ fn completed(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
         .chain([("exposure".to_owned(), vec![bake.exposure]), ("isovalues".to_owned(), range.to_vec())])
         .map(|(name, v)| (name, Samples::F64(v)))
         .collect();
-    let doubles: Option<Vec<f64>> =
-        coarse(&sweep).then(|| (0..lattice.len()).into_par_iter().with_min_len(1 << 12).map(value).collect());
+    let doubles: Option<Vec<f64>> = (coarse(&sweep) || beyond_f32(volume))
+        .then(|| (0..lattice.len()).into_par_iter().with_min_len(1 << 12).map(value).collect());
     let mut writer = VtiWriter::new(lattice);
     writer = match &doubles {
         Some(doubles) => writer.point_data("value", 1, &doubles[..]),
@@ -216,9 +214,15 @@ fn completed(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
     writer.field_string(vti::SPACE, volume.space.name()).field_string(DESCRIPTION, &json).complete(path)
 }
 
-/// Whether f32 tells a sweep's isovalues apart too coarsely, as with a large offset.
+/// Whether f32 tells a sweep's isovalues apart too coarsely, as with a large offset or among its smallest numbers.
 fn coarse(sweep: &Sweep) -> bool {
-    sweep.lo().abs().max(sweep.hi().abs()) * f64::from(f32::EPSILON) > COARSE * (sweep.hi() - sweep.lo())
+    super::coarse_in_f32(sweep.lo().abs().max(sweep.hi().abs()), sweep.hi() - sweep.lo())
+}
+
+/// Whether samples are numbers, but not in f32.
+fn beyond_f32(volume: &Volume) -> bool {
+    let Samples::F64(samples) = volume.samples() else { return false };
+    samples.par_iter().any(|x| x.is_finite() && x.abs() > f64::from(f32::MAX))
 }
 
 /// Every number of a JSON tree by its dotted path.
@@ -276,9 +280,14 @@ impl BakedVolume {
     /// `Io`; `Invalid` if the file is no bake or is damaged.
     pub fn read(path: &Path) -> Result<Self> {
         if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("vtm")) {
-            let fields = multi_block::read(path)?.iter().map(|file| Self::read(file)).collect::<Result<Vec<_>>>()?;
+            let fields = multi_block::read(path)?.iter().map(|file| Self::one(file)).collect::<Result<Vec<_>>>()?;
             return Self::seen_from(fields, 0).map_err(|e| e.in_file(path));
         }
+        Self::one(path)
+    }
+
+    /// The bake of one field.
+    fn one(path: &Path) -> Result<Self> {
         Self::try_read(path)?
             .ok_or_else(|| Error::invalid(path, "is no bake: it holds no illumination; make one with `isolume bake`"))
     }

@@ -3,6 +3,7 @@
 use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
 use crate::files;
+use crate::volume::vti::escape;
 use std::fmt::Write as _;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
@@ -25,15 +26,11 @@ pub(super) fn completed(path: &Path, parts: &[(String, String)]) -> Result<Atomi
          <vtkMultiBlockDataSet>\n",
     );
     for (n, (name, file)) in parts.iter().enumerate() {
-        let (name, file) = (escaped(name), escaped(file));
+        let (name, file) = (escape(name), escape(file));
         let _ = writeln!(text, "    <DataSet index=\"{n}\" name=\"{name}\" file=\"{file}\"/>");
     }
     text.push_str("  </vtkMultiBlockDataSet>\n</VTKFile>\n");
     files::completed(path, |out| out.write_all(text.as_bytes()))
-}
-
-fn escaped(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('"', "&quot;")
 }
 
 /// The files that a `.vtm` names, beside it or where it says.
@@ -42,8 +39,7 @@ fn escaped(text: &str) -> String {
 /// `Io`; `Invalid` if it is none or names nothing.
 pub fn read(path: &Path) -> Result<Vec<PathBuf>> {
     let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
-    let document =
-        roxmltree::Document::parse(&text).map_err(|e| Error::invalid(path, format!("is no well-formed XML: {e}")))?;
+    let document = files::xml(&text).map_err(|e| Error::invalid(path, format!("is no well-formed XML: {e}")))?;
     let folder = path.parent().unwrap_or(Path::new(""));
     let parts = document.descendants().filter(|n| n.has_tag_name("DataSet"));
     let files: Vec<PathBuf> = parts.filter_map(|n| Some(folder.join(n.attribute("file")?))).collect();

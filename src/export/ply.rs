@@ -1,18 +1,20 @@
 //! Binary little-endian PLY: a mesh with named values at its vertices.
 //!
 //! What is written is read by ParaView/VTK, MeshLab, Blender and Mitsuba. So there is no `obj_info` line (Mitsuba
-//! refuses it), the face list is `uchar int`, and positions are `float`: with coordinates of 1e6 their steps are 0.06.
+//! refuses it), the face list is `uchar int`, and positions are `float`; but `double` far from the origin, where steps
+//! of `float` are to be seen.
 
-use super::{Mesh, colour_bytes};
+use super::{Mesh, coarse_in_f32, colour_bytes};
 use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
+use glam::DVec3;
 use std::io::{self, Write};
 use std::path::Path;
 
 /// Names of vertex properties with a meaning of their own.
 const RESERVED: [&str; 9] = ["x", "y", "z", "nx", "ny", "nz", "red", "green", "blue"];
 
-/// Writes `mesh`: `x y z`, `nx ny nz`, the named properties (all float), then `red green blue` (uchar).
+/// Writes `mesh`: `x y z`, `nx ny nz`, the named properties (all float, but see above), then `red green blue` (uchar).
 ///
 /// # Errors
 /// `Invalid` if the arrays do not fit each other, a position is not finite in f32, or a property's name is taken, used
@@ -37,8 +39,14 @@ pub fn write(path: impl AsRef<Path>, mesh: &Mesh) -> Result<()> {
 fn write_to(out: &mut impl Write, mesh: &Mesh) -> io::Result<()> {
     writeln!(out, "ply\nformat binary_little_endian 1.0\ncomment isolume {}", env!("CARGO_PKG_VERSION"))?;
     writeln!(out, "element vertex {}", mesh.positions.len())?;
+    let (lo, hi) =
+        mesh.positions.iter().fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(lo, hi), p| (lo.min(*p), hi.max(*p)));
+    let double = coarse_in_f32(lo.abs().max(hi.abs()).max_element(), (hi - lo).length());
+    for name in ["x", "y", "z"] {
+        writeln!(out, "property {} {name}", if double { "double" } else { "float" })?;
+    }
     let normals = mesh.normals.map_or(&[][..], |_| &["nx", "ny", "nz"]);
-    for name in ["x", "y", "z"].iter().chain(normals).chain(mesh.properties.iter().map(|(name, _)| name)) {
+    for name in normals.iter().chain(mesh.properties.iter().map(|(name, _)| name)) {
         writeln!(out, "property float {name}")?;
     }
     if mesh.colours.is_some() {
@@ -49,8 +57,13 @@ fn write_to(out: &mut impl Write, mesh: &Mesh) -> io::Result<()> {
     let mut record = Vec::new();
     for (i, p) in mesh.positions.iter().enumerate() {
         record.clear();
+        if double {
+            p.to_array().into_iter().for_each(|x| record.extend_from_slice(&x.to_le_bytes()));
+        }
         let mut float = |value: f32| record.extend_from_slice(&value.to_le_bytes());
-        p.as_vec3().to_array().into_iter().for_each(&mut float);
+        if !double {
+            p.as_vec3().to_array().into_iter().for_each(&mut float);
+        }
         if let Some(normals) = mesh.normals {
             normals[i].to_array().into_iter().for_each(&mut float);
         }
@@ -73,20 +86,20 @@ fn write_to(out: &mut impl Write, mesh: &Mesh) -> io::Result<()> {
 pub struct PlyMesh {
     /// Number of vertices.
     pub vertices: usize,
-    /// All vertex properties, in the order of the file, as f32 (integers as they are: a uchar colour reaches 255).
-    pub properties: Vec<(String, Vec<f32>)>,
+    /// All vertex properties, in the order of the file (integers as they are: a uchar colour reaches 255).
+    pub properties: Vec<(String, Vec<f64>)>,
     /// Triangles as vertex indices, each below `vertices`.
     pub triangles: Vec<[u32; 3]>,
 }
 
 impl PlyMesh {
     /// The values of a vertex property.
-    pub fn property(&self, name: &str) -> Option<&[f32]> {
+    pub fn property(&self, name: &str) -> Option<&[f64]> {
         self.properties.iter().find(|(n, _)| n == name).map(|(_, values)| values.as_slice())
     }
 
     /// Three vertex properties side by side, such as `["x", "y", "z"]` or `["radiance_r", "radiance_g", "radiance_b"]`.
-    pub fn triple(&self, names: [&str; 3]) -> Option<Vec<[f32; 3]>> {
+    pub fn triple(&self, names: [&str; 3]) -> Option<Vec<[f64; 3]>> {
         let [a, b, c] = names.map(|name| self.property(name));
         Some(a?.iter().zip(b?).zip(c?).map(|((a, b), c)| [*a, *b, *c]).collect())
     }
@@ -167,7 +180,7 @@ struct Header {
 }
 
 /// Reads the bytes of a PLY file; `name` is for messages. Binary little-endian, vertices before triangles, any scalar
-/// vertex properties (stored as f32), one index list per face, nothing else. Sizes are checked against the bytes there
+/// vertex properties, one index list per face, nothing else. Sizes are checked against the bytes there
 /// are before room for them is made.
 ///
 /// # Errors
@@ -189,7 +202,7 @@ pub fn parse(bytes: &[u8], name: impl AsRef<Path>) -> Result<PlyMesh> {
     let mut offset = 0;
     let mut properties = Vec::with_capacity(header.properties.len());
     for (property, scalar) in header.properties {
-        let values = body.chunks_exact(stride).map(|record| scalar.get(&record[offset..]) as f32).collect();
+        let values = body.chunks_exact(stride).map(|record| scalar.get(&record[offset..])).collect();
         offset += scalar.size();
         properties.push((property, values));
     }
@@ -285,7 +298,7 @@ fn parse_header<'a>(bytes: &'a [u8], name: &Path) -> Result<(Header, &'a [u8])> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::{DVec3, Vec3};
+    use glam::Vec3;
 
     const COLOURS: [[f32; 3]; 4] = [[1.0, 0.0, 7.0 / 255.0], [0.0; 3], [0.5; 3], [1.0; 3]];
     const POSITIONS: [DVec3; 4] = [DVec3::new(0.1, -2.5, 1e20), DVec3::X, DVec3::Y, DVec3::Z];
@@ -317,9 +330,9 @@ mod tests {
         assert_eq!(read.vertices, 4);
         let names: Vec<_> = read.properties.iter().map(|(name, _)| name.as_str()).collect();
         assert_eq!(names, ["x", "y", "z", "nx", "ny", "nz", "radiance_r", "red", "green", "blue"]);
-        assert_eq!(read.triple(["x", "y", "z"]).unwrap()[0], [0.1, -2.5, 1e20]);
+        assert_eq!(read.triple(["x", "y", "z"]).unwrap()[0], [0.1f32, -2.5, 1e20].map(f64::from));
         assert_eq!(read.triple(["nx", "ny", "nz"]).unwrap()[1], [0.0, -1.0, 0.0]);
-        assert_eq!(read.property("radiance_r").unwrap(), radiance);
+        assert_eq!(read.property("radiance_r").unwrap(), radiance.map(f64::from));
         assert_eq!(read.triple(["red", "green", "blue"]).unwrap()[0], [255.0, 0.0, 7.0]);
         assert_eq!(read.triangles, [[0, 1, 2], [3, 2, 1]]);
         assert_eq!(read.property("radiance_g"), None);
@@ -334,6 +347,17 @@ mod tests {
         assert!(refused(&Mesh { triangles: &[[0, 1, 4]], ..example(&[]) }).contains("[0, 1, 4] of 4"));
         assert!(refused(&Mesh { positions: &[DVec3::splat(1e39); 4], ..example(&[]) }).contains("beyond f32"));
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    /// Steps of f32 are 0.0625 there.
+    #[test]
+    fn places_far_away_are_double() {
+        let positions = POSITIONS.map(|p| 1e6 + 0.3 * p.clamp(DVec3::splat(-1.0), DVec3::ONE));
+        let bytes = bytes_of(&Mesh { positions: &positions, ..example(&[("a", &[0.5; 4])]) });
+        assert!(String::from_utf8_lossy(&bytes).contains("property double z\nproperty float nx\n"));
+        let read = parse(&bytes, "far").unwrap();
+        assert_eq!(read.triple(["x", "y", "z"]).unwrap(), positions.map(|p| p.to_array()));
+        assert_eq!((read.property("a").unwrap()[3], read.triangles[1]), (0.5, [3, 2, 1]));
     }
 
     #[test]

@@ -21,7 +21,7 @@ pub(super) fn text(path: &Path) -> Result<String> {
         if let Some(key) = words.next().filter(|key| COLOURS.contains(key)) {
             // What may follow three numbers is nobody's concern.
             let numbers: Vec<&str> = words.take_while(|w| !w.starts_with('#')).take(3).collect();
-            let all = numbers.iter().all(|w| w.parse::<f32>().is_ok());
+            let all = numbers.iter().all(|w| w.parse::<f64>().is_ok());
             let [r, g, b] = match numbers[..] {
                 [grey] if all => [grey; 3],
                 [r, g, b] if all => [r, g, b],

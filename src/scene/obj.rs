@@ -121,13 +121,10 @@ fn faces(path: &Path) -> Result<Vec<Face>> {
     for model in &models {
         let mesh = &model.mesh;
         let material = mesh.material_id.map(|i| &materials[i]);
-        let channels = |v: Option<[f32; 3]>, default: DVec3| v.map_or(default, |c| DVec3::from_array(c.map(f64::from)));
+        let channels = |v: Option<[f64; 3]>, default: DVec3| v.map_or(default, DVec3::from_array);
         let albedo = channels(material.and_then(|m| m.diffuse), DVec3::new(0.725, 0.71, 0.68));
         let emission = channels(material.and_then(|m| m.emissive), DVec3::ZERO);
-        let vertex = |i: u32| {
-            let p = &mesh.positions[3 * i as usize..][..3];
-            DVec3::new(f64::from(p[0]), f64::from(p[1]), f64::from(p[2]))
-        };
+        let vertex = |i: u32| DVec3::from_slice(&mesh.positions[3 * i as usize..]);
         let mut at = 0;
         // tobj leaves the arities out when all faces are triangles.
         let triangles = vec![3; if mesh.face_arities.is_empty() { mesh.indices.len() / 3 } else { 0 }];
@@ -163,7 +160,7 @@ mod tests {
         .unwrap();
         let p = read_obj(&obj).unwrap();
         assert_eq!((p.len(), p[0].name.as_str(), p[1].name.as_str()), (2, "wall", "light"));
-        assert!((p[0].albedo - DVec3::new(0.63, 0.065, 0.05)).length() < 1e-7);
+        assert_eq!(p[0].albedo, DVec3::new(0.63, 0.065, 0.05));
         assert_eq!((p[0].normal(), p[0].emission), (DVec3::X, DVec3::ZERO));
         assert_eq!(p[1].emission, DVec3::new(2.0, 3.0, 4.0));
         std::fs::write(&obj, "v 0 0 0\nv 0 1 0\nv 0 2 0\nf 1 2 3\n").unwrap();
@@ -195,6 +192,22 @@ mod tests {
         assert!(p.iter().zip([1, -1].into_iter().cycle()).all(|(p, n)| p.other_face == n && !p.opaque_back));
         std::fs::write(&obj, "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n").unwrap();
         assert!(read_context(&obj, &Placement::default()).unwrap_err().to_string().contains("thing.obj"));
+    }
+
+    /// Far from the origin, and with a vertex given twice: f32 knows nothing between 1 000 001 and 1 000 001.06.
+    #[test]
+    fn vertices_are_where_the_file_says() {
+        let dir = tempfile::tempdir().unwrap();
+        let obj = dir.path().join("far.obj");
+        let text = "v 1000000 0 0\nv 1000001.02 0 0\nv 1000001.02 1 0\nv 1000000 1 0\nf 1 2 3 4\nf 1 1 2 3\nf 1 2 3 3\n\
+                    f 1 2 3 1\n";
+        std::fs::write(&obj, text).unwrap();
+        let p = read_obj(&obj).unwrap();
+        assert!((p[0].area() - 1.02).abs() < 1e-9, "{}", p[0].area());
+        for p in &p[1..] {
+            assert_eq!(p.vertices().len(), 3, "{p:?}");
+            assert!((p.area() - 0.51).abs() < 1e-9 && p.texture(p.at([0.5, 0.5])) == [0.5, 0.5], "{p:?}");
+        }
     }
 
     #[test]

@@ -32,10 +32,10 @@ impl VolumeSource {
     }
 
     pub(super) fn series(&self, folder: &Path) -> Result<Option<Series>> {
+        self.check()?;
         let times = self.times.clone();
         let series = match (&self.files, &self.file) {
-            (Some(_), Some(_)) => return Err(Error::Invalid("[volume] needs either file or files".into())),
-            (Some(files), None) => Some(Series::new(files.iter().map(|f| folder.join(f)).collect(), times)?),
+            (Some(files), _) => Some(Series::new(files.iter().map(|f| folder.join(f)).collect(), times)?),
             (None, Some(file)) => Series::find(&folder.join(file), times)?,
             (None, None) => None,
         };

@@ -16,18 +16,17 @@ const GAP: usize = 8;
 const DRAWN: u64 = 40_000;
 
 /// Writes `figure6-<subject>-<strategy>.png`: seen along +y, with z up, samples coloured by their radiance (left), a
-/// slice through the illumination grid at 0.4 of its depth (middle), the isosurface reported first (right). The bake's
-/// grid must be the volume's.
+/// slice through the illumination grid at 0.4 of its depth (middle), the isosurface reported first (right).
 ///
 /// # Errors
 /// As rendering; `Io`.
 pub(super) fn figure6(study: &Study, subject: &Subject, name: &str, strategy: StrategyName, bake: Bake) -> Result<()> {
     let seed = bake.report.seed;
-    let baked = BakedVolume::new(subject.scene.clone(), bake);
+    let baked = BakedVolume::new(subject.scene.resampled(&bake.lattice), bake);
     let panels = [
         samples(&baked, strategy, seed)?,
         slice(&baked, 0.4),
-        render(&subject.scene, subject.main_isovalue(), &square(&baked), Shading::Baked(&baked), 8, &study.device)?
+        render(&baked.scene, subject.main_isovalue(), &square(&baked), Shading::Baked(&baked), 8, &study.device)?
             .picture,
     ];
     let mut sheet = Picture::new(3 * PANEL + 2 * GAP, PANEL);

@@ -134,7 +134,7 @@ in vec3 v_position;
 out vec4 colour;
 uniform sampler3D u_wall;
 uniform vec3 u_normal, u_corner, u_du, u_dv, u_emission;
-uniform bool u_cap, u_textured;
+uniform bool u_cap, u_textured, u_opaque_back;
 
 // Texel-centred trilinear lookup, continued linearly over the outer half texels.
 vec3 wall(vec3 uvc) {
@@ -158,7 +158,7 @@ void main() {
     vec3 p = u_inverse * (v_position - u_origin);
     if (facing > 0.0 || cut(v_position) || value(clamp(p, vec3(0.0), u_dims - 1.0)) < u_iso) discard;
   } else if (facing > 0.0) {
-    if (!emits) discard; // walls are seen from inside only
+    if (!u_opaque_back) discard; // walls are seen from inside only, what stands between from both by two polygons
     colour = vec4(0.0, 0.0, 0.0, 1.0);
     return;
   }

@@ -206,7 +206,7 @@ function draw() {
     bind(1, f.wall);
     programs.flat.set({
       u_normal: f.normal, u_albedo: albedo(f.albedo), u_emission: f.emission, u_corner: f.corner, u_du: f.du, u_dv: f.dv,
-      u_cap: f.cap ? 1 : 0, u_textured: f.texture ? 1 : 0,
+      u_cap: f.cap ? 1 : 0, u_textured: f.texture ? 1 : 0, u_opaque_back: f.opaqueBack ? 1 : 0,
     });
     gl.bindVertexArray(f.vertex_array);
     gl.drawArrays(gl.TRIANGLE_FAN, 0, f.count);

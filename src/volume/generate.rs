@@ -138,11 +138,17 @@ impl Generator {
         }
     }
 
+    /// Samples along each edge at most.
+    pub const MOST: usize = 2048;
+
     /// Samples the field, as f32, on a vertex-centred lattice over `[0,1]³`.
     ///
     /// # Errors
-    /// `Invalid` as [`Lattice::new`].
+    /// `Invalid` as [`Lattice::new`], and beyond [`Generator::MOST`] samples along an edge.
     pub fn sample(&self, dims: [usize; 3]) -> Result<Volume> {
+        if let Some(n) = dims.into_iter().find(|&n| n > Self::MOST) {
+            return Err(Error::Invalid(format!("size {n}: at most {} samples along each edge", Self::MOST)));
+        }
         let spacing = DVec3::from_array(dims.map(|n| 1.0 / n.saturating_sub(1).max(1) as f64));
         let lattice = Lattice::aligned(dims, DVec3::ZERO, spacing)?;
         let at = |o: usize| {

@@ -76,6 +76,31 @@ impl<'a> Cursor<'a> {
         Ok(Array { element, values: &rest[..length], count })
     }
 
+    /// Passes over strings: a line each in text, else a length in 1, 2, 4 or 8 bytes, as its two highest bits say, and
+    /// the bytes.
+    fn pass_over_strings(&mut self, name: &str, count: usize) -> Result<()> {
+        for found in 0..count {
+            let rest = &self.bytes[self.at..];
+            let length = if self.binary {
+                let size = rest.first().map_or(usize::MAX, |first| 8 >> (first >> 6));
+                rest.get(..size).and_then(|bytes| {
+                    let all = bytes.iter().fold(0u64, |n, b| n << 8 | u64::from(*b));
+                    let length = all & (u64::MAX >> (66 - 8 * size));
+                    usize::try_from(length).ok()?.checked_add(size).filter(|n| *n <= rest.len())
+                })
+            } else {
+                rest.iter().position(|b| *b == b'\n').map(|end| end + 1)
+            };
+            let Some(length) = length else {
+                return invalid(format!(
+                    "array `{name}`: {count} strings promised, {found} found; the file is cut short"
+                ));
+            };
+            self.at += length;
+        }
+        Ok(())
+    }
+
     fn samples(&self, array: &Array) -> Result<Samples> {
         if self.binary {
             return Ok(Samples::from_bytes(array.values, array.element, Endian::Big));
@@ -248,7 +273,7 @@ fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
             }
             "FIELD" => {
                 for _ in 0..components(&words, 2)? {
-                    let (array, n) = field_array(&mut cursor)?;
+                    let Some((array, n)) = field_array(&mut cursor)? else { continue };
                     if wanted(n) && array.count == tuples && field.is_none() {
                         field = Some(array);
                     }
@@ -275,8 +300,8 @@ fn cells() -> Error {
     )
 }
 
-/// One array of a `FIELD`, and its components.
-fn field_array<'a>(cursor: &mut Cursor<'a>) -> Result<(Array<'a>, usize)> {
+/// One array of a `FIELD`, and its components; `None` of what holds no numbers.
+fn field_array<'a>(cursor: &mut Cursor<'a>) -> Result<Option<(Array<'a>, usize)>> {
     let mut words = cursor.words().unwrap_or_default();
     // Behind each array there may be notes about it.
     if words.first().is_some_and(|w| w.eq_ignore_ascii_case("METADATA")) {
@@ -291,7 +316,10 @@ fn field_array<'a>(cursor: &mut Cursor<'a>) -> Result<(Array<'a>, usize)> {
         ));
     };
     let count = n.checked_mul(tuples).ok_or_else(|| Error::Invalid(format!("{n} × {tuples} values are too many")))?;
-    Ok((cursor.array(&words[0], kind, count)?, n))
+    if kind.eq_ignore_ascii_case("string") {
+        return cursor.pass_over_strings(&words[0], count).map(|()| None);
+    }
+    Ok(Some((cursor.array(&words[0], kind, count)?, n)))
 }
 
 fn skip_field(cursor: &mut Cursor, words: &[String]) -> Result<()> {
@@ -348,6 +376,28 @@ mod tests {
             let field = format!("{head}FIELD FieldData 2\nv 3 12 short\n{}\nh 1 12 {kind}\n", "ab".repeat(36));
             ok(&[field.as_bytes(), &data, b"\nMETADATA\nINFORMATION 0\n\n"].concat(), element);
         }
+    }
+
+    /// As VTK writes them: a line each, or a length and the bytes.
+    #[test]
+    fn strings_in_a_field_are_passed_over() {
+        let field = "FIELD FieldData 2\nname 1 3 string\n";
+        let behind = format!("h 1 12 short\n{NUMBERS}");
+        ok(format!("{HEAD}{field}a%20b\n\n7\n{behind}").as_bytes(), ElementType::I16);
+        let head = HEAD.replace("ASCII", "BINARY");
+        let long = [&[0x80 | 1, 44][..], &[b'\n'; 300]].concat();
+        let huge = [&[0x40, 1, 0, 0][..], &[b'x'; 1 << 16]].concat();
+        let strings = [&[0xc0 | 2][..], b"ab", &long, &huge].concat();
+        let numbers: Vec<u8> = (0..12).flat_map(|i: i16| i.to_be_bytes()).collect();
+        let bytes = [format!("{head}{field}").as_bytes(), &strings, b"\nh 1 12 short\n", &numbers].concat();
+        ok(&bytes, ElementType::I16);
+        let start = head.len() + field.len();
+        for cut in [start, start + 1, start + 4, start + 200, start + 400] {
+            assert!(matches!(parse(&bytes[..cut]), Err(Error::Invalid(e)) if e.contains("strings promised")), "{cut}");
+        }
+        // 2⁶² bytes.
+        let endless = [&bytes[..start], &[0x3f; 8]].concat();
+        assert!(parse(&endless).is_err());
     }
 
     #[test]

@@ -264,15 +264,18 @@ impl<'a> Fields<'a> {
         let (mut step, mut origin) = (DVec3::ONE, DVec3::ZERO);
         for a in 0..3 {
             // Cell-centred samples stand half a step inside the axis' ends; node-centred ones, the default, on them.
-            let cell = centers.get(keep[a]) == Some(&"cell");
+            let cell = centers.get(keep[a]).is_some_and(|c| c.eq_ignore_ascii_case("cell"));
             let steps = if cell { dims[a] as f64 } else { dims[a].saturating_sub(1) as f64 };
             if !spacings[a].is_nan() {
                 step[a] = spacings[a];
             } else if !mins[a].is_nan() && !maxs[a].is_nan() {
                 step[a] = (maxs[a] - mins[a]) / steps;
             }
+            let inset = if cell { 0.5 * step[a] } else { 0.0 };
             if !mins[a].is_nan() {
-                origin[a] = mins[a] + if cell { 0.5 * step[a] } else { 0.0 };
+                origin[a] = mins[a] + inset;
+            } else if !maxs[a].is_nan() {
+                origin[a] = maxs[a] - inset - step[a] * dims[a].saturating_sub(1) as f64;
             }
         }
         Lattice::aligned(dims, origin, step)

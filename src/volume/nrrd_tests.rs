@@ -107,6 +107,14 @@ fn the_world_is_the_files_own() {
     let l = read_one(&oblique, &TWELVE).unwrap().lattice;
     assert_eq!(l.to_world(DVec3::new(1.0, 2.0, 3.0)), DVec3::new(88.0, -4.5, 14.5));
 
+    // What is known of an axis is an end, and the step.
+    let ends = |centers: &str| {
+        let text = format!("NRRD0004\n{U8}spacings: 0.5 2 3\naxis maxs: 1 NaN 5\ncenterings: {centers}\n{raw}");
+        read_one(&text, &TWELVE).unwrap().lattice.origin()
+    };
+    assert_eq!(ends("node node node"), DVec3::new(0.0, 0.0, 2.0));
+    assert_eq!(ends("Cell cell CELL"), DVec3::new(-0.25, 0.0, 0.5));
+
     let spaced = format!("NRRD0001\n{U8}spacings: 0.5 2 NaN\naxis mins: -1 10 NaN\n{raw}");
     let l = read_one(&spaced, &TWELVE).unwrap().lattice;
     assert_eq!((l.origin(), l.spacing()), (DVec3::new(-1.0, 10.0, 0.0), DVec3::new(0.5, 2.0, 1.0)));

@@ -7,7 +7,7 @@ mod codec;
 mod document;
 mod writer;
 
-pub(crate) use document::Document as XmlDocument;
+pub(crate) use document::{Document as XmlDocument, escape};
 pub use writer::{SamplesRef, VtiWriter};
 
 use crate::error::{Error, Result};
@@ -182,8 +182,24 @@ impl Arrays {
         }
         if let Some(points) = piece.children().find(|n| n.has_tag_name("PointData")) {
             file.active_scalars = points.attribute("Scalars").filter(|s| !s.is_empty()).map(str::to_string);
+            let mut fault = None;
             for node in points.children().filter(|n| n.has_tag_name("DataArray")) {
-                file.point_data.push(reader.array(node, count)?);
+                match reader.array(node, count) {
+                    Ok(array) => file.point_data.push(array),
+                    // Of a type that is not read: unless nothing else is there or it is the one meant, let it be.
+                    Err(e @ Error::NotSupported(_))
+                        if fault.is_none() || file.active_scalars.as_deref() == Some(name(node)) =>
+                    {
+                        fault = Some((name(node), e));
+                    }
+                    Err(Error::NotSupported(_)) => {}
+                    Err(e) => return Err(e),
+                }
+            }
+            if let Some((name, e)) = fault
+                && (file.point_data.is_empty() || file.active_scalars.as_deref() == Some(name))
+            {
+                return Err(e);
             }
         }
         let fields = root.descendants().filter(|n| n.has_tag_name("FieldData")).flat_map(|n| n.children());
@@ -194,8 +210,12 @@ impl Arrays {
             if node.attribute("type") == Some("String") {
                 let texts = reader.strings(node, tuples)?;
                 file.field_strings.extend(texts.into_iter().map(|t| (name(node).to_string(), t)));
-            } else {
-                file.field_data.push(reader.array(node, tuples)?);
+                continue;
+            }
+            match reader.array(node, tuples) {
+                Ok(array) => file.field_data.push(array),
+                Err(Error::NotSupported(_)) => {}
+                Err(e) => return Err(e),
             }
         }
         Ok((place, file))

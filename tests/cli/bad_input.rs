@@ -55,6 +55,15 @@ fn bad_input_is_one_clear_line_and_leaves_nothing() {
         }
     }
 
+    refused(dir, &["generate", "bumps", "--size", "100000", "-o", "out.vti"], &["100000", "2048"]);
+    refused(dir, &with(&["--checkpoint-every=-1"]), &["--checkpoint-every", "0 or more"]);
+
+    // A list of volumes that names itself.
+    let list = "<VTKFile type=\"vtkMultiBlockDataSet\"><vtkMultiBlockDataSet><DataSet file=\"self.vtm\"/>\
+                </vtkMultiBlockDataSet></VTKFile>";
+    fs::write(dir.join("self.vtm"), list).unwrap();
+    refused(dir, &["render", "self.vtm", "--isovalue", "5", "-o", "out.png"], &["self.vtm"]);
+
     // A luminaire without area, and a scene with an unknown key.
     fs::write(dir.join("l.mtl"), "newmtl lamp\nKe 1 1 1\n").unwrap();
     fs::write(dir.join("l.obj"), "mtllib l.mtl\nv 0 0 0\nv 1 1 1\nv 2 2 2\nusemtl lamp\nf 1 2 3\n").unwrap();

@@ -50,6 +50,8 @@ fn no_output_takes_the_place_of_an_input() {
     taken(&["bake", "b.vti", "-o", "new.vti", "--report", "b.vti"], &["b.vti", "is an input"]);
     taken(&["bake", "b.vti", "-o", "new.vti", "--report", "new.vti"], &["new.vti", "two outputs"]);
     taken(&["bake", "b.vti", "-o", "new.vti", "--checkpoint", "new.vti"], &["new.vti", "two outputs"]);
+    let default = ["bake", "b.vti", "-o", "new.vti", "--report", "new.vti.checkpoint"];
+    taken(&default, &["new.vti.checkpoint", "two outputs"]);
     taken(&["bake", "series/rho_%04d.vti", "-o", "series/rho.vti"], &["rho_%04d.vti", "would be a frame"]);
     let two = "isovalues = [3.6, 95]\n[[volume]]\nname = \"a\"\nfile = \"b.vti\"\n[[volume]]\nname = \"b\"\nfile = \"b-a.vti\"\n";
     fs::write(dir.join("two.toml"), two).unwrap();

@@ -47,20 +47,36 @@ fn bakes_of_data_on_an_offset_hold_their_isosurfaces() {
         let given = ["bake", volume, "-o", output, "--preset", "preview", "-q", "--isovalues", sweep[0], sweep[1]];
         ok(dir, &[&given[..], more].concat());
     };
-    let surface = |bake: &str, isovalue: &str| {
-        ok(dir, &["extract", bake, "--isovalue", isovalue, "-o", "s.ply", "-q"]);
+    let surface = |file: &str, isovalue: &str, more: &[&str]| {
+        ok(dir, &[&["extract", file, "--isovalue", isovalue, "-o", "s.ply", "-q"], more].concat());
         let mesh = isolume::export::ply::read(dir.join("s.ply")).unwrap();
         mesh.triple(["x", "y", "z"]).unwrap()
     };
+    let farthest = |a: &[[f64; 3]], b: &[[f64; 3]]| {
+        a.iter().zip(b).flat_map(|(a, b)| [0, 1, 2].map(|x| (a[x] - b[x]).abs())).fold(0.0, f64::max)
+    };
+    let size = bumps.lattice.spacing().max_element();
     for grid in ["1x", "2x"] {
         bake("b.vti", "lit.vti", ["5", "95"], &["--grid", grid]);
         bake("raised.vti", "high.vti", ["1000000000.05", "1000000000.95"], &["--grid", grid]);
-        let (plain, raised) = (surface("lit.vti", "47"), surface("high.vti", "1000000000.47"));
+        let (plain, raised) = (surface("lit.vti", "47", &[]), surface("high.vti", "1000000000.47", &[]));
         assert!(plain.len() == raised.len() && plain.len() > 100, "{grid}: {} {}", plain.len(), raised.len());
-        let off =
-            plain.iter().zip(&raised).flat_map(|(a, b)| [0, 1, 2].map(|x| (a[x] - b[x]).abs())).fold(0.0, f32::max);
-        let size = bumps.lattice.spacing().max_element();
-        assert!(f64::from(off) < 1e-3 * size, "{grid}: {off} of {size}");
+        let off = farthest(&plain, &raised);
+        assert!(off < 1e-3 * size, "{grid}: {off} of {size}");
+    }
+    // In units in which f32 has no such numbers, or whole steps; and a sample beyond f32 in a sweep that is not.
+    let scaled = |by: f64| -> Vec<f64> { (0..bumps.lattice.len()).map(|o| by * bumps.value(o)).collect() };
+    let mut one = scaled(1.0);
+    one[0] = 1e39;
+    for (samples, by) in [(scaled(1e38), 1e38), (scaled(1e-45), 1e-45), (one, 1.0)] {
+        let volume = Volume::new("scaled", bumps.lattice.clone(), Samples::F64(samples)).unwrap();
+        volume.write(dir.join("scaled.vti")).unwrap();
+        let of = |x: f64| format!("{:e}", x * by);
+        let sweep = [of(5.0), of(95.0)];
+        bake("scaled.vti", "far.vti", [&sweep[0], &sweep[1]], &[]);
+        let far = surface("far.vti", &of(47.0), &[]);
+        let own = surface("scaled.vti", &of(47.0), &["--isovalues", &sweep[0], &sweep[1]]);
+        assert!(far.len() == own.len() && farthest(&far, &own) < 1e-5 * size, "{by:e}: {}", farthest(&far, &own));
     }
     let stored = |name: &str| {
         let file = VtiFile::read(&dir.join(name)).unwrap();

@@ -253,6 +253,15 @@ fn what_is_not_read_says_so() {
     assert!(matches!(change("type=\"ImageData\"", "type=\"PolyData\""), Err(Error::NotSupported(_))));
     assert!(matches!(change("vtkZLib", "vtkLZMA"), Err(Error::NotSupported(_))));
     assert!(matches!(change("\"Float32\"", "\"Bit\""), Err(Error::NotSupported(_))));
+    // Beside what is read, and not the one that is meant, it may be there.
+    let flags = "<DataArray type=\"Bit\" Name=\"flags\" format=\"ascii\">1 0</DataArray>";
+    let both = |meant: &str| change("</PointData>", &format!("{flags}</PointData>")).map(|f| (f, meant.len()));
+    assert_eq!(both("").unwrap().0.point_data.len(), 1);
+    let meant = VTK_INLINE.replace("</PointData>", &format!("{flags}</PointData>"));
+    let at = meant.find("<PointData").unwrap() + "<PointData".len();
+    let end = at + meant[at..].find('>').unwrap();
+    let meant = format!("{} Scalars=\"flags\"{}", &meant[..at], &meant[end..]);
+    assert!(matches!(VtiFile::parse(meant.as_bytes()), Err(Error::NotSupported(_))));
     assert!(matches!(change("</Piece>", "</Piece><Piece/>"), Err(Error::NotSupported(_))));
     assert!(matches!(change("WholeExtent=\"1 2", "WholeExtent=\"0 2"), Err(Error::NotSupported(_))));
     assert!(matches!(change("header_type=\"UInt32\"", "header_type=\"UInt8\""), Err(Error::Invalid(_))));
