@@ -176,6 +176,9 @@ struct Render {
     scene: SceneOptions,
 }
 
+/// More are of no use to any machine, and take long to start.
+const MOST_THREADS: usize = 1024;
+
 impl Cli {
     /// Runs the verb.
     ///
@@ -183,8 +186,8 @@ impl Cli {
     /// Whatever the verb meets; [`Error::exit_code`] says how the process should end.
     pub fn run(self) -> Result<()> {
         if let Some(threads) = self.threads {
-            if threads == 0 {
-                return Err(Error::Invalid("--threads 0: must be at least 1".into()));
+            if !(1..=MOST_THREADS).contains(&threads) {
+                return Err(Error::Invalid(format!("--threads {threads}: 1 to {MOST_THREADS}")));
             }
             rayon::ThreadPoolBuilder::new()
                 .num_threads(threads)
@@ -354,6 +357,7 @@ impl Render {
             ));
         }
         let rendered = if self.reference {
+            baked.as_ref().map_or(Ok(()), BakedVolume::whole).map_err(|e| e.in_file(&self.file))?;
             let picture = reference::picture(scene, isovalue, &camera, self.samples, self.trilinear, &device()?)?;
             Rendered { picture, unbaked: 0.0 }
         } else {

@@ -142,11 +142,24 @@ fn shifted_up(word: impl Fn(usize) -> u64, w: usize) -> u64 {
     word(w) << 1 | if w > 0 { word(w - 1) >> 63 } else { 0 }
 }
 
+/// `words` words of zeros for each row.
+fn words_for([nx, ny, nz]: [usize; 3], words: usize) -> Result<Vec<u64>> {
+    let mut all = Vec::new();
+    let there = all.try_reserve_exact(words * ny * nz).is_ok();
+    if !there {
+        return Err(Error::NotSupported(format!(
+            "isosurface of {nx}×{ny}×{nz} samples, refined ones included: there is not enough memory for a bit of each"
+        )));
+    }
+    all.resize(words * ny * nz, 0);
+    Ok(all)
+}
+
 impl Bits {
-    fn new(source: &impl Source, c: f64) -> Self {
-        let dims @ [nx, ny, nz] = source.dims();
+    fn new(source: &impl Source, c: f64) -> Result<Self> {
+        let dims @ [nx, ny, _] = source.dims();
         let words = nx.div_ceil(64);
-        let mut inside = vec![0u64; words * ny * nz];
+        let mut inside = words_for(dims, words)?;
         let finite = inside
             .par_chunks_mut(words * ny)
             .enumerate()
@@ -158,8 +171,8 @@ impl Bits {
                 },
             )
             .reduce(|| true, |a, b| a & b);
-        let usable = (!finite).then(|| usable_cells(source, words));
-        Self { dims, words, inside, usable }
+        let usable = (!finite).then(|| usable_cells(source, words)).transpose()?;
+        Ok(Self { dims, words, inside, usable })
     }
 
     #[inline]
@@ -234,9 +247,9 @@ impl Bits {
 }
 
 /// The cells all of whose corners are finite, as in [`Bits::usable`].
-fn usable_cells(source: &impl Source, words: usize) -> Vec<u64> {
-    let [nx, ny, nz] = source.dims();
-    let mut finite = vec![0u64; words * ny * nz];
+fn usable_cells(source: &impl Source, words: usize) -> Result<Vec<u64>> {
+    let dims @ [nx, ny, nz] = source.dims();
+    let mut finite = words_for(dims, words)?;
     finite.par_chunks_mut(words * ny).enumerate().for_each_init(
         || vec![0.0; nx],
         |row, (k, plane)| {
@@ -247,7 +260,7 @@ fn usable_cells(source: &impl Source, words: usize) -> Vec<u64> {
         },
     );
     let row = |j: usize, k: usize| &finite[(k * ny + j) * words..][..words];
-    let mut usable = vec![0u64; words * ny * nz];
+    let mut usable = words_for(dims, words)?;
     usable.par_chunks_mut(words * ny).take(nz - 1).enumerate().for_each(|(k, plane)| {
         for (j, cells) in plane.chunks_mut(words).take(ny - 1).enumerate() {
             let rows = [row(j, k), row(j + 1, k), row(j, k + 1), row(j + 1, k + 1)];
@@ -256,7 +269,7 @@ fn usable_cells(source: &impl Source, words: usize) -> Vec<u64> {
             }
         }
     });
-    usable
+    Ok(usable)
 }
 
 /// Where the vertices and triangles of each row begin. A row (j, k) owns the edges that leave its samples, those along
@@ -308,7 +321,7 @@ impl Starts {
 
 /// Marching cubes of any source.
 fn march(source: &impl Source, c: f64) -> Result<Isosurface> {
-    let bits = Bits::new(source, c);
+    let bits = Bits::new(source, c)?;
     let starts = Starts::new(&bits)?;
     let [_, ny, nz] = bits.dims;
 

@@ -28,8 +28,20 @@ const MAX_BATCHES: usize = 4096;
 ///
 /// # Errors
 /// From extracting level sets.
-#[allow(clippy::cast_possible_truncation, reason = "positions are f32, indices below 2³²")]
 pub fn positions(field: &Field, strategy: &Strategy, count: u64, seed: u64) -> Result<Vec<Vec3>> {
+    positions_in(field, strategy, count, seed, MAX_BATCHES)
+}
+
+/// As [`positions`], but what is not found at once is left out.
+///
+/// # Errors
+/// From extracting level sets.
+pub fn positions_at_hand(field: &Field, strategy: &Strategy, count: u64, seed: u64) -> Result<Vec<Vec3>> {
+    positions_in(field, strategy, count, seed, 1)
+}
+
+#[allow(clippy::cast_possible_truncation, reason = "positions are f32, indices below 2³²")]
+fn positions_in(field: &Field, strategy: &Strategy, count: u64, seed: u64, most: usize) -> Result<Vec<Vec3>> {
     let far = field.lattice().far();
     let on_sweep = |p: &Vec3| (0.0..=1.0).contains(&field.value(p.as_dvec3()));
     let uniform = |i: usize| {
@@ -51,12 +63,12 @@ pub fn positions(field: &Field, strategy: &Strategy, count: u64, seed: u64) -> R
                 let [x, y] = set.point2(i as u32, 0);
                 (corner + DVec3::new(x, y, set.coordinate(i as u32, 2))).as_vec3()
             };
-            let mut found = in_batches(count, |i| Some(in_cell(i)).filter(on_sweep));
+            let mut found = in_batches(count, most, |i| Some(in_cell(i)).filter(on_sweep));
             // Neighbours one after another: their rays read the same memory.
             found.par_sort_by_key(|p| [p.z as u32, p.y as u32, p.x as u32]);
             Ok(found)
         }
-        Strategy::Planes(planes) => Ok(in_batches(count, |i| {
+        Strategy::Planes(planes) => Ok(in_batches(count, most, |i| {
             // (1,1,1) in units of Ω: each point of a slab goes straight to the plane in the slab's middle.
             let p = uniform(i) / far;
             let s = p.element_sum() / 3.0;
@@ -80,12 +92,12 @@ fn cells_on_sweep(field: &Field) -> Vec<usize> {
     (0..nx * ny * nz).into_par_iter().filter(passed).collect()
 }
 
-/// The first `count` points that `point` gives for 0, 1, 2 …, tried in batches until there are enough.
+/// The first `count` points that `point` gives for 0, 1, 2 …, tried in batches until there are enough, `most` of them.
 #[allow(clippy::cast_possible_truncation, reason = "counts of what fits memory")]
-fn in_batches(count: u64, point: impl Fn(usize) -> Option<Vec3> + Sync) -> Vec<Vec3> {
+fn in_batches(count: u64, most: usize, point: impl Fn(usize) -> Option<Vec3> + Sync) -> Vec<Vec3> {
     const BATCH: usize = 1 << 20;
     let mut found: Vec<Vec3> = Vec::new();
-    for batch in 0..MAX_BATCHES {
+    for batch in 0..most {
         found.par_extend((batch * BATCH..(batch + 1) * BATCH).into_par_iter().filter_map(&point));
         if found.len() as u64 >= count {
             found.truncate(count as usize);
@@ -146,6 +158,17 @@ mod tests {
     use crate::field::Sweep;
     use crate::stats::{normal_quantile, sidak};
     use crate::volume::{Lattice, Samples, Volume};
+
+    /// Of 10⁶ points one lies on such a sweep: a search for all would take minutes.
+    #[test]
+    fn what_is_at_hand_takes_no_search() {
+        let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::ONE).unwrap();
+        let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[2] as f32).collect();
+        let volume = Volume::new("x", lattice, Samples::F32(samples)).unwrap();
+        let field = Field::new(&volume, Sweep::new(3.5, 3.500_001).unwrap()).unwrap();
+        let found = positions_at_hand(&field, &Strategy::Uniform, 4096, 1).unwrap();
+        assert!(found.len() < 100, "{}", found.len());
+    }
 
     /// Uniform samples of a sweep whose ends cut cells: as many in every block as its share of the sweep's volume,
     /// which the midpoint rule knows; noise of random points is the most that is allowed.

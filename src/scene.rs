@@ -269,16 +269,19 @@ pub fn nearest_axes(lattice: &Lattice) -> [(usize, bool); 3] {
     std::array::from_fn(|w| (best[w], normal(best[w])[w] > 0.0))
 }
 
+/// The largest margin of a box: farther off, f32 coordinates of rays are coarser than voxels.
+const MOST_MARGIN: f64 = 1000.0;
+
 /// The default scene's polygons: a Cornell box that coincides with Ω's faces, grown by `margin` × Ω's edge on every
 /// side. x_min red, x_max green, floor, ceiling and y_max white, y_min open; a square luminaire of radiance 1 and side
 /// 0.4 · min(Lx, Ly), 0.001 Lz under the ceiling. x, y, z are the world axes nearest the lattice's.
 ///
 /// # Errors
-/// `Invalid` for a margin that is negative or not finite.
+/// `Invalid` for a margin that is no number from 0 to 1000.
 pub fn cornell_box(lattice: &Lattice, margin: f64) -> Result<Vec<Polygon>> {
-    if !(margin >= 0.0 && margin.is_finite()) {
+    if !(0.0..=MOST_MARGIN).contains(&margin) {
         return Err(Error::Invalid(format!(
-            "box margin {margin}: must be a fraction of the volume's edges, 0 or more"
+            "box margin {margin}: must be a fraction of the volume's edges, 0 to {MOST_MARGIN}"
         )));
     }
     let nearest = nearest_axes(lattice);

@@ -36,6 +36,7 @@ pub struct SceneFile {
     /// How several volumes share light (default joint).
     pub policy: Option<PolicyName>,
     /// The sweep [lo, hi] in source units; a suggestion from the data if absent.
+    #[serde(default, deserialize_with = "numbers")]
     pub isovalues: Option<[f64; 2]>,
     /// Material and sides.
     #[serde(default)]
@@ -51,6 +52,16 @@ pub struct SceneFile {
     pub bake: BakeOptions,
 }
 
+/// A list of exactly `N` numbers, since by themselves arrays leave out what is too much.
+pub(crate) fn numbers<'de, D, const N: usize>(deserializer: D) -> std::result::Result<Option<[f64; N]>, D::Error>
+where
+    D: serde::Deserializer<'de>,
+{
+    let values = Vec::<f64>::deserialize(deserializer)?;
+    let found = values.len();
+    values.try_into().map(Some).map_err(|_| serde::de::Error::custom(format!("needs {N} numbers, found {found}")))
+}
+
 /// `[[context]]`: polygons beside the box, seen from both sides.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
@@ -64,8 +75,10 @@ pub struct ContextOptions {
     /// Factor of the coordinates.
     pub scale: Option<f64>,
     /// Degrees about x, y and z.
+    #[serde(default, deserialize_with = "numbers")]
     pub rotate: Option<[f64; 3]>,
     /// Shift, world units.
+    #[serde(default, deserialize_with = "numbers")]
     pub translate: Option<[f64; 3]>,
 }
 
@@ -177,6 +190,19 @@ impl RawOptions {
     /// Whether anything of it is set.
     pub fn given(&self) -> bool {
         *self != Self::default()
+    }
+
+    /// What is not given here comes from `other`.
+    fn or(&self, other: Option<&Self>) -> Self {
+        let (this, other) = (self.clone(), other.cloned().unwrap_or_default());
+        Self {
+            dims: this.dims.or(other.dims),
+            element: this.element.or(other.element),
+            endian: this.endian.or(other.endian),
+            spacing: this.spacing.or(other.spacing),
+            origin: this.origin.or(other.origin),
+            skip: this.skip.or(other.skip),
+        }
     }
 }
 
@@ -493,6 +519,14 @@ mod tests {
         assert!(e.contains("scene.toml:2: file") && e.contains("nowhere.vti"), "{e}");
         let e = error_of("[volume]\ngenerator = \"bumps\"\nsize = 9\n[box]\nmargin = -1.0\n");
         assert!(e.contains("scene.toml:5: margin"), "{e}");
+        let e = error_of("[volume]\ngenerator = \"bumps\"\nsize = 9\n[box]\nmargin = 1001\n");
+        assert!(e.contains("scene.toml:5: margin") && e.contains("1000"), "{e}");
+        let e = error_of("isovalues = [10, 20, 30]\n[volume]\ngenerator = \"bumps\"\n");
+        assert!(e.contains("scene.toml:1") && e.contains("needs 2 numbers, found 3"), "{e}");
+        for emission in ["\"red\"", "[1, 2]"] {
+            let e = error_of(&format!("[volume]\ngenerator = \"bumps\"\n[surface]\nemission = {emission}\n"));
+            assert!(e.contains("scene.toml:4") && e.contains("a number, or three"), "{e}");
+        }
         assert!(error_of("[volume]\n").contains("file or generator"));
         let e = error_of("[volume]\nfiles = [\"a.vti\", \"b.vti\"]\ngenerator = \"bumps\"\n");
         assert!(e.contains("scene.toml:2: files") && e.contains("files or generator"), "{e}");

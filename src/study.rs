@@ -109,12 +109,14 @@ impl Study {
     /// either engine, and `quick`. Rows of `table` that bear a subject's name must be of its digest.
     ///
     /// # Errors
-    /// `Invalid` if some are not, or if two scenes that differ have one name.
+    /// `Invalid` if some are not, if two scenes that differ have one name, or if neither engine takes what `base` sets.
     fn jobs(&self, table: &Table, subjects: &[Subject], base: &BakeOptions) -> Result<Vec<String>> {
-        let settings = [Engine::Photon, Engine::Sweep].map(|engine| {
+        let settings = [Engine::Photon, Engine::Sweep].map(|engine| BakeSettings::with_engine(base, engine));
+        let settings = match settings {
+            [Err(e), Err(_)] => return Err(e),
             // An engine that cannot do what is asked for leaves no rows.
-            BakeSettings::with_engine(base, engine).map_or_else(|e| e.to_string(), |s| settings_job(&s))
-        });
+            each => each.map(|s| s.map_or_else(|e| e.to_string(), |s| settings_job(&s))),
+        };
         let job = |s: &Subject| digest(&format!("{}{}quick: {}", scene_job(&s.scene), settings.concat(), self.quick));
         let jobs: Vec<String> = subjects.iter().map(job).collect();
         for (n, (subject, job)) in subjects.iter().zip(&jobs).enumerate() {

@@ -73,6 +73,22 @@ fn what_another_scene_or_other_settings_left_is_refused_and_the_same_study_adds_
 }
 
 #[test]
+fn settings_are_checked_before_anything_is_computed() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    assert!(isolume(dir, &["generate", "bumps", "--size", "8", "-o", "b.vti", "-q"]).status.success());
+    for study in ["datasets", "strategies", "curve"] {
+        for (option, value) in [("--gather", "2000000"), ("--wall-resolution", "1"), ("--bands", "1000")] {
+            let output = isolume(dir, &["study", study, "b.vti", "-o", "st", "--quick", option, value]);
+            let said = String::from_utf8_lossy(&output.stderr);
+            assert!(output.status.code() == Some(2) && said.lines().count() == 1, "{study} {option}: {said}");
+            assert!(said.contains(option.trim_start_matches('-')), "{study} {option}: {said}");
+            assert!(!dir.join("st/references").exists() || content(&dir.join("st/references")).is_empty());
+        }
+    }
+}
+
+#[test]
 fn strategies_are_not_baked_again_where_there_is_no_surface_to_compare() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();

@@ -325,6 +325,18 @@ fn a_dry_run_takes_little_memory_whatever_the_walls() {
     assert!(line.contains("photons 0.0"), "{line}");
 }
 
+/// Lines that miss the volume report to walls as often as walls are fine, not as voxels are: 6 GB at this margin.
+#[test]
+fn walls_far_away_take_no_more_memory() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    volume(dir, "21");
+    let peak = |margin: &str| memory(dir, &["--preset", "preview", "--margin", margin]).0;
+    let (near, far) = (peak("1"), peak("1000"));
+    println!("{:.0} and {:.0} MB", near / 1e6, far / 1e6);
+    assert!(far < near + 64e6, "{near} {far}");
+}
+
 /// Peak resident memory of a bake, bytes; and the estimate it printed.
 fn memory(dir: &Path, more: &[&str]) -> (f64, f64) {
     peak(dir, more, &mut Command::new(PROGRAM))

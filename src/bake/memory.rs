@@ -129,6 +129,21 @@ impl MemoryEstimate {
         self.stages.iter().map(|s| s.1).max().unwrap_or(0)
     }
 
+    /// Refuses a bake that needs several times what this machine has, if that is known. What is announced may never be
+    /// touched, so that somewhat more is no reason.
+    ///
+    /// # Errors
+    /// `Invalid` with both.
+    pub fn check_machine(&self) -> Result<()> {
+        match machine_memory() {
+            Some(there) if self.peak() / BEYOND > there => Err(Error::Invalid(format!(
+                "the bake is estimated at {self}; this machine has {}; lower --grid or --wall-resolution",
+                size(there)
+            ))),
+            _ => Ok(()),
+        }
+    }
+
     /// Refuses a bake by `engine` in so many bands that needs more than `most` bytes.
     ///
     /// # Errors
@@ -147,6 +162,19 @@ impl MemoryEstimate {
             limit(most)
         )))
     }
+}
+
+/// Such a multiple of the machine's memory is too much.
+const BEYOND: u64 = 4;
+
+/// Memory and swap of this machine, bytes, where the system tells.
+fn machine_memory() -> Option<u64> {
+    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let of = |key: &str| {
+        let rest = text.lines().find_map(|l| l.strip_prefix(key))?;
+        rest.trim_start_matches(':').split_whitespace().next()?.parse::<u64>().ok()?.checked_mul(1024)
+    };
+    Some(of("MemTotal")? + of("SwapTotal").unwrap_or(0))
 }
 
 /// What an estimate is made of: bytes, but where it says counts.

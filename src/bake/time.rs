@@ -15,7 +15,7 @@ use crate::photon_map::PhotonMap;
 use crate::radiance::{Indirect, sample_radiance};
 use crate::radiance_cache::{CacheSettings, RadianceCache};
 use crate::rng::Stage;
-use crate::sampling::{Strategy, positions};
+use crate::sampling::{Strategy, positions_at_hand};
 use crate::scene::Scene;
 use crate::sweep::{self, SweepSettings};
 use rayon::prelude::*;
@@ -276,7 +276,7 @@ fn field_seconds(
     let own = scene.lattice();
     let needed = masks(&scene.field, own).iter().filter(|&&m| m != Mask::Empty).count() as f64;
     let side = scene.surface.outside;
-    let at = positions(&scene.field, &Strategy::Uniform, SAMPLES, settings.seed)?;
+    let at = positions_at_hand(&scene.field, &Strategy::Uniform, SAMPLES, settings.seed)?;
     let tried = at.len().max(1) as f64;
     let map = PhotonMap::new(scene, &photons.surface, side, |p| p.bounces > 0, settings.estimate());
     let begun = Instant::now();

@@ -11,7 +11,7 @@ use crate::export::bake_file::{self, BakedVolume};
 use crate::field::Sweep;
 use crate::flattened::Side;
 use crate::isa::Isa;
-use crate::progress::{Progress, say};
+use crate::progress::{Clock, Progress, say};
 use crate::scene::{Boundary, Policy, Scene};
 use crate::scene_file::{Inputs, SceneOptions, load, load_series};
 use crate::series::{Series, write_collection};
@@ -20,7 +20,7 @@ use crate::volume::Volume;
 use glam::DVec3;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
@@ -72,7 +72,7 @@ pub(super) struct Bake {
 
 impl Bake {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
-        let begun = Instant::now();
+        let begun = Clock::start();
         let found = self.output.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
         if ["nrrd", "npy", "exr"].contains(&found.as_str()) {
             return Err(Error::invalid(
@@ -135,7 +135,7 @@ impl Bake {
             }
             scene.time = Some(time);
             let frame = Self { scene: scene.clone(), ..frame };
-            let sweep = frame.one(Instant::now(), progress)?;
+            let sweep = frame.one(Clock::start(), progress)?;
             scene.isovalues = Some(vec![sweep.lo(), sweep.hi()]);
             if self.dry_run {
                 say!("{:>14}  that for each of {} frames", "series", series.times().len());
@@ -170,9 +170,9 @@ impl Bake {
     }
 
     /// One bake; returns its sweep.
-    fn one(&self, begun: Instant, progress: Progress) -> Result<Sweep> {
+    fn one(&self, begun: Clock, progress: Progress) -> Result<Sweep> {
         let loaded = load(&self.input, &self.scene)?;
-        let load_seconds = begun.elapsed().as_secs_f64();
+        let load_seconds = begun.seconds();
         let extension = self.output.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
         match (loaded.scene.fields(), extension.as_str()) {
             (1, "vtm") => {
@@ -257,6 +257,7 @@ impl Bake {
             }
             None => MemoryEstimate::new(&loaded.scene, &volumes, &settings, &device)?,
         };
+        memory.check_machine()?;
         if progress == Progress::Shown || self.dry_run {
             let engine = match settings.engine {
                 Engine::Sweep => "sweep: every isovalue at once",
@@ -282,12 +283,12 @@ impl Bake {
             return Ok(sweep);
         }
         let checkpoint = self.checkpoint(job)?;
-        let work = || -> Result<(Vec<crate::bake::Bake>, Instant)> {
+        let work = || -> Result<(Vec<crate::bake::Bake>, Clock)> {
             let mut bakes = bake_fields(&loaded.scene, &settings, &device, progress, Some(&checkpoint))?;
-            let export = Instant::now();
+            let export = Clock::start();
             for bake in &mut bakes {
-                bake.report.seconds.load = load_seconds;
-                bake.report.seconds.total = begun.elapsed().as_secs_f64();
+                [bake.report.seconds.load, bake.report.processor_seconds.load] = load_seconds;
+                [bake.report.seconds.total, bake.report.processor_seconds.total] = begun.seconds();
             }
             bake_file::write_fields(&self.output, &loaded.scene, &volumes, &bakes)?;
             Ok((bakes, export))
@@ -296,8 +297,8 @@ impl Bake {
         checkpoint.remove();
         let mut reports: Vec<BakeReport> = bakes.into_iter().map(|b| b.report).collect();
         for report in &mut reports {
-            report.seconds.export = export.elapsed().as_secs_f64();
-            report.seconds.total = begun.elapsed().as_secs_f64();
+            [report.seconds.export, report.processor_seconds.export] = export.seconds();
+            [report.seconds.total, report.processor_seconds.total] = begun.seconds();
         }
         // Of several volumes, one report each by name.
         let json = match &reports[..] {

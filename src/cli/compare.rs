@@ -2,7 +2,7 @@
 
 use super::{expect_extension, outputs};
 use crate::accuracy::{Accuracy, ReferenceMesh, compare};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
 use crate::export::{Mesh, ply};
 use crate::progress::{Progress, say};
@@ -45,6 +45,9 @@ impl Compare {
             .map(|path| ReferenceMesh::from_ply(&ply::read(path)?).map_err(|e| e.in_file(path)))
             .collect::<Result<Vec<_>>>()?;
         let baked = BakedVolume::read(&self.bake)?;
+        if baked.scene.fields() > 1 {
+            return Err(Error::not_supported(&self.bake, "holds several volumes; name the .vti of one of them"));
+        }
         let colours = texture(&baked, &references[0].positions).map_err(|e| e.in_file(&self.bake))?;
         let (accuracy, errors) = compare(&colours, &references, baked.exposure)?;
         if self.json {

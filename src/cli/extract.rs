@@ -7,6 +7,7 @@ use crate::export::bake_file::BakedVolume;
 use crate::progress::{Progress, say};
 use crate::scene::Scene;
 use crate::scene_file::{Inputs, SceneOptions, load};
+use crate::series::is_pattern;
 use crate::surface_mesh::{SurfaceMesh, channel, display_colours, texture, unit_isovalue};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -100,7 +101,7 @@ pub(super) fn open_bake(path: &Path, options: &SceneOptions) -> Result<Option<Ba
     let is = |extension: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(extension));
     let baked = match () {
         () if is("vtm") => BakedVolume::read(path).map(Some),
-        () if is("vti") => BakedVolume::try_read(path),
+        () if is("vti") && !is_pattern(path) => BakedVolume::try_read(path),
         () => Ok(None),
     }?;
     match options.first_given().filter(|_| baked.is_some()) {

@@ -42,10 +42,17 @@ impl Init {
         file.write_all(text.as_bytes()).map_err(|e| Error::io(&output, e))?;
         file.commit()?;
         if progress == Progress::Shown {
-            say!("{}: edit it, then: isolume bake {} -o lit.vti", output.display(), output.display());
+            say!("{}: edit it, then: isolume bake {} -o lit.vti", output.display(), quoted(&output));
         }
         Ok(())
     }
+}
+
+/// A path as a shell takes it.
+fn quoted(path: &Path) -> String {
+    let text = path.display().to_string();
+    let plain = |c: char| c.is_alphanumeric() || "/._-+=@:,%".contains(c);
+    if text.chars().all(plain) { text } else { format!("'{}'", text.replace('\'', "'\\''")) }
 }
 
 /// `head.nii.gz` to `head.toml`.
@@ -104,4 +111,18 @@ fn scene_text(volume: &Path, raw: &RawOptions, statistics: &VolumeStatistics) ->
         .replace("@sweep@", &sweep)
         .replace("@layout@", &layout)
         .replace("@file@", &quoted(&volume.to_string_lossy()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn hints_can_be_pasted() {
+        for (path, text) in
+            [("a/b-1.toml", "a/b-1.toml"), ("süb/ü.toml", "süb/ü.toml"), ("a b", "'a b'"), ("it's", "'it'\\''s'")]
+        {
+            assert_eq!(quoted(Path::new(path)), text);
+        }
+    }
 }

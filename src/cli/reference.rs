@@ -80,7 +80,8 @@ impl ReferenceArgs {
         if self.photons == 0 || !(2..=4096).contains(&self.photons_per_estimate) || self.vertices == Some(0) {
             return Err(Error::Invalid("--photons, --vertices: at least 1; --photons-per-estimate: 2 to 4096".into()));
         }
-        let (scene, _) = open_scene(&self.input, &self.scene, self.field.as_deref())?;
+        let (scene, baked) = open_scene(&self.input, &self.scene, self.field.as_deref())?;
+        baked.map_or(Ok(()), |b| b.whole()).map_err(|e| e.in_file(&self.input))?;
         // Alone, if the scene's volumes give each other no light.
         let scene = scene.lit(scene.number());
         let isovalue = unit_isovalue(&scene.field, self.isovalue)?;

@@ -264,6 +264,8 @@ pub struct BakedVolume {
     pub companions: Vec<BakedVolume>,
     /// Whether the fields gave each other no light.
     independent: bool,
+    /// Whether other fields gave it light that are not here.
+    among_others: bool,
 }
 
 impl BakedVolume {
@@ -271,7 +273,22 @@ impl BakedVolume {
     pub fn new(scene: Scene, bake: Bake) -> Self {
         let report = serde_json::to_value(&bake.report).expect("the report is plain data");
         let (sides, flats, exposure) = (bake.sides, bake.flats, bake.exposure);
-        Self { scene, sides, flats, exposure, report, companions: Vec::new(), independent: false }
+        Self { scene, sides, flats, exposure, report, companions: Vec::new(), independent: false, among_others: false }
+    }
+
+    /// Refuses to light its scene anew if others lit it that are in another file.
+    ///
+    /// # Errors
+    /// `NotSupported` in that case.
+    pub fn whole(&self) -> Result<()> {
+        if self.among_others {
+            return Err(Error::NotSupported(
+                "is one of several volumes that light each other, and does not hold the others; name the .vtm and, by \
+                 --field, this one"
+                    .into(),
+            ));
+        }
+        Ok(())
     }
 
     /// Reads a bake; a `.vtm` with all its fields, seen from the first.
@@ -390,7 +407,18 @@ impl BakedVolume {
             }
         }
         let (exposure, report) = (d.exposure, d.report);
-        Ok(Self { scene, sides, flats, exposure, report, companions: Vec::new(), independent: d.independent })
+        // Such bakes hold the parameter that their fields share.
+        let among_others = !d.independent && file.point_data.iter().any(|a| a.name == "s");
+        Ok(Self {
+            scene,
+            sides,
+            flats,
+            exposure,
+            report,
+            companions: Vec::new(),
+            independent: d.independent,
+            among_others,
+        })
     }
 
     /// Single bakes of one scene put together, seen from number `own`.
@@ -401,7 +429,7 @@ impl BakedVolume {
         let polygons = fields[0].scene.polygons().to_vec();
         let scene = Scene::with_members(members, policy, polygons)?.seen_from(own);
         let mut this = fields.remove(own);
-        (this.scene, this.companions) = (scene, fields);
+        (this.scene, this.companions, this.among_others) = (scene, fields, false);
         Ok(this)
     }
 

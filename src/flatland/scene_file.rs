@@ -4,7 +4,7 @@ use super::{FlatScene, HeightField, Segment};
 use crate::error::{Error, Result};
 use crate::field::Sweep;
 use crate::flattened::Side;
-use crate::scene_file::{OutsideName, Rgb, fault};
+use crate::scene_file::{OutsideName, Rgb, fault, numbers};
 use glam::{DVec2, DVec3};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
@@ -13,6 +13,7 @@ use std::path::{Path, PathBuf};
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
 struct File {
     field: FieldSource,
+    #[serde(default, deserialize_with = "numbers")]
     isovalues: Option<[f64; 2]>,
     height: Option<f64>,
     #[serde(default)]

@@ -213,7 +213,11 @@ impl Bench {
     }
 }
 
-/// Runs the study and writes `study.csv`, `study.md`, `study.svg` and `figure5.png` into `folder`.
+/// Samples of BB09's Figure 5.
+const FIGURE5: u64 = 20_000;
+
+/// Runs the study and writes `study.csv`, `study.md`, `study.svg` and, if it comes to so many samples, `figure5.png`
+/// into `folder`.
 ///
 /// # Errors
 /// `Io`, `Embree`, `Interrupted`; `Invalid` if fewer than 1000 samples are allowed.
@@ -234,7 +238,7 @@ pub fn flatland(folder: &Path, device: &Device, settings: &StudySettings, progre
                 let (name, n) = (placement.name(), measured.samples);
                 say!("{name:>14}  {n:>8} samples: {:.2} % in {:.2} s", measured.percent_rms, measured.seconds);
             }
-            if count == 20_000 {
+            if count == FIGURE5 {
                 rows.push(figure5(&bench, &positions, &grid));
             }
             table.push(measured);
@@ -246,12 +250,16 @@ pub fn flatland(folder: &Path, device: &Device, settings: &StudySettings, progre
     }
     write(&folder.join("study.csv"), &csv)?;
     write(&folder.join("study.svg"), &plot(&table))?;
-    write(&folder.join("study.md"), &markdown(&bench, &table, solved, device))?;
+    let mut text = markdown(&bench, &table, solved, device);
+    let mut figure = "";
     if !rows.is_empty() {
         stacked(&rows).write_png(folder.join("figure5.png"), 1.0)?;
+        text += "\n![samples and grids: level sets above, uniform below](figure5.png)\n";
+        figure = ", figure5.png";
     }
+    write(&folder.join("study.md"), &text)?;
     if progress == Progress::Shown {
-        say!("{}: study.csv, study.md, study.svg, figure5.png", folder.display());
+        say!("{}: study.csv, study.md, study.svg{figure}", folder.display());
     }
     Ok(())
 }
@@ -332,8 +340,7 @@ fn markdown(bench: &Bench, table: &[Measured], solved: f64, device: &Device) -> 
     let _ = write!(
         text,
         "\nSolution and reference: {solved:.1} s. {} gather directions per sample, {} for the reference; seed {}. {} threads, \
-         Embree {}, commit {}.\n\n![error against samples](study.svg)\n\n![samples and grids: level sets above, uniform \
-         below](figure5.png)\n",
+         Embree {}, commit {}.\n\n![error against samples](study.svg)\n",
         s.gather,
         s.reference_gather,
         s.seed,

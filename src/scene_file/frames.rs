@@ -62,9 +62,6 @@ pub(super) fn moment(
 
 /// Reads a volume file as the source and flags say.
 pub(super) fn read_volume(path: &Path, source: &VolumeSource, raw: &RawOptions) -> Result<Volume> {
-    let layout = if raw.given() { Some(raw) } else { source.raw.as_ref() };
-    match layout {
-        Some(layout) => layout.layout(path)?.read(path),
-        None => Volume::open(path),
-    }
+    let layout = raw.or(source.raw.as_ref());
+    if layout.given() { layout.layout(path)?.read(path) } else { Volume::open(path) }
 }

@@ -2,7 +2,7 @@
 
 use super::{
     Albedo, BoundaryName, Loaded, OutsideName, RawOptions, Rgb, SceneFile, SceneOptions, SidesName, SurfaceOptions,
-    VolumeSource, context, load_volume, suggested, surface, surroundings,
+    VolumeSource, context, load_volume, numbers, suggested, surface, surroundings,
 };
 use crate::error::{Error, Result};
 use crate::field::{Field, Sweep};
@@ -83,10 +83,12 @@ pub struct VolumeEntry {
     /// Samples along each edge of a generated volume.
     pub size: Option<usize>,
     /// World position of the first sample, instead of the file's.
+    #[serde(default, deserialize_with = "numbers")]
     pub origin: Option<[f64; 3]>,
     /// Factor of the world distances between samples.
     pub scale: Option<f64>,
     /// Its range, which the shared parameter sweeps.
+    #[serde(default, deserialize_with = "numbers")]
     pub isovalues: Option<[f64; 2]>,
     /// Instead of a range, the isovalue at which it stands in every hyperplane.
     pub held: Option<f64>,

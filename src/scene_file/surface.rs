@@ -10,7 +10,7 @@ use serde::Deserialize;
 
 /// A number for all channels, or three.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
-#[serde(untagged)]
+#[serde(untagged, expecting = "expected a number, or three: [red, green, blue]")]
 pub enum Rgb {
     /// The same in all channels.
     Grey(f64),

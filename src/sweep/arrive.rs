@@ -10,11 +10,13 @@ use super::pack::{LANES, OUTSIDE, Pack, Plan};
 use crate::flattened::Side;
 use crate::rng::{Rng, Stage};
 use glam::DVec3;
-use std::ops::RangeInclusive;
 
 /// Lines per texel edge that report to walls. Each reports to four texels, so that one reaches every texel from every
 /// direction; half of one showed as a weave on the walls.
 const LINES_PER_TEXEL: f64 = 1.0;
+
+/// Of lines near Ω at least one in so many reports, however large texels are: what is seen there is not even.
+const MOST_STRIDE: f64 = 8.0;
 
 /// A line that meets Ω: its pack, B of this side and the other, its lane, and where it enters and leaves.
 type Samples<'a> = (&'a Pack, [&'a [Half4]; 2], usize, [f64; 2]);
@@ -39,18 +41,46 @@ fn rows(pack: &Pack, span: [f64; 2], (from, to): (f64, f64)) -> impl Iterator<It
     (0..count).map(row).filter(move |row| (lo..hi).contains(row))
 }
 
+/// Which lines report: every `stride`-th along u and v, from `phase` on; none with a stride of 0.
+#[derive(Clone, Copy)]
+struct Reporting {
+    stride: isize,
+    phase: [isize; 2],
+    weight: f32,
+}
+
+impl Reporting {
+    #[allow(clippy::cast_possible_truncation, reason = "below the stride, and a weight")]
+    fn new(stride: isize, phase: [f64; 2], line: f64) -> Self {
+        let phase = phase.map(|u| (u * stride as f64) as isize);
+        Self { stride, phase, weight: (line * (stride * stride) as f64) as f32 }
+    }
+
+    /// Those of the rows, or with `axis` 0 of the lines of a row, from one to another; none if that is before it.
+    fn along(&self, axis: usize, (first, last): (isize, isize)) -> impl Iterator<Item = isize> + use<> {
+        let stride = self.stride.max(1);
+        let any = self.stride > 0 && first <= last;
+        let start = if any { first + (self.phase[axis] - first).rem_euclid(stride) } else { 0 };
+        (start..=if any { last } else { -1 }).step_by(stride.unsigned_abs())
+    }
+
+    fn row(&self, q: isize) -> bool {
+        self.stride > 0 && (q - self.phase[1]).rem_euclid(self.stride) == 0
+    }
+}
+
 /// The walls' part of one family of lines.
 pub(super) struct Walls<'a> {
     plan: &'a Plan,
     ends: &'a Ends,
     flats: &'a Flats,
     /// Rows of lines that meet the box.
-    pub rows: (isize, isize),
+    rows: (isize, isize),
     columns: (isize, isize),
-    /// Every `stride`-th line along u and v, from `phase` on, reports.
-    stride: isize,
-    phase: [isize; 2],
-    weight: f32,
+    /// Lines near Ω report, and …
+    near: Reporting,
+    /// … those that surely miss it, of which there may be many more than texels.
+    past: Reporting,
     capped: bool,
     /// Whether all isovalues of lines without samples are this side's.
     primary: bool,
@@ -87,22 +117,24 @@ impl<'a> Walls<'a> {
         };
         let side_of_texel = flats.textures.iter().flatten().map(|t| t.sink_area.sqrt()).fold(f64::INFINITY, f64::min);
         let spacing = pass.scene.lattice().spacing().max_element();
-        let stride = (side_of_texel / (LINES_PER_TEXEL * spacing)).floor().clamp(1.0, 8.0) as isize;
+        let lines = (side_of_texel / (LINES_PER_TEXEL * spacing)).floor().max(1.0);
         let mut rng =
             Rng::stream(shear.offset[0].to_bits() ^ shear.offset[1].to_bits().rotate_left(32), Stage::Sweep, 0);
-        let phase = [0, 1].map(|_| (rng.unit() * stride as f64) as isize);
+        let phase = [0, 1].map(|_| rng.unit());
         let none = flats.none();
         // Only ratios of weights count.
         let area = shear.area / pass.scene.lattice().unit().powi(2);
+        let line = 4.0 * std::f64::consts::PI / (2 * families) as f64 * area;
+        let every = |stride: f64| Reporting::new(if none { 0 } else { stride as isize }, phase, line);
         Self {
             plan,
             ends,
             flats,
             rows: if margin && !none { range(1) } else { (isize::MAX, isize::MIN) },
             columns: range(0),
-            stride: if none { 0 } else { stride },
-            phase,
-            weight: (4.0 * std::f64::consts::PI / (2 * families) as f64 * area * (stride * stride) as f64) as f32,
+            near: every(lines.min(MOST_STRIDE)),
+            // Two lines per texel edge at least, and no more than that far away.
+            past: every(lines.min(MOST_STRIDE.max(0.5 * lines).min(f64::from(1 << 20)))),
             capped: super::flats::capped(pass.scene),
             primary: side == pass.primary,
             margin,
@@ -111,46 +143,46 @@ impl<'a> Walls<'a> {
         }
     }
 
-    /// The lines of row `q` with p in `range` that report.
-    fn reporting(&self, range: RangeInclusive<isize>, q: isize) -> impl Iterator<Item = isize> {
-        let reports = self.stride > 0 && (q - self.phase[1]).rem_euclid(self.stride) == 0;
-        let (first, last) = range.into_inner();
-        let stride = self.stride.max(1);
-        let start = first + (self.phase[0] - first).rem_euclid(stride);
-        (start..=if reports { last } else { start - 1 }).step_by(stride.unsigned_abs())
+    /// The rows below and above those from `first` to `last` in which lines report.
+    pub(super) fn rows_beside(&self, (first, last): (isize, isize)) -> [Vec<isize>; 2] {
+        let (least, most) = self.rows;
+        [(least, most.min(first - 1)), (least.max(last + 1), most)].map(|range| self.past.along(1, range).collect())
     }
 
     /// Reports of lines (first + lane, q), whose samples are in `pack`, with B of this side and the other.
     pub(super) fn through(&self, pack: &Pack, b: [&[Half4]; 2], first: isize, q: isize, out: &mut Arrivals) {
-        for p in self.reporting(first..=first + LANES as isize - 1, q) {
+        if !self.near.row(q) {
+            return;
+        }
+        for p in self.near.along(0, (first, first + LANES as isize - 1)) {
             let lane = (p - first).unsigned_abs();
             let span = pack.spans.map(|tau| tau[lane]);
             // Lines through a corner of Ω that no slice cuts have no samples.
             if span[0].ceil() <= span[1].floor() {
-                self.line(Some((pack, b, lane, span)), p, q, out);
+                self.line(Some((pack, b, lane, span)), (p, q), self.near.weight, out);
                 if self.capped && self.plan.sign > 0.0 {
                     self.caps(pack, lane, span, (p, q), out);
                 }
             } else if self.margin {
-                self.line(None, p, q, out);
+                self.line(None, (p, q), self.near.weight, out);
             }
         }
     }
 
     /// Reports of the other lines of row q: those that miss Ω.
     pub(super) fn past(&self, q: isize, within: bool, out: &mut Arrivals) {
-        if !self.margin {
+        if !self.margin || !self.past.row(q) {
             return;
         }
         let packs = self.plan.first[0]..self.plan.first[0] + self.plan.width as isize;
-        for p in self.reporting(self.columns.0..=self.columns.1, q).filter(|p| !(within && packs.contains(p))) {
-            self.line(None, p, q, out);
+        for p in self.past.along(0, self.columns).filter(|p| !(within && packs.contains(p))) {
+            self.line(None, (p, q), self.past.weight, out);
         }
     }
 
     /// What every front on one line sees along it.
     #[inline(always)]
-    fn line(&self, samples: Option<Samples>, p: isize, q: isize, out: &mut Arrivals) {
+    fn line(&self, samples: Option<Samples>, (p, q): (isize, isize), weight: f32, out: &mut Arrivals) {
         let nc = self.flats.isovalues;
         let (pf, qf) = (p as f64, q as f64);
         for (wall, forward) in self.ends.fronts(pf, qf) {
@@ -161,7 +193,7 @@ impl<'a> Walls<'a> {
                 continue;
             }
             let reach = next.map_or(if forward { f64::INFINITY } else { f64::NEG_INFINITY }, |s| s.tau);
-            out.push((flat, wall.uv), self.weight, nc, |values| {
+            out.push((flat, wall.uv), weight, nc, |values| {
                 fill_column(self.flats, next, values);
                 match samples {
                     Some((pack, b, lane, span)) if self.meets(wall.tau, reach, span) => {
@@ -356,7 +388,7 @@ impl<'a> Walls<'a> {
             if covered > 0 {
                 let next = self.ends.stop(pq.0, pq.1, span[end], end == 1, None);
                 let cap = self.cap_stop(span[end], pq);
-                out.push((cap.flat.expect("a cap"), cap.uv), self.weight, nc, |values| {
+                out.push((cap.flat.expect("a cap"), cap.uv), self.near.weight, nc, |values| {
                     fill_column(self.flats, next, values);
                     (0, covered)
                 });

@@ -176,17 +176,17 @@ impl Pass<'_> {
             flats,
             way: Way { strict: side == Side::Higher, sign, capped: capped(self.scene) },
             omega: (shear.omega * share).as_vec3().to_array(),
-            // Rows that meet Ω, one behind them for the last row of nodes, and those that only walls see.
             walls,
         };
-        let first = plan.first[1].min(family.walls.rows.0);
-        let last = (plan.first[1] + plan.count[1] as isize).max(family.walls.rows.1);
-        let count = (last - first + 1).unsigned_abs();
-        let arrivals: Vec<Mutex<Arrivals>> = (0..count).map(|_| Mutex::default()).collect();
+        // Rows that meet Ω, one behind them for the last row of nodes, and those that only walls see.
+        let near = (plan.first[1], plan.first[1] + plan.count[1] as isize);
+        let [below, above] = family.walls.rows_beside(near);
+        let lines: Vec<isize> = below.into_iter().chain(near.0..=near.1).chain(above).collect();
+        let arrivals: Vec<Mutex<Arrivals>> = lines.iter().map(|_| Mutex::default()).collect();
         let threads = rayon::current_num_threads();
-        let runs = Runs::new(count, threads);
+        let runs = Runs::new(lines.len(), threads);
         let shares = || {
-            let share = |own| self.rows_of_lines(&family, (first, &arrivals), rows, (&runs, own));
+            let share = |own| self.rows_of_lines(&family, (&lines, &arrivals), rows, (&runs, own));
             (0..threads).into_par_iter().with_max_len(1).for_each(share);
         };
         rayon::join(shares, || incoming.receive(&before));
@@ -208,13 +208,13 @@ impl Pass<'_> {
         }
     }
 
-    /// The rows q = `first` … of lines that thread `own` gets: their light to the nodes between each and the one
+    /// Those of the rows `lines` that thread `own` gets: their light to the nodes between each and the one
     /// before, and to walls. Only for a row that does not follow the thread's last one the one before is walked through
     /// again.
     fn rows_of_lines(
         &self,
         family: &Family,
-        (first, arrivals): (isize, &[Mutex<Arrivals>]),
+        (lines, arrivals): (&[isize], &[Mutex<Arrivals>]),
         rows: &Rows,
         (runs, own): (&Runs, usize),
     ) {
@@ -234,10 +234,10 @@ impl Pass<'_> {
         work.gaps.iter_mut().for_each(|g| g.resize(packs, 0));
         let mut walked = None;
         while let Some(n) = runs.next(own) {
-            let q = first + n as isize;
+            let q = lines[n];
             let mut nodes = std::mem::take(&mut work.nodes);
             self.nodes(plan, q, &mut nodes);
-            let follows = n > 0 && walked == Some(n - 1);
+            let follows = walked == Some(q - 1);
             if !follows && !nodes.is_empty() {
                 self.row_of_lines(family, q - 1, &mut work, 1 - n % 2, None);
             }
@@ -253,7 +253,7 @@ impl Pass<'_> {
                 self.accumulate(family, (light, gaps), &mut row.expect("asked for before"), at);
             }
             work.nodes = nodes;
-            walked = Some(n);
+            walked = Some(q);
         }
         self.workspaces.lock().expect("no thread panics").push(work);
     }

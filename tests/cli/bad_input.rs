@@ -58,6 +58,10 @@ fn bad_input_is_one_clear_line_and_leaves_nothing() {
     refused(dir, &["generate", "bumps", "--size", "100000", "-o", "out.vti"], &["100000", "2048"]);
     refused(dir, &with(&["--checkpoint-every=-1"]), &["--checkpoint-every", "0 or more"]);
 
+    // More than any machine has.
+    refused(dir, &["info", "ramp.nrrd", "--threads", "99999999"], &["--threads", "1024"]);
+    refused(dir, &with(&["--grid", "100000,100000,100000", "-q"]), &["GB", "this machine has", "--grid"]);
+
     // A list of volumes that names itself.
     let list = "<VTKFile type=\"vtkMultiBlockDataSet\"><vtkMultiBlockDataSet><DataSet file=\"self.vtm\"/>\
                 </vtkMultiBlockDataSet></VTKFile>";

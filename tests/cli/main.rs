@@ -64,6 +64,10 @@ fn generate_info_bake_render() {
     for key in ["load", "build", "photons", "samples", "interpolate", "export", "total"] {
         assert!(report["seconds"][key].is_number(), "seconds.{key}");
     }
+    for key in ["load", "samples", "total"] {
+        let worked = report["processor_seconds"][key].as_f64().unwrap();
+        assert!(worked > 0.0 || key != "total" && worked == 0.0, "the clock ticks every 10 ms: {key} {worked}");
+    }
     for key in ["rays", "rays_per_second", "samples", "masked", "misses", "threads", "seed"] {
         assert!(report[key].is_number(), "{key}");
     }

@@ -38,6 +38,7 @@ fn no_output_takes_the_place_of_an_input() {
     fs::write(dir.join("room.obj"), "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").unwrap();
     let scene = "isovalues = [3.6, 95]\n[volume]\nfile = \"b.vti\"\n[[context]]\nfile = \"room.obj\"\n";
     fs::write(dir.join("scene.toml"), scene).unwrap();
+    ok(dir, &["extract", "series/rho_%04d.vti", "--time", "0.5", "--isovalue", "47", "-o", "moment.ply", "-q"]);
     let all = || {
         let files =
             ["b.vti", "lit.vti", "r.ply", "room.obj", "scene.toml", "series/rho_0000.vti", "series/rho_0002.vti"];

@@ -95,6 +95,13 @@ fn a_headerless_file_may_have_flipped_axes() {
     let json: serde_json::Value = serde_json::from_slice(&info.stdout).unwrap();
     assert_eq!(json["axes"], serde_json::json!([[-1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, -3.0]]));
     assert_eq!(json["origin"], serde_json::json!([-7.0, 0.0, 1.0]));
+    // Flags take the place of single keys.
+    fs::write(dir.join("r.toml"), "[volume]\nfile = \"r.raw\"\nraw = { dims = [3, 2, 2], type = \"u8\" }\n").unwrap();
+    let spaced = ["extract", "r.toml", "--raw-spacing", "5,2,2", "--isovalue", "5.5", "-o", "r.ply", "-q"];
+    ok(dir, &spaced);
+    let mesh = isolume::export::ply::read(dir.join("r.ply")).unwrap();
+    let most = mesh.property("x").unwrap().iter().fold(0.0, |a: f64, x| a.max(*x));
+    assert_eq!(most, 10.0);
 }
 
 /// What Slicer draws mirrored if it is lost.
@@ -162,6 +169,11 @@ fn several_volumes_in_one_scene() {
     ok(dir, &["compare", "two-b.vti", "r.ply", "--json"]);
     refused(dir, &[&reference[..2], &["c", "two.toml", "--isovalue", "0.11", "-o", "r.ply"]].concat(), &["a, b"]);
     refused(dir, &["view", "two.vtm", "-o", "two.html"], &["two.vtm", "several"]);
+    refused(dir, &["compare", "two.vtm", "r.ply"], &["two.vtm", "several"]);
+    // One of them alone is another scene than the one that lit it.
+    let alone = ["two-b.vti", "--isovalue", "0.11", "-o"];
+    refused(dir, &[&["reference"], &alone[..], &["c.ply"]].concat(), &["two-b.vti", ".vtm", "--field"]);
+    refused(dir, &[&["render", "--reference"], &alone[..], &["c.png"]].concat(), &["two-b.vti", ".vtm"]);
     refused(dir, &["render", "two.vtm", "--isovalue", "5", "--field", "b", "-o", "c.png"], &["'b'", "0.02"]);
 
     let first = fs::read(dir.join("two-a.vti")).unwrap();
