@@ -507,6 +507,10 @@ mod tests {
         assert!(e.contains("scene.toml:3: unknown key `colour` in [volume]; known: file") && !e.contains('\n'), "{e}");
         let e = error_of("[volume]\ngenerator = \"bumps\"\n[surface]\noutside = \"heigher\"\n");
         assert!(e.contains("scene.toml:4: unknown value `heigher` in [surface]; did you mean `higher`?"), "{e}");
+        let e = error_of("[volume]\ngenerator = \"bumps\"\n[foo]\nx = 1\n");
+        assert!(e.contains("scene.toml:3: unknown key `foo`; known: volume"), "{e}");
+        let e = error_of("[volume]\ngenerator = \"bumps\"\n[volume.foo]\nx = 1\n");
+        assert!(e.contains("scene.toml:3: unknown key `foo` in [volume]; known: file"), "{e}");
         let e = error_of("isovalue = [1, 2]\n[volume]\ngenerator = \"bumps\"\n");
         assert!(e.contains("scene.toml:1: unknown key `isovalue`; did you mean `isovalues`?"), "{e}");
         let e = error_of("isovalues = [5, 5]\n[volume]\ngenerator = \"bumps\"\nsize = 9\n");

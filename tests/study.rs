@@ -77,6 +77,12 @@ fn settings_are_checked_before_anything_is_computed() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     assert!(isolume(dir, &["generate", "bumps", "--size", "8", "-o", "b.vti", "-q"]).status.success());
+    for n in 0..2 {
+        fs::copy(dir.join("b.vti"), dir.join(format!("t_{n}.vti"))).unwrap();
+    }
+    let output = isolume(dir, &["study", "datasets", "t_%d.vti", "-o", "st", "--quick"]);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.code() == Some(2) && said.contains("name one of its files"), "{said}");
     for study in ["datasets", "strategies", "curve"] {
         for (option, value) in [("--gather", "2000000"), ("--wall-resolution", "1"), ("--bands", "1000")] {
             let output = isolume(dir, &["study", study, "b.vti", "-o", "st", "--quick", option, value]);

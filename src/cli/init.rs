@@ -42,14 +42,14 @@ impl Init {
         file.write_all(text.as_bytes()).map_err(|e| Error::io(&output, e))?;
         file.commit()?;
         if progress == Progress::Shown {
-            say!("{}: edit it, then: isolume bake {} -o lit.vti", output.display(), quoted(&output));
+            say!("{}: edit it, then: isolume bake {} -o lit.vti", output.display(), for_shell(&output));
         }
         Ok(())
     }
 }
 
 /// A path as a shell takes it.
-fn quoted(path: &Path) -> String {
+fn for_shell(path: &Path) -> String {
     let text = path.display().to_string();
     let plain = |c: char| c.is_alphanumeric() || "/._-+=@:,%".contains(c);
     if text.chars().all(plain) { text } else { format!("'{}'", text.replace('\'', "'\\''")) }
@@ -122,7 +122,7 @@ mod tests {
         for (path, text) in
             [("a/b-1.toml", "a/b-1.toml"), ("süb/ü.toml", "süb/ü.toml"), ("a b", "'a b'"), ("it's", "'it'\\''s'")]
         {
-            assert_eq!(quoted(Path::new(path)), text);
+            assert_eq!(for_shell(Path::new(path)), text);
         }
     }
 }

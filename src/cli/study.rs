@@ -4,7 +4,7 @@ use crate::bake::BakeOptions;
 use crate::error::{Error, Result};
 use crate::flatland::study::{StudySettings, flatland};
 use crate::progress::Progress;
-use crate::scene_file::{SceneOptions, load};
+use crate::scene_file::{SceneOptions, load, load_series};
 use crate::study::{self, Subject};
 use std::path::{Path, PathBuf};
 
@@ -111,6 +111,12 @@ impl SceneStudy {
     ) -> Result<()> {
         let mut subjects = Vec::new();
         for path in &self.scenes {
+            if load_series(path, &SceneOptions::default())?.is_some() {
+                return Err(Error::not_supported(
+                    path,
+                    "is a series: studies take single volumes; name one of its files",
+                ));
+            }
             let loaded = load(path, &SceneOptions::default())?;
             subjects.push(Subject { name: stem(path), scene: loaded.scene, isovalue: None });
         }

@@ -31,8 +31,13 @@ fn nearest<'a>(found: &str, known: &[&'a str]) -> Option<&'a str> {
     (likeness(&best) > 0.75).then_some(best)
 }
 
-/// ` in [table]`, by the last header above.
+/// ` in [table]`, by the last header above; of what stands in a header itself, that of which it is a part.
 fn table_of(before: &str) -> String {
+    let last = before.lines().last().unwrap_or_default().trim();
+    if last.starts_with('[') && !last.contains(']') {
+        let parent = last.trim_start_matches('[').rsplit_once('.').map(|(parent, _)| parent);
+        return parent.map_or_else(String::new, |p| format!(" in [{p}]"));
+    }
     let header = before.lines().rev().map(str::trim).find(|l| l.starts_with('['));
     let closing = |l: &str| if l.starts_with("[[") { "]]" } else { "]" };
     header.and_then(|l| Some(format!(" in {}{}", l.split(']').next()?, closing(l)))).unwrap_or_default()
