@@ -145,8 +145,7 @@ fn shifted_up(word: impl Fn(usize) -> u64, w: usize) -> u64 {
 /// `words` words of zeros for each row.
 fn words_for([nx, ny, nz]: [usize; 3], words: usize) -> Result<Vec<u64>> {
     let mut all = Vec::new();
-    let there = all.try_reserve_exact(words * ny * nz).is_ok();
-    if !there {
+    if all.try_reserve_exact(words * ny * nz).is_err() {
         return Err(Error::NotSupported(format!(
             "isosurface of {nx}×{ny}×{nz} samples, refined ones included: there is not enough memory for a bit of each"
         )));

@@ -257,7 +257,7 @@ impl Bake {
             }
             None => MemoryEstimate::new(&loaded.scene, &volumes, &settings, &device)?,
         };
-        memory.check_machine()?;
+        let fits = memory.check_machine();
         if progress == Progress::Shown || self.dry_run {
             let engine = match settings.engine {
                 Engine::Sweep => "sweep: every isovalue at once",
@@ -270,9 +270,14 @@ impl Bake {
             }
         }
         if self.dry_run {
+            // It may be for another machine.
+            if let Err(e) = fits {
+                say!("warning: {e}");
+            }
             say!("{:>14}  {}", "time", TimeEstimate::new(&loaded.scene, &settings, &device)?);
             return Ok(sweep);
         }
+        fits?;
         let job = job(&loaded.scene, &settings);
         if self.resume
             && self.scene.time.is_some()

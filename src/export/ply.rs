@@ -180,8 +180,8 @@ struct Header {
 }
 
 /// Reads the bytes of a PLY file; `name` is for messages. Binary little-endian, vertices before triangles, any scalar
-/// vertex properties, one index list per face, nothing else. Sizes are checked against the bytes there
-/// are before room for them is made.
+/// vertex properties, one index list per face, nothing else. Sizes are checked against the bytes there are before room
+/// for them is made.
 ///
 /// # Errors
 /// `Invalid` if the bytes are no PLY, are cut short or go on, or name vertices that do not exist; `NotSupported` for

@@ -133,7 +133,7 @@ impl<'a> Walls<'a> {
             rows: if margin && !none { range(1) } else { (isize::MAX, isize::MIN) },
             columns: range(0),
             near: every(lines.min(MOST_STRIDE)),
-            // Two lines per texel edge at least, and no more than that far away.
+            // Two lines per texel edge where texels are large: one has 2 % more error.
             past: every(lines.min(MOST_STRIDE.max(0.5 * lines).min(f64::from(1 << 20)))),
             capped: super::flats::capped(pass.scene),
             primary: side == pass.primary,

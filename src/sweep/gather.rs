@@ -208,9 +208,8 @@ impl Pass<'_> {
         }
     }
 
-    /// Those of the rows `lines` that thread `own` gets: their light to the nodes between each and the one
-    /// before, and to walls. Only for a row that does not follow the thread's last one the one before is walked through
-    /// again.
+    /// Those of the rows `lines` that thread `own` gets: their light to the nodes between each and the one before, and
+    /// to walls. Only for a row that does not follow the thread's last one the one before is walked through again.
     fn rows_of_lines(
         &self,
         family: &Family,

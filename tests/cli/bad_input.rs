@@ -60,7 +60,10 @@ fn bad_input_is_one_clear_line_and_leaves_nothing() {
 
     // More than any machine has.
     refused(dir, &["info", "ramp.nrrd", "--threads", "99999999"], &["--threads", "1024"]);
-    refused(dir, &with(&["--grid", "100000,100000,100000", "-q"]), &["GB", "this machine has", "--grid"]);
+    let huge = with(&["--grid", "100000,100000,100000", "-q"]);
+    refused(dir, &huge, &["GB", "this machine has", "--grid"]);
+    let dry = text(&ok(dir, &[&huge[..], &["--dry-run"]].concat()).stderr);
+    assert!(dry.contains("warning: ") && dry.contains("this machine has") && dry.contains("time"), "{dry}");
 
     // A list of volumes that names itself.
     let list = "<VTKFile type=\"vtkMultiBlockDataSet\"><vtkMultiBlockDataSet><DataSet file=\"self.vtm\"/>\
