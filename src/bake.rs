@@ -213,10 +213,7 @@ pub fn bake_fields(
         let scene = scene.lit(number as usize);
         let named = |e: Error| if scene.name.is_empty() { e } else { e.in_file(format!("volume '{}'", scene.name)) };
         let lattice = settings.grid.lattice(scene.lattice()).map_err(named)?;
-        let masks = masks(&scene.field, &lattice);
-        if nothing_in(&masks) {
-            return Err(named(Error::Invalid(nothing_found(&scene, &lattice))));
-        }
+        let masks = masks_of(&scene, &lattice).map_err(named)?;
         Ok(Job { number, scene, lattice, masks })
     };
     let jobs = (0..).take(scene.fields()).map(job).collect::<Result<Vec<_>>>()?;
@@ -233,6 +230,12 @@ pub fn bake_fields(
         bakes.extend(finish(group, lit, scene.exposure(), &digest, settings, device)?);
     }
     Ok(bakes)
+}
+
+/// The masks of a grid's lattice, some of which holds something.
+fn masks_of(scene: &Scene, grid: &Lattice) -> Result<Vec<Mask>> {
+    let masks = masks(&scene.field, grid);
+    if nothing_in(&masks) { Err(Error::Invalid(nothing_found(scene, grid))) } else { Ok(masks) }
 }
 
 fn nothing_in(masks: &[Mask]) -> bool {
@@ -254,15 +257,21 @@ fn nothing_found(scene: &Scene, grid: &Lattice) -> String {
     )
 }
 
-/// Whether the engine can light the scene.
+/// Whether the engine can light the scene, and the grid can hold its light.
 ///
 /// # Errors
-/// `NotSupported` as [`sweep::supported`].
+/// `NotSupported` as [`sweep::supported`]; `Invalid` for a grid so coarse that no isosurface passes near its points.
 pub fn supported(scene: &Scene, settings: &BakeSettings) -> Result<()> {
-    match settings.engine {
-        Engine::Photon => Ok(()),
-        Engine::Sweep => can_sweep(scene),
+    if settings.engine == Engine::Sweep {
+        can_sweep(scene)?;
     }
+    // Grids as fine as the volume hold what it holds, and are looked at when their light is computed.
+    (0..scene.fields()).try_for_each(|number| {
+        let scene = scene.lit(number);
+        let lattice = settings.grid.lattice(scene.lattice())?;
+        let coarse = lattice.len() < scene.lattice().len();
+        if coarse { masks_of(&scene, &lattice).map(drop) } else { Ok(()) }
+    })
 }
 
 /// Whether sweeps can light the scene, all its fields.

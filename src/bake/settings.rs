@@ -194,43 +194,70 @@ impl BakeOptions {
         }
     }
 
-    /// The first option that is set and means nothing to sweeps, or little: they take a part of its rays where they
-    /// end.
-    fn of_photons(&self) -> Option<&'static str> {
-        let own = [
+    /// Options of the photon engine, by name, and whether they are set. Sweeps take a part of the rays that the last
+    /// three ask for, where they end.
+    fn of_photons(&self) -> [(&'static str, bool); 13] {
+        [
             ("photons", self.photons.is_some()),
             ("bounces", self.bounces.is_some()),
             ("estimator", self.estimator.is_some()),
             ("photons-per-estimate", self.photons_per_estimate.is_some()),
-            ("tau", self.tau.is_some()),
             ("samples", self.samples.is_some()),
             ("strategy", self.strategy.is_some()),
-            ("shadow-rays", self.shadow_rays.is_some()),
-            ("gather", self.gather_rays.is_some()),
             ("smoothing", self.smoothing.is_some()),
             ("neighbours", self.neighbours.is_some()),
             ("interpolation", self.interpolation.is_some()),
             ("bands", self.bands.is_some()),
-        ];
-        own.into_iter().find(|(_, set)| *set).map(|(name, _)| name)
+            ("tau", self.tau.is_some()),
+            ("shadow-rays", self.shadow_rays.is_some()),
+            ("gather", self.gather_rays.is_some()),
+        ]
     }
 
-    /// The first option that is set and means nothing to photons.
-    fn of_sweeps(&self) -> Option<&'static str> {
-        let own = [("directions", self.directions.is_some()), ("light-points", self.light_points.is_some())];
-        own.into_iter().find(|(_, set)| *set).map(|(name, _)| name)
+    /// Options that mean nothing to photons, and whether they are set.
+    fn of_sweeps(&self) -> [(&'static str, bool); 2] {
+        [("directions", self.directions.is_some()), ("light-points", self.light_points.is_some())]
+    }
+
+    /// What is set and changes nothing in a bake of `settings`, for people: a line for each cause.
+    pub fn idle(&self, settings: &BakeSettings) -> Vec<String> {
+        let scattered = settings.strategy != StrategyName::Nodes;
+        let at_nodes = [
+            ("samples", self.samples.is_some()),
+            ("neighbours", self.neighbours.is_some()),
+            ("interpolation", self.interpolation.is_some()),
+        ];
+        let smoothing = [("smoothing", self.smoothing == Some(true))];
+        let (sweeps, photons) = (self.of_sweeps(), self.of_photons());
+        let of: &[(&[(&str, bool)], &str)] = match (settings.engine, scattered) {
+            (Engine::Sweep, _) => &[(&photons[..10], "engine = \"sweep\"")],
+            (Engine::Photon, true) => &[(&sweeps, "engine = \"photon\""), (&smoothing, "scattered samples")],
+            (Engine::Photon, false) => &[
+                (&sweeps, "engine = \"photon\""),
+                (&at_nodes, "strategy = \"nodes\" (uniform, level-set and planes scatter samples)"),
+                (&smoothing[usize::from(settings.gather_rays > 1)..], "fewer than 2 gather rays"),
+            ],
+        };
+        let line = |&(options, because): &(&[(&'static str, bool)], &str)| {
+            let set: Vec<&str> = options.iter().filter(|o| o.1).map(|o| o.0).collect();
+            let verb = if set.len() == 1 { "has" } else { "have" };
+            (!set.is_empty()).then(|| format!("{} {verb} no effect with {because}", set.join(", ")))
+        };
+        of.iter().filter_map(line).collect()
     }
 
     /// Whether nothing that is set asks for one of the engines.
     pub fn leaves_engine(&self) -> bool {
-        self.engine.is_none() && self.of_photons().or(self.of_sweeps()).is_none()
+        let set = |o: &(&str, bool)| o.1;
+        self.engine.is_none() && !self.of_photons().iter().any(set) && !self.of_sweeps().iter().any(set)
     }
 
     /// The engine for a scene: the one that is asked for; else sweeps, which are faster for the same error, unless
     /// options that only photons know are set, the scene cannot be swept, or sweeps would leave out what its surfaces
     /// reflect.
     fn engine(&self, scene: &Scene) -> Result<Engine> {
-        match (self.engine, self.of_photons(), self.of_sweeps()) {
+        let first = |options: &[(&'static str, bool)]| options.iter().find(|o| o.1).map(|o| o.0);
+        match (self.engine, first(&self.of_photons()), first(&self.of_sweeps())) {
             (Some(engine), ..) => Ok(engine),
             (None, Some(photons), Some(sweeps)) => Err(Error::Invalid(format!(
                 "{photons} is an option of the photon engine, {sweeps} of the sweep engine: say which with engine"
@@ -433,5 +460,38 @@ impl BakeSettings {
             normalisation: self.normalisation,
             ..EstimateSettings::default()
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn options_without_effect_are_named() {
+        let idle = |o: &BakeOptions, engine| o.idle(&BakeSettings::with_engine(o, engine).unwrap()).join("; ");
+        let all = BakeOptions {
+            directions: Some(64),
+            photons: Some(1000),
+            samples: Some(1000),
+            strategy: Some(StrategyName::Nodes),
+            gather_rays: Some(0),
+            smoothing: Some(true),
+            tau: Some(0.1),
+            ..BakeOptions::default()
+        };
+        assert_eq!(
+            idle(&all, Engine::Sweep),
+            "photons, samples, strategy, smoothing have no effect with engine = \"sweep\""
+        );
+        let photon = "directions has no effect with engine = \"photon\"; samples has no effect with strategy = \"nodes\" \
+                      (uniform, level-set and planes scatter samples); smoothing has no effect with fewer than 2 gather rays";
+        assert_eq!(idle(&all, Engine::Photon), photon);
+        let scattered = BakeOptions { samples: Some(10), neighbours: Some(8), ..BakeOptions::default() };
+        assert_eq!(idle(&scattered, Engine::Photon), "");
+        let smoothed = BakeOptions { smoothing: Some(true), ..scattered };
+        assert_eq!(idle(&smoothed, Engine::Photon), "smoothing has no effect with scattered samples");
+        let smoothed = BakeOptions { smoothing: Some(true), ..BakeOptions::default() };
+        assert_eq!(idle(&smoothed, Engine::Photon), "");
     }
 }

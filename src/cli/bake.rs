@@ -214,6 +214,9 @@ impl Bake {
                     Isa::current().name()
                 );
             }
+            for idle in options.idle(&settings) {
+                say!("warning: {idle}");
+            }
             let dark = members.iter().all(|m| m.surface.emission == DVec3::ZERO);
             if loaded.scene.luminaires().is_empty() && dark {
                 say!("warning: nothing emits light; everything will be black");

@@ -88,6 +88,7 @@ fn a_grid_that_is_too_coarse_is_told_from_a_constant_volume() {
     for engine in ["sweep", "photon"] {
         let bake = ["bake", "b.nrrd", "--isovalues", "3.6", "95", "-o", "out.vti", "-q", "--engine", engine];
         refused(dir, &[&bake[..], &["--grid", "2,2,2"]].concat(), &["too coarse", "--grid", "2×2×2"]);
+        refused(dir, &[&bake[..], &["--grid", "2,2,2", "--dry-run"]].concat(), &["too coarse", "--grid", "2×2×2"]);
     }
     // 0 and 10, and what is not finite between them.
     let lattice = Lattice::aligned([8; 3], glam::DVec3::ZERO, glam::DVec3::ONE).unwrap();
