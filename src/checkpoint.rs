@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-const MAGIC: &[u8] = b"isolume checkpoint 11\n";
+const MAGIC: &[u8] = b"isolume checkpoint 12\n";
 /// What the magic of any version starts with.
 const ANY_MAGIC: &[u8] = b"isolume checkpoint ";
 

@@ -106,6 +106,17 @@ impl Flat {
         [u, v, isovalues]
     }
 
+    /// Texels across for light that bounces from texel to texel: `least`, or as many more as it takes for none to be
+    /// longer than `narrow` on a wall that is long, but no more in all than a square wall would have.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "at most its square")]
+    pub fn across(&self, least: usize, narrow: f64) -> usize {
+        if self.span > longest(self.edges) {
+            return least;
+        }
+        let texel = narrow.max(self.area().sqrt() / least as f64);
+        least.max((self.span / texel).ceil() as usize)
+    }
+
     /// The texels of one isovalue of a texture of `dims`, u fastest.
     pub fn texels(&self, dims: [usize; 3]) -> Vec<Texel> {
         let [nu, nv, _] = dims;
@@ -247,10 +258,10 @@ impl FlatTexture {
     }
 }
 
-/// Texels of the textures of all flats of a scene, at most: as [`Flat::resolution`] sizes them.
-pub fn texels(scene: &Scene, across: usize, isovalues: usize) -> usize {
+/// Texels of the textures of all flats of a scene, at most: as [`Flat::resolution`] sizes them, `across` of each.
+pub fn texels(scene: &Scene, across: impl Fn(&Flat) -> usize, isovalues: usize) -> usize {
     let flats = (0..count(scene)).filter_map(|n| flat(scene, n));
-    flats.map(|f| f.resolution(across, isovalues).iter().product::<usize>()).sum()
+    flats.map(|f| f.resolution(across(&f), isovalues).iter().product::<usize>()).sum()
 }
 
 #[cfg(test)]

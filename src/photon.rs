@@ -164,7 +164,8 @@ pub struct PhotonSettings {
     pub max_bounces: u16,
     /// Seed of the run.
     pub seed: u64,
-    /// Emit all photons at this isovalue instead of over the whole sweep: the ordinary 3D photon map of one level set.
+    /// Emit the photons of luminaires at this isovalue instead of over the whole sweep: the ordinary 3D photon map of
+    /// one level set. Level sets that emit are not for it: theirs come from all of the sweep.
     pub fixed_isovalue: Option<f32>,
 }
 

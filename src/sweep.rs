@@ -49,6 +49,7 @@ use crate::flattened::Side;
 use crate::isa::Isa;
 use crate::scene::{Boundary, Scene};
 use flats::Flats;
+pub use flats::texels;
 use glam::DVec3;
 use grid::Geometry;
 use planes::Spare;

@@ -328,6 +328,35 @@ fn axes_caps_and_sides_are_where_render_has_them() {
     compare(dir, &program, &views, "");
 }
 
+/// Samples that are not finite were above every isovalue: their borders were drawn as surfaces, and as caps.
+#[test]
+fn gaps_are_open_where_render_has_them() {
+    let Some(program) = chromium() else { return };
+    let lattice = Lattice::aligned([25; 3], DVec3::ZERO, DVec3::ONE).unwrap();
+    for (names, boundary, gap) in [
+        (["shell", "shell-local"], "open", 3),
+        (["slab", "slab-local"], "open", 9),
+        (["capped", "capped-local"], "capped", 3),
+    ] {
+        let dir = tempfile::tempdir().unwrap();
+        let dir = dir.path();
+        let samples = (0..lattice.len()).map(|o| {
+            let p = DVec3::from_array(lattice.ijk(o).map(|i| i as f64));
+            if p.y < f64::from(gap) { f64::NAN } else { 1.0 - (p / 12.0 - 1.0).length() }
+        });
+        let volume = Volume::new("ball", lattice.clone(), Samples::F64(samples.collect())).unwrap();
+        volume.write(dir.join("b.nrrd")).unwrap();
+        let bake = ["bake", "b.nrrd", "--isovalues", "-0.4", "0.9", "-o", "out.vti", "--margin", "0.1"];
+        isolume(dir, &[&bake[..], &QUICK, &["--boundary", boundary]].concat());
+        let view = |name, shading: &str, extra: &str| View {
+            name,
+            page: format!("{{ iso: {}, shading: '{shading}' }}", (-0.2 + 0.4) / 1.3),
+            render: words(&format!("--isovalue -0.2 {extra}")),
+        };
+        compare(dir, &program, &[view(names[0], "global", ""), view(names[1], "local", "--local")], "");
+    }
+}
+
 #[test]
 fn a_file_needs_no_server_and_writes_nothing_to_the_console() {
     let Some(program) = chromium() else { return };

@@ -2,7 +2,7 @@
 //! grid's points.
 
 use glam::DVec3;
-use isolume::bake::{Bake, BakeOptions, BakeSettings, Engine, bake};
+use isolume::bake::{Bake, BakeOptions, BakeSettings, Engine, Preset, bake};
 use isolume::direct::Receiver;
 use isolume::embree::{Device, GraphTracer};
 use isolume::field::{Field, Sweep};
@@ -207,4 +207,37 @@ fn contacts_beside_a_hole_keep_their_light() {
         println!("(0, {j}, {k}): {found} beside a hole, {expected} without");
         assert!(found > 0.1 * expected && expected > 0.0, "(0, {j}, {k}): {found}, {expected}");
     }
+}
+
+/// A tube 35 times as long as wide, by the preview, whose walls have 32 texels along their longer edges: from texel to
+/// texel light walked into the dark ends.
+#[test]
+fn light_does_not_walk_along_narrow_tubes() {
+    let lattice = Lattice::aligned([5, 175, 5], DVec3::ZERO, DVec3::ONE).unwrap();
+    let samples = (0..lattice.len()).map(|o| {
+        let x = DVec3::from_array(lattice.ijk(o).map(|x| x as f64)) / lattice.far();
+        (-(x - DVec3::new(0.45, 0.5, 0.4)).length_squared() / 0.125).exp()
+    });
+    let volume = Volume::new("tube", lattice.clone(), Samples::F64(samples.collect())).unwrap();
+    let field = Field::new(&volume, Sweep::new(0.02, 0.8).unwrap()).unwrap();
+    let walls = cornell_box(&lattice, 0.0).unwrap();
+    let scene = Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap();
+    let options = BakeOptions { preset: Some(Preset::Preview), engine: Some(Engine::Sweep), ..BakeOptions::default() };
+    let device = Device::new(0).unwrap();
+    let baked = bake(&scene, &BakeSettings::new(&options, &scene).unwrap(), &device, Progress::Quiet).unwrap();
+    let tracer = GraphTracer::new(&device, &scene).unwrap();
+    let (side, grid) = &baked.sides[0];
+    let mut sections = [[0.0; 2]; 12];
+    for o in (0..lattice.len()).filter(|&o| grid.mask[o] == Mask::Valid) {
+        let p = DVec3::from_array(lattice.ijk(o).map(|x| x as f64));
+        let Some(r) = receiver(&scene, p, scene.field.samples()[o], *side) else { continue };
+        let away = ((p.y - 87.0).abs() / 87.0 * 12.0).min(11.0) as usize;
+        sections[away][0] += PathTracer::new(&scene, &tracer).outgoing(&r, 256, (3, o as u64)).y;
+        sections[away][1] += f64::from(grid.radiance[o][1]);
+    }
+    let ratios = sections.map(|[exact, got]| got / exact);
+    println!("{} bounces, {sections:?}, {ratios:?}", baked.report.sweep_bounces);
+    assert!((ratios[0] - 1.0).abs() < 0.12, "below the luminaire: {ratios:?}");
+    // Light falls to a hundred thousandth of that; 11 to 22 times as much once.
+    assert!(ratios[1..7].iter().all(|r| (0.5..2.0).contains(r)), "beside it: {ratios:?}");
 }

@@ -255,7 +255,11 @@ impl Parts {
             all_masks.push(masks);
         }
         let levels = Levels::new(members.iter().zip(&all_masks).map(|(m, masks)| (&*m.field, &masks[..])));
-        let texels = flat::texels(scene, settings.wall_resolution, settings.wall_isovalues) as u64;
+        let across = settings.wall_resolution;
+        let texels = match settings.engine {
+            Engine::Sweep => sweep::texels(scene, across, settings.wall_isovalues),
+            Engine::Photon => flat::texels(scene, |_| across, settings.wall_isovalues),
+        } as u64;
         let sides = sweep::swept_sides(scene).len() as u64;
         let settling = SETTLING_SIDE + if sweep::bright(scene) { LEVEL_SIDE } else { 0 };
         let summed = 2 * stored * SPREAD_SIDE + sides * settling.max(2 * SUMMED_SIDE);

@@ -91,7 +91,7 @@ pub struct BakeOptions {
     /// options that are its own)
     #[arg(long)]
     pub engine: Option<Engine>,
-    /// Sweep engine: directions per pass and replicate (a power of two)
+    /// Sweep engine: directions per pass and replicate (a power of two, 8 or more)
     #[arg(long, value_name = "N")]
     pub directions: Option<usize>,
     /// Sweep engine: points per luminaire and replicate (a power of two)
@@ -406,10 +406,14 @@ impl BakeSettings {
         let checks = [
             (
                 "directions",
-                settings.directions.is_power_of_two() && settings.directions >= 8,
-                "a power of two, 8 or more",
+                settings.directions.is_power_of_two() && (8..=1 << 20).contains(&settings.directions),
+                "a power of two, 8 to 1048576",
             ),
-            ("light-points", settings.light_points.is_power_of_two(), "a power of two"),
+            (
+                "light-points",
+                settings.light_points.is_power_of_two() && settings.light_points <= 1 << 16,
+                "a power of two, at most 65536",
+            ),
             ("samples", settings.samples != Some(0), "at least 1"),
             ("photons-per-estimate", (2..=4096).contains(&settings.photons_per_estimate), "2 to 4096"),
             ("neighbours", (1..=1024).contains(&settings.neighbours), "1 to 1024"),
@@ -466,6 +470,19 @@ impl BakeSettings {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// More directions than 32 bits count were none at all.
+    #[test]
+    fn directions_and_points_have_a_most() {
+        let fails = |directions, light_points| {
+            let o =
+                BakeOptions { directions: Some(directions), light_points: Some(light_points), ..Default::default() };
+            BakeSettings::with_engine(&o, Engine::Sweep).err().map(|e| e.to_string())
+        };
+        assert_eq!(fails(1 << 20, 1 << 16), None);
+        assert!(fails(1 << 32, 64).is_some_and(|e| e.contains("directions: must be a power of two, 8 to 1048576")));
+        assert!(fails(64, 1 << 33).is_some_and(|e| e.contains("light-points: must be a power of two, at most 65536")));
+    }
 
     #[test]
     fn options_without_effect_are_named() {

@@ -11,6 +11,7 @@ use crate::render::Camera;
 use crate::scene::Scene;
 use crate::scene_file::{Inputs, SceneOptions};
 use crate::surface_mesh::{SurfaceMesh, unit_isovalue};
+use glam::DVec3;
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -84,6 +85,12 @@ impl ReferenceArgs {
         baked.map_or(Ok(()), |b| b.whole()).map_err(|e| e.in_file(&self.input))?;
         // Alone, if the scene's volumes give each other no light.
         let scene = scene.lit(scene.number());
+        // Emitting level sets send their photons from all of the sweep.
+        if self.integrator == Integrator::Photon && scene.members().iter().any(|m| m.surface.emission != DVec3::ZERO) {
+            return Err(Error::NotSupported(
+                "--integrator photon: isosurfaces that emit light are for --integrator path".into(),
+            ));
+        }
         let isovalue = unit_isovalue(&scene.field, self.isovalue)?;
         let settings = ReferenceSettings {
             integrator: self.integrator,

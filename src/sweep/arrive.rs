@@ -18,6 +18,10 @@ const LINES_PER_TEXEL: f64 = 1.0;
 /// Of lines near Ω at least one in so many reports, however large texels are: what is seen there is not even.
 const MOST_STRIDE: f64 = 8.0;
 
+/// About so many lines of a family report at most, however small one texel of many may be: what they bring is kept
+/// until it is told to the walls.
+const MOST_REPORTING: f64 = 131_072.0;
+
 /// A line that meets Ω: its pack, B of this side and the other, its lane, and where it enters and leaves.
 type Samples<'a> = (&'a Pack, [&'a [Half4]; 2], usize, [f64; 2]);
 
@@ -126,12 +130,16 @@ impl<'a> Walls<'a> {
         let area = shear.area / pass.scene.lattice().unit().powi(2);
         let line = 4.0 * std::f64::consts::PI / (2 * families) as f64 * area;
         let every = |stride: f64| Reporting::new(if none { 0 } else { stride as isize }, phase, line);
+        let (rows, columns) = (range(1), range(0));
+        let [across, along] = [rows, columns].map(|(least, most)| (most - least + 1) as f64);
+        let least = (across * along / MOST_REPORTING).sqrt().ceil();
+        let lines = lines.max(least);
         Self {
             plan,
             ends,
             flats,
-            rows: if margin && !none { range(1) } else { (isize::MAX, isize::MIN) },
-            columns: range(0),
+            rows: if margin && !none { rows } else { (isize::MAX, isize::MIN) },
+            columns,
             near: every(lines.min(MOST_STRIDE)),
             // Two lines per texel edge where texels are large: one has 2 % more error.
             past: every(lines.min(MOST_STRIDE.max(0.5 * lines).min(f64::from(1 << 20)))),

@@ -223,7 +223,10 @@ fn walls(
             if e == 0.0 {
                 return;
             }
-            let stream = ((part.replicate as u64) << 32 | u64::from(number)) ^ (id as u64) << 48 ^ (texel as u64) << 16;
+            // Number, low half of the texel, replicate, high half, flat: fields of their own, but for flats above 2¹⁵.
+            let texel = texel as u64;
+            let stream = ((part.replicate as u64) << 32 | u64::from(number)) ^ (id as u64) << 48;
+            let stream = stream ^ (texel & 0xffff) << 16 ^ (texel >> 16) << 40;
             let mut rng = Rng::stream(part.seed, Stage::Sweep, stream ^ 1 << 63);
             // Number of isovalue texels at or below h.
             let below = |h: f32| ((h * nc as f32 + 0.5).floor().max(0.0) as usize).min(nc);

@@ -2,6 +2,7 @@
 
 #![allow(clippy::needless_range_loop, reason = "a channel indexes several planes at once")]
 
+use super::gather::local_bounds;
 use super::half::{Half4, encode};
 use crate::flat::{self, FlatTexture};
 use crate::scene::{Boundary, Scene};
@@ -130,8 +131,28 @@ pub(super) struct Flats {
     pub packed: Vec<Half4>,
 }
 
+/// Texels of walls are at most this share of the scene's narrowest extent: light that bounces between walls less than
+/// two texels apart walks along them from texel to texel.
+const NARROW: f64 = 1.0 / 16.0;
+
+/// How long a texel of a scene's walls may be, but for walls too large to hold as many: no shorter than a voxel.
+fn narrow(scene: &Scene) -> f64 {
+    let lattice = scene.lattice();
+    let [lo, hi] = local_bounds(scene);
+    let inverse = lattice.axes().inverse();
+    let width = |a: usize| (hi[a] - lo[a]) / inverse.row(a).length();
+    (NARROW * (0..3).map(width).fold(f64::INFINITY, f64::min)).max(lattice.cell_volume().cbrt())
+}
+
+/// Texels of all flats of a scene, at most.
+pub fn texels(scene: &Scene, across: usize, isovalues: usize) -> usize {
+    let narrow = narrow(scene);
+    flat::texels(scene, |flat| flat.across(across, narrow), isovalues)
+}
+
 impl Flats {
     pub(super) fn new(scene: &Scene, across: usize, isovalues: usize) -> Self {
+        let narrow = narrow(scene);
         // Black comes first.
         let mut next = isovalues;
         let textures = (0..flat::count(scene))
@@ -140,7 +161,7 @@ impl Flats {
                 if flat.albedo.black() {
                     return None;
                 }
-                let dims = flat.resolution(across, isovalues);
+                let dims = flat.resolution(flat.across(across, narrow), isovalues);
                 let texels = dims[0] * dims[1];
                 let n = 3 * texels * isovalues;
                 next += texels * isovalues;

@@ -10,6 +10,15 @@ uniform vec2 u_depth;
 uniform float u_iso, u_scale;
 uniform bool u_local;
 float value(vec3 p) { return texture(u_value, (p + 0.5) / u_dims).r; }
+
+// A cell that touches a sample that is not finite holds no surface.
+bool hole(vec3 p) {
+  ivec3 cell = clamp(ivec3(floor(p)), ivec3(0), ivec3(u_dims) - 2);
+  for (int i = 0; i < 8; ++i)
+    if (texelFetch(u_value, cell + ivec3(i & 1, i >> 1 & 1, i >> 2), 0).r > 5e4) return true;
+  return false;
+}
+
 bool cut(vec3 x) { return dot(u_clip.xyz, x) > u_clip.w; }
 vec4 display(vec3 linear) {
   vec3 c = clamp(linear * u_gain, 0.0, 1.0);
@@ -37,14 +46,6 @@ uniform ivec3 u_block_count;
 uniform int u_most_steps;
 uniform bool u_capped, u_both, u_outside_lower, u_clipped;
 
-// A cell that touches a sample that is not finite holds no surface.
-bool hole(vec3 p) {
-  ivec3 cell = clamp(ivec3(floor(p)), ivec3(0), ivec3(u_dims) - 2);
-  for (int i = 0; i < 8; ++i)
-    if (texelFetch(u_value, cell + ivec3(i & 1, i >> 1 & 1, i >> 2), 0).r > 5e4) return true;
-  return false;
-}
-
 vec3 shade(vec3 p, bool lower, vec3 direction) {
   bool outside = lower == u_outside_lower;
   bool stored = outside || u_both;
@@ -60,7 +61,9 @@ vec3 shade(vec3 p, bool lower, vec3 direction) {
     vec3 e = vec3(0.0);
     e[a] = 1.0;
     vec3 high = min(p + e, far), low = max(p - e, vec3(0.0));
-    g[a] = (value(high) - value(low)) / (high[a] - low[a]);
+    if (hole(high)) high = p;
+    if (hole(low)) low = p;
+    g[a] = (value(high) - value(low)) / max(high[a] - low[a], 1e-3);
   }
   vec3 normal = normalize(transpose(u_inverse) * g + vec3(0.0, 0.0, 1e-20));
   return u_albedo * headlight(dot(normal, direction)) * (u_local ? 1.0 : 0.3);
@@ -85,7 +88,7 @@ void main() {
   float stride = 0.5 / max(length3.x, max(length3.y, length3.z));
   float t = t0, found = -1.0, leaves_block = t0;
   bool inside = value(o + d * t) >= u_iso, lower = true, empty = false;
-  if (u_capped && inside && faced) discard; // a cap, drawn as a wall
+  if (u_capped && inside && faced && !hole(o + d * (t + 1e-3 * stride))) discard; // a cap, drawn as a wall
   for (int i = 0; i < u_most_steps; ++i) {
     if (t >= leaves_block) {
       ivec3 block = clamp(ivec3((o + d * (t + 0.01 * stride)) / 8.0), ivec3(0), u_block_count - 1);
@@ -101,7 +104,7 @@ void main() {
         float middle = 0.5 * (low + high);
         if ((value(o + d * middle) >= u_iso) != inside) high = middle; else low = middle;
       }
-      if (!hole(o + d * high)) { found = high; lower = !inside; break; }
+      if (!hole(o + d * high) && !hole(o + d * low)) { found = high; lower = !inside; break; }
       inside = !inside;
     }
     if (next >= t1) break;
@@ -109,9 +112,10 @@ void main() {
   }
   if (found >= 0.0) {
     colour = display(shade(clamp(o + d * found, vec3(0.0), far), lower, direction));
-  } else if (u_capped && inside && leaves) {
-    found = t1; // a cap from within
-    colour = vec4(0.0, 0.0, 0.0, 1.0);
+  } else if (u_capped && inside && leaves && !hole(o + d * (t1 - 1e-3 * stride))) {
+    found = t1; // a cap from within, which holds no light
+    vec3 normal = normalize(transpose(u_inverse) * vec3(equal(far3, vec3(t1))));
+    colour = u_local ? display(u_albedo * headlight(dot(normal, direction))) : vec4(0.0, 0.0, 0.0, 1.0);
   } else discard;
   float z = found * dot(direction, u_forward);
   gl_FragDepth = clamp(0.5 * (u_depth.x + u_depth.y / z) + 0.5, 0.0, 1.0);
@@ -156,7 +160,8 @@ void main() {
   bool emits = any(greaterThan(u_emission, vec3(0.0)));
   if (u_cap) {
     vec3 p = u_inverse * (v_position - u_origin);
-    if (facing > 0.0 || cut(v_position) || value(clamp(p, vec3(0.0), u_dims - 1.0)) < u_iso) discard;
+    p = clamp(p, vec3(0.0), u_dims - 1.0);
+    if (facing > 0.0 || cut(v_position) || value(p) < u_iso || hole(p)) discard;
   } else if (facing > 0.0) {
     if (!u_opaque_back) discard; // walls are seen from inside only, what stands between from both by two polygons
     colour = vec4(0.0, 0.0, 0.0, 1.0);

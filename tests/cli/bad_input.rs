@@ -79,6 +79,18 @@ fn bad_input_is_one_clear_line_and_leaves_nothing() {
     refused(dir, &["bake", "s.toml", "-o", "out.vti"], &["s.toml:5", "albdo", "albedo"]);
 }
 
+/// Its photons would come from all isovalues of the sweep.
+#[test]
+fn photons_of_one_isosurface_that_emits_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "12", "-o", "b.nrrd", "-q"]);
+    let reference =
+        ["reference", "b.nrrd", "--isovalue", "47", "-o", "r.ply", "-q", "--emission", "1", "--vertices", "9"];
+    refused(dir, &[&reference[..], &["--integrator", "photon"]].concat(), &["--integrator path", "emit"]);
+    ok(dir, &[&reference[..], &["--samples", "16"]].concat());
+}
+
 /// The surfaces are there, but between the grid's points; a volume without any is another matter.
 #[test]
 fn a_grid_that_is_too_coarse_is_told_from_a_constant_volume() {
