@@ -227,7 +227,7 @@ mod tests {
     use crate::volume::{Samples, Volume};
 
     /// Bumps whose values are small: isovalues that four digits after the point do not tell apart.
-    fn subject(albedo: f64) -> Subject {
+    pub(super) fn subject(albedo: f64) -> Subject {
         let bumps = Generator::from_name("bumps").unwrap().sample([8; 3]).unwrap();
         let values = (0..bumps.lattice.len()).map(|o| 1e-6 * bumps.value(o) as f32).collect();
         let volume = Volume::new("small", bumps.lattice, Samples::F32(values)).unwrap();

@@ -145,11 +145,12 @@ fn grid_of(subject: &Subject, count: u64) -> Result<GridSize> {
 /// Whether an isovalue is among those that are read off the table rather than the plot.
 fn is_in_table(subject: &Subject, isovalue: f64) -> bool {
     // The same numbers as `isovalues` makes: those of narrow sweeps lie closer together than any tolerance.
-    [35.0, 47.0, 80.0].iter().any(|c| subject.at((c - 3.6) / 91.4) == isovalue)
+    let fixed = [35.0, 47.0, 80.0].map(|c| subject.at((c - 3.6) / 91.4));
+    isovalue == subject.main_isovalue() || fixed.contains(&isovalue)
 }
 
-/// Level sets of strategy 1, the middles between them, 35, 47 and 80 of [3.6, 95], and a regular comb, where there is a
-/// surface; source units, increasing.
+/// Level sets of strategy 1, the middles between them, 35, 47 and 80 of [3.6, 95], a regular comb, and the isovalue
+/// that is reported first, where there is a surface; source units, increasing.
 ///
 /// # Errors
 /// `Invalid` if there is none.
@@ -165,7 +166,10 @@ fn isovalues(study: &Study, subject: &Subject) -> Result<Vec<f64>> {
     fractions.sort_by(f64::total_cmp);
     fractions.dedup_by(|a, b| (*a - *b).abs() < 0.008);
     // Elsewhere no row ever says that a bake was compared.
-    let all: Vec<f64> = fractions.into_iter().map(|f| subject.at(f)).collect();
+    let mut all: Vec<f64> = fractions.into_iter().map(|f| subject.at(f)).collect();
+    all.push(subject.main_isovalue());
+    all.sort_by(f64::total_cmp);
+    all.dedup();
     subject.with_surfaces(&all)
 }
 
@@ -174,9 +178,18 @@ fn level_sets() -> Vec<f64> {
     (-2..=3).map(|k| (39.0 + 17.7 * f64::from(k) - 3.6) / 91.4).filter(|s| (0.0..=1.0).contains(s)).collect()
 }
 
+/// A number for a sentence, without the last digits of rounding.
+fn shortly(x: f64) -> String {
+    let rounded: f64 = format!("{x:.6e}").parse().unwrap_or(x);
+    rounded.to_string()
+}
+
 fn summarise(study: &Study, subjects: &[Subject], table: &Table, counts: &[u64]) -> Result<()> {
-    let mut notes = String::from("RMS over the isovalues | at 47.0 of [3.6, 95]:\n\n");
+    let mut notes = String::from("RMS over the isovalues | at the isovalue that is reported first:\n\n");
     for subject in subjects {
+        let sweep = subject.scene.field.sweep();
+        let (c, lo, hi) = (shortly(subject.main_isovalue()), shortly(sweep.lo()), shortly(sweep.hi()));
+        notes += &format!("* {}: at {c} of [{lo}, {hi}]\n", subject.name);
         let main = exactly(subject.main_isovalue());
         let mut series = Vec::new();
         for &count in counts {
@@ -193,8 +206,9 @@ fn summarise(study: &Study, subjects: &[Subject], table: &Table, counts: &[u64])
                     rows.iter().map(|r| (table.number(r, "isovalue"), table.number(r, "percent_rms"))).collect();
                 points.sort_by(|a, b| a.0.total_cmp(&b.0));
                 let rms = (points.iter().map(|p| p.1 * p.1).sum::<f64>() / points.len() as f64).sqrt();
-                let at_main = rows.iter().find(|r| r[3] == main).map_or(f64::NAN, |r| table.number(r, "percent_rms"));
-                notes += &format!("* {}, {count} samples, {name}: {rms:.3} | {at_main:.3}\n", subject.name);
+                let at_main = rows.iter().find(|r| r[3] == main);
+                let at_main = at_main.map_or("no surface".into(), |r| format!("{:.3}", table.number(r, "percent_rms")));
+                notes += &format!("* {}, {count} samples, {name}: {rms:.3} | {at_main}\n", subject.name);
                 series.push(Series {
                     name: format!("{name} {count:.0e}", count = count as f64),
                     points,
@@ -219,4 +233,40 @@ fn summarise(study: &Study, subjects: &[Subject], table: &Table, counts: &[u64])
         provenance(study)
     );
     table.write_markdown(&study.folder.join("strategies.md"), "Sampling strategies", &notes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::embree::Device;
+    use crate::progress::Progress;
+    use crate::study::tests::subject;
+
+    /// A sweep [3.6e-6, 95e-6] whose main isovalue is none of those that all subjects share, though near one.
+    #[test]
+    fn the_isovalue_of_a_subject_is_compared_and_reported() {
+        let dir = tempfile::tempdir().unwrap();
+        let study = Study::new(dir.path().into(), Device::new(1).unwrap(), Progress::Quiet, true).unwrap();
+        let mut subject = subject(0.5);
+        let shared = isovalues(&study, &subject).unwrap();
+        assert_eq!(shared.iter().filter(|&&c| c == subject.main_isovalue()).count(), 1, "{shared:?}");
+        let main = subject.main_isovalue() + 1e-8;
+        subject.isovalue = Some(main);
+        let all = isovalues(&study, &subject).unwrap();
+        assert_eq!(all.len(), shared.len() + 1);
+        assert!(all.contains(&main) && all.is_sorted() && is_in_table(&subject, main), "{all:?}");
+
+        let mut table = Table::open(dir.path().join("t.csv"), &COLUMNS, 4).unwrap();
+        for (c, error) in [(all[0], "3"), (main, "4")] {
+            let mut row: Vec<String> = ["s", "20000", "level-set"].map(str::to_owned).to_vec();
+            row.extend([exactly(c), "1".into(), error.into()]);
+            row.resize(COLUMNS.len(), "0".into());
+            table.push(row).unwrap();
+        }
+        summarise(&study, &[subject], &table, &[20_000]).unwrap();
+        let notes = std::fs::read_to_string(dir.path().join("strategies.md")).unwrap();
+        assert!(notes.contains("s: at 0.00004701 of [0.0000036, 0.000095]"), "{notes}");
+        assert!(notes.contains("s, 20000 samples, level-set: 3.536 | 4.000"), "√12.5 and what stands at it: {notes}");
+        assert_eq!(shortly(20.000_000_000_000_004), "20");
+    }
 }
