@@ -211,9 +211,8 @@ pub fn bake_fields(
     let digest = digest(&job(scene, settings));
     let job = |number: u32| -> Result<Job> {
         let scene = scene.lit(number as usize);
-        let named = |e: Error| if scene.name.is_empty() { e } else { e.in_file(format!("volume '{}'", scene.name)) };
-        let lattice = settings.grid.lattice(scene.lattice()).map_err(named)?;
-        let masks = masks_of(&scene, &lattice).map_err(named)?;
+        let lattice = grid_of(&scene, settings)?;
+        let masks = masks_of(&scene, &lattice)?;
         Ok(Job { number, scene, lattice, masks })
     };
     let jobs = (0..).take(scene.fields()).map(job).collect::<Result<Vec<_>>>()?;
@@ -232,10 +231,19 @@ pub fn bake_fields(
     Ok(bakes)
 }
 
+/// An error of one of several volumes, by name.
+fn named(scene: &Scene, e: Error) -> Error {
+    if scene.name.is_empty() { e } else { e.in_file(format!("volume '{}'", scene.name)) }
+}
+
+fn grid_of(scene: &Scene, settings: &BakeSettings) -> Result<Lattice> {
+    settings.grid.lattice(scene.lattice()).map_err(|e| named(scene, e))
+}
+
 /// The masks of a grid's lattice, some of which holds something.
 fn masks_of(scene: &Scene, grid: &Lattice) -> Result<Vec<Mask>> {
     let masks = masks(&scene.field, grid);
-    if nothing_in(&masks) { Err(Error::Invalid(nothing_found(scene, grid))) } else { Ok(masks) }
+    if nothing_in(&masks) { Err(named(scene, Error::Invalid(nothing_found(scene, grid)))) } else { Ok(masks) }
 }
 
 fn nothing_in(masks: &[Mask]) -> bool {
@@ -268,7 +276,7 @@ pub fn supported(scene: &Scene, settings: &BakeSettings) -> Result<()> {
     // Grids as fine as the volume hold what it holds, and are looked at when their light is computed.
     (0..scene.fields()).try_for_each(|number| {
         let scene = scene.lit(number);
-        let lattice = settings.grid.lattice(scene.lattice())?;
+        let lattice = grid_of(&scene, settings)?;
         let coarse = lattice.len() < scene.lattice().len();
         if coarse { masks_of(&scene, &lattice).map(drop) } else { Ok(()) }
     })

@@ -258,15 +258,34 @@ impl FlatTexture {
     }
 }
 
-/// Texels of the textures of all flats of a scene, at most: as [`Flat::resolution`] sizes them, `across` of each.
-pub fn texels(scene: &Scene, across: impl Fn(&Flat) -> usize, isovalues: usize) -> usize {
+/// Texels of the textures of all flats of a scene, at most: as [`Flat::resolution`] sizes them.
+pub fn texels(scene: &Scene, across: usize, isovalues: usize) -> usize {
     let flats = (0..count(scene)).filter_map(|n| flat(scene, n));
-    flats.map(|f| f.resolution(across(&f), isovalues).iter().product::<usize>()).sum()
+    flats.map(|f| f.resolution(across, isovalues).iter().product::<usize>()).sum()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn long_walls_have_more_texels_across() {
+        let wall = |u: f64, v: f64, span: f64| Flat {
+            corner: DVec3::ZERO,
+            edges: [u * DVec3::X, v * DVec3::Y],
+            normal: DVec3::Z,
+            albedo: DVec3::ONE.into(),
+            departure: Departure::Polygon(0),
+            outline: None,
+            span,
+        };
+        assert_eq!(wall(10.0, 10.0, 10.0).across(32, 0.1), 32, "no more than a square wall has");
+        assert_eq!(wall(10.0, 40.0, 40.0).across(32, 2.0), 32, "short enough as they are");
+        assert_eq!(wall(10.0, 40.0, 40.0).across(32, 1.0), 40);
+        let most = wall(10.0, 40.0, 40.0);
+        assert_eq!((most.across(32, 0.1), most.resolution(64, 1)), (64, [16, 64, 1]), "32² texels");
+        assert_eq!(wall(10.0, 40.0, 100.0).across(32, 1.0), 32, "context geometry");
+    }
 
     #[test]
     fn lookup_reproduces_linear_functions_between_centres() {

@@ -258,12 +258,13 @@ impl Parts {
         let across = settings.wall_resolution;
         let texels = match settings.engine {
             Engine::Sweep => sweep::texels(scene, across, settings.wall_isovalues),
-            Engine::Photon => flat::texels(scene, |_| across, settings.wall_isovalues),
+            Engine::Photon => flat::texels(scene, across, settings.wall_isovalues),
         } as u64;
         let sides = sweep::swept_sides(scene).len() as u64;
         let settling = SETTLING_SIDE + if sweep::bright(scene) { LEVEL_SIDE } else { 0 };
         let summed = 2 * stored * SPREAD_SIDE + sides * settling.max(2 * SUMMED_SIDE);
-        let swept = points * (SWEPT + sides * (SWEPT_SIDE + KEPT_SIDE) + summed);
+        let reports = sweep::reports(scene, across, settings.wall_isovalues) as u64;
+        let swept = points * (SWEPT + sides * (SWEPT_SIDE + KEPT_SIDE) + summed) + reports;
         let ([landings, lower, higher], gather) = match settings.engine {
             Engine::Photon => (landings(scene, settings, device)?, settings.gather_rays > 0),
             Engine::Sweep => ([0.0; 3], false),

@@ -194,9 +194,8 @@ impl BakeOptions {
         }
     }
 
-    /// Options of the photon engine, by name, and whether they are set. Sweeps take a part of the rays that the last
-    /// three ask for, where they end.
-    fn of_photons(&self) -> [(&'static str, bool); 13] {
+    /// Options that mean nothing to sweeps, by name, and whether they are set.
+    fn of_photons(&self) -> [(&'static str, bool); 10] {
         [
             ("photons", self.photons.is_some()),
             ("bounces", self.bounces.is_some()),
@@ -208,6 +207,12 @@ impl BakeOptions {
             ("neighbours", self.neighbours.is_some()),
             ("interpolation", self.interpolation.is_some()),
             ("bands", self.bands.is_some()),
+        ]
+    }
+
+    /// Options of exact rays, of which sweeps cast a few where they end, and whether they are set.
+    fn of_rays(&self) -> [(&'static str, bool); 3] {
+        [
             ("tau", self.tau.is_some()),
             ("shadow-rays", self.shadow_rays.is_some()),
             ("gather", self.gather_rays.is_some()),
@@ -230,7 +235,7 @@ impl BakeOptions {
         let smoothing = [("smoothing", self.smoothing == Some(true))];
         let (sweeps, photons) = (self.of_sweeps(), self.of_photons());
         let of: &[(&[(&str, bool)], &str)] = match (settings.engine, scattered) {
-            (Engine::Sweep, _) => &[(&photons[..10], "engine = \"sweep\"")],
+            (Engine::Sweep, _) => &[(&photons, "engine = \"sweep\"")],
             (Engine::Photon, true) => &[(&sweeps, "engine = \"photon\""), (&smoothing, "scattered samples")],
             (Engine::Photon, false) => &[
                 (&sweeps, "engine = \"photon\""),
@@ -246,18 +251,23 @@ impl BakeOptions {
         of.iter().filter_map(line).collect()
     }
 
+    /// The first options that are set and ask for photons and for sweeps.
+    fn asks_for(&self) -> [Option<&'static str>; 2] {
+        let first = |options: &[(&'static str, bool)]| options.iter().find(|o| o.1).map(|o| o.0);
+        [first(&self.of_photons()).or(first(&self.of_rays())), first(&self.of_sweeps())]
+    }
+
     /// Whether nothing that is set asks for one of the engines.
     pub fn leaves_engine(&self) -> bool {
-        let set = |o: &(&str, bool)| o.1;
-        self.engine.is_none() && !self.of_photons().iter().any(set) && !self.of_sweeps().iter().any(set)
+        self.engine.is_none() && self.asks_for() == [None; 2]
     }
 
     /// The engine for a scene: the one that is asked for; else sweeps, which are faster for the same error, unless
     /// options that only photons know are set, the scene cannot be swept, or sweeps would leave out what its surfaces
     /// reflect.
     fn engine(&self, scene: &Scene) -> Result<Engine> {
-        let first = |options: &[(&'static str, bool)]| options.iter().find(|o| o.1).map(|o| o.0);
-        match (self.engine, first(&self.of_photons()), first(&self.of_sweeps())) {
+        let [photons, sweeps] = self.asks_for();
+        match (self.engine, photons, sweeps) {
             (Some(engine), ..) => Ok(engine),
             (None, Some(photons), Some(sweeps)) => Err(Error::Invalid(format!(
                 "{photons} is an option of the photon engine, {sweeps} of the sweep engine: say which with engine"

@@ -2,13 +2,14 @@
 //! running maximum of h.
 
 use super::ends::Ends;
-use super::flats::{Arrivals, Flats, Stop, fill_column};
+use super::flats::{Arrivals, Flats, Stop, fill_column, shapes, sinks};
 use super::gaps::Crossing;
 use super::gather::{Pass, local_bounds};
 use super::half::{Half4, colour, decode};
 use super::pack::{LANES, OUTSIDE, Pack, Plan};
 use crate::flattened::Side;
 use crate::rng::{Rng, Stage};
+use crate::scene::Scene;
 use glam::DVec3;
 
 /// Lines per texel edge that report to walls. Each reports to four texels, so that one reaches every texel from every
@@ -18,9 +19,35 @@ const LINES_PER_TEXEL: f64 = 1.0;
 /// Of lines near Ω at least one in so many reports, however large texels are: what is seen there is not even.
 const MOST_STRIDE: f64 = 8.0;
 
-/// About so many lines of a family report at most, however small one texel of many may be: what they bring is kept
+/// About so many lines of a family report at most for the sake of texels smaller than others: what they bring is kept
 /// until it is told to the walls.
 const MOST_REPORTING: f64 = 131_072.0;
+
+/// Strides, in lines, of those that report near Ω and past it, to texels of these areas, of a family of so many lines.
+fn strides(scene: &Scene, sinks: impl Iterator<Item = f64>, family: f64) -> [f64; 2] {
+    let voxel = LINES_PER_TEXEL * scene.lattice().spacing().max_element();
+    let lines = |area: f64| (area.sqrt() / voxel).floor().max(1.0);
+    let (least, most) = sinks.fold((f64::INFINITY, 0.0f64), |(lo, hi), area| (lo.min(area), hi.max(area)));
+    let lines = lines(least).max((family / MOST_REPORTING).sqrt().ceil().min(lines(most)));
+    // Two lines per texel edge where texels are large: one has 2 % more error.
+    [lines.min(MOST_STRIDE), lines.min(MOST_STRIDE.max(0.5 * lines).min(f64::from(1 << 20)))]
+}
+
+/// Bytes of what the lines of two families bring to walls of so many texels across, about at most: one is told to the
+/// walls while the next is walked.
+pub(crate) fn reports(scene: &Scene, across: usize, isovalues: usize) -> f64 {
+    let [lo, hi] = local_bounds(scene);
+    let far = scene.lattice().far();
+    // Lines through a box, along the axis that gives most, at slopes of a half.
+    let lines = |e: DVec3, c: usize| (e[(c + 1) % 3] + 0.5 * e[c]) * (e[(c + 2) % 3] + 0.5 * e[c]);
+    let [volume, all] = [far, hi - lo].map(|e| (0..3).map(|c| lines(e + 1.0, c)).fold(0.0, f64::max));
+    let areas = || {
+        shapes(scene, across).flatten().map(|(flat, dims)| flat.area() / sinks(dims).iter().product::<usize>() as f64)
+    };
+    let [near, past] = strides(scene, areas(), all);
+    let fronts = areas().count().min(2) as f64;
+    2.0 * fronts * (volume / (near * near) + (all - volume) / (past * past)) * (12 * isovalues + 40) as f64
+}
 
 /// A line that meets Ω: its pack, B of this side and the other, its lane, and where it enters and leaves.
 type Samples<'a> = (&'a Pack, [&'a [Half4]; 2], usize, [f64; 2]);
@@ -119,9 +146,6 @@ impl<'a> Walls<'a> {
             let offset = shear.offset[a];
             ((lo[axes[a]] - most - offset).floor() as isize, (hi[axes[a]] - least - offset).ceil() as isize)
         };
-        let side_of_texel = flats.textures.iter().flatten().map(|t| t.sink_area.sqrt()).fold(f64::INFINITY, f64::min);
-        let spacing = pass.scene.lattice().spacing().max_element();
-        let lines = (side_of_texel / (LINES_PER_TEXEL * spacing)).floor().max(1.0);
         let mut rng =
             Rng::stream(shear.offset[0].to_bits() ^ shear.offset[1].to_bits().rotate_left(32), Stage::Sweep, 0);
         let phase = [0, 1].map(|_| rng.unit());
@@ -132,17 +156,15 @@ impl<'a> Walls<'a> {
         let every = |stride: f64| Reporting::new(if none { 0 } else { stride as isize }, phase, line);
         let (rows, columns) = (range(1), range(0));
         let [across, along] = [rows, columns].map(|(least, most)| (most - least + 1) as f64);
-        let least = (across * along / MOST_REPORTING).sqrt().ceil();
-        let lines = lines.max(least);
+        let [near, past] = strides(pass.scene, flats.textures.iter().flatten().map(|t| t.sink_area), across * along);
         Self {
             plan,
             ends,
             flats,
             rows: if margin && !none { rows } else { (isize::MAX, isize::MIN) },
             columns,
-            near: every(lines.min(MOST_STRIDE)),
-            // Two lines per texel edge where texels are large: one has 2 % more error.
-            past: every(lines.min(MOST_STRIDE.max(0.5 * lines).min(f64::from(1 << 20)))),
+            near: every(near),
+            past: every(past),
             capped: super::flats::capped(pass.scene),
             primary: side == pass.primary,
             margin,
@@ -402,5 +424,63 @@ impl<'a> Walls<'a> {
                 });
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::{Field, Sweep};
+    use crate::polygon::Polygon;
+    use crate::scene::{Boundary, Surface, cornell_box};
+    use crate::volume::generate::Generator;
+
+    fn scene(walls: impl Fn(&Field) -> Vec<Polygon>) -> Scene {
+        let volume = Generator::from_name("bumps").and_then(|g| g.sample([24; 3])).unwrap();
+        let field = Field::new(&volume, Sweep::new(3.6, 95.0).unwrap()).unwrap();
+        let walls = walls(&field);
+        Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap()
+    }
+
+    /// A wide floor with a small triangle on it had lines report for the triangle's texels: 4 GB.
+    #[test]
+    fn small_texels_do_not_ask_all_of_a_wide_floor() {
+        let with = |crumb: bool| {
+            scene(|field| {
+                let far = 23.0 * field.lattice().spacing().x;
+                let floor = [[-60.0, -60.0], [60.0, -60.0], [60.0, 60.0], [-60.0, 60.0]];
+                let small = [[1.2, 0.5], [1.21, 0.5], [1.21, 0.51]];
+                let [x, y, z] = field.lattice().origin().to_array();
+                let flat = |name: &str, outline: &[[f64; 2]], height: f64, emission: f64| {
+                    let place = |p: &[f64; 2]| DVec3::new(x + far * p[0], y + far * p[1], z + far * height);
+                    let vertices = outline.iter().map(place).collect();
+                    let albedo = DVec3::splat(if emission > 0.0 { 0.0 } else { 0.6 });
+                    Polygon::new(name, vertices, albedo, DVec3::splat(emission)).unwrap()
+                };
+                let lamp = flat("lamp", &[[0.0, 0.0], [0.0, 1.0], [1.0, 1.0], [1.0, 0.0]], 3.0, 10.0);
+                let mut walls = vec![lamp, flat("floor", &floor, -0.5, 0.0)];
+                walls.extend(crumb.then(|| flat("crumb", &small, 0.5, 0.0)));
+                walls
+            })
+        };
+        let [without, crumb] = [false, true].map(|crumb| reports(&with(crumb), 32, 16));
+        assert!(without < 1e6, "{without:e}");
+        assert!((2e7..5e8).contains(&crumb), "{crumb:e}");
+    }
+
+    /// Where all texels are alike, all of their lines report.
+    #[test]
+    fn walls_of_one_fineness_keep_their_lines() {
+        let scene = scene(|field| cornell_box(field.lattice(), 0.0).unwrap());
+        let voxel = scene.lattice().spacing().max_element();
+        for texel in [0.4, 1.0, 3.5, 20.0] {
+            let area = (texel * voxel).powi(2);
+            let lines = texel.floor().max(1.0);
+            let [near, past] = strides(&scene, [area; 6].into_iter(), 1e9);
+            assert_eq!((near, past), (lines.min(8.0), lines.min(10.0)), "{texel}");
+        }
+        let voxels = |n: f64| (n * voxel).powi(2);
+        assert_eq!(strides(&scene, [voxels(1.0), voxels(40.5)].into_iter(), 1e8), [8.0, 14.0]);
+        assert_eq!(strides(&scene, [voxels(1.0), voxels(40.5)].into_iter(), 1e5), [1.0, 1.0]);
     }
 }

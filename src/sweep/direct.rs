@@ -186,6 +186,14 @@ impl Staircases {
     }
 }
 
+/// The random stream of a flat's texel for one luminaire (below 2¹⁶) and replicate (below 2⁸): of flats below 2¹⁵ and
+/// texels below 2²⁴ each has one of its own, which nodes do not use.
+fn stream(replicate: usize, luminaire: u32, flat: usize, texel: usize) -> u64 {
+    let [replicate, flat, texel] = [replicate, flat, texel].map(|n| n as u64);
+    let low = u64::from(luminaire) | (texel & 0xffff) << 16 | replicate << 32 | (texel >> 16) << 40;
+    low ^ flat << 48 ^ 1 << 63
+}
+
 /// Direct light of one luminaire on all flats: every texel looks from a point of its own along the segment to each
 /// luminaire point; it is lit at the isovalues above the greatest h there (and, inside solids, up to the least).
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the isovalues")]
@@ -223,11 +231,8 @@ fn walls(
             if e == 0.0 {
                 return;
             }
-            // Number, low half of the texel, replicate, high half, flat: fields of their own, but for flats above 2¹⁵.
-            let texel = texel as u64;
-            let stream = ((part.replicate as u64) << 32 | u64::from(number)) ^ (id as u64) << 48;
-            let stream = stream ^ (texel & 0xffff) << 16 ^ (texel >> 16) << 40;
-            let mut rng = Rng::stream(part.seed, Stage::Sweep, stream ^ 1 << 63);
+            let stream = stream(part.replicate, number, id, texel);
+            let mut rng = Rng::stream(part.seed, Stage::Sweep, stream);
             // Number of isovalue texels at or below h.
             let below = |h: f32| ((h * nc as f32 + 0.5).floor().max(0.0) as usize).min(nc);
             // Σ g of what begins at each isovalue texel on the lower side, and of what ends before it on the higher
@@ -288,6 +293,20 @@ fn walls(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn texels_have_streams_of_their_own() {
+        let all = [0, 1, 7].into_iter().flat_map(|replicate| {
+            [0, 1, 32_767].into_iter().flat_map(move |flat| {
+                let texels = [0, 1, 2, 65_535, 65_536, 65_537, 131_072, (1 << 22) - 1];
+                let of = move |texel| [0, 1, 300].map(|luminaire| stream(replicate, luminaire, flat, texel));
+                texels.into_iter().flat_map(of)
+            })
+        });
+        let all: Vec<u64> = all.collect();
+        let different: std::collections::BTreeSet<u64> = all.iter().copied().collect();
+        assert_eq!(different.len(), all.len());
+    }
 
     /// What one range hides lies between the steps from its greatest on and up to its least; two also leave what is
     /// between them.

@@ -4,7 +4,7 @@
 
 use super::gather::local_bounds;
 use super::half::{Half4, encode};
-use crate::flat::{self, FlatTexture};
+use crate::flat::{self, Flat, FlatTexture};
 use crate::scene::{Boundary, Scene};
 use rayon::prelude::*;
 use std::f32::consts::PI;
@@ -16,7 +16,7 @@ pub(super) struct Texture {
     pub dims: [usize; 3],
     /// Diffuse reflectance at every isovalue.
     pub albedo: Vec<[f32; 3]>,
-    /// Texels along u and v that lines report to: half as many, since light that comes from everywhere has no edges.
+    /// Texels along u and v that lines report to, as [`sinks`].
     sink: [usize; 2],
     /// World area of one of these.
     pub sink_area: f64,
@@ -144,30 +144,39 @@ fn narrow(scene: &Scene) -> f64 {
     (NARROW * (0..3).map(width).fold(f64::INFINITY, f64::min)).max(lattice.cell_volume().cbrt())
 }
 
-/// Texels of all flats of a scene, at most.
-pub fn texels(scene: &Scene, across: usize, isovalues: usize) -> usize {
+/// By flat number, what reflects and its texels along u and v.
+pub(super) fn shapes(scene: &Scene, across: usize) -> impl Iterator<Item = Option<(Flat, [usize; 2])>> {
     let narrow = narrow(scene);
-    flat::texels(scene, |flat| flat.across(across, narrow), isovalues)
+    (0..flat::count(scene)).map(move |number| {
+        let flat = flat::flat(scene, number).filter(|flat| !flat.albedo.black())?;
+        let [u, v, _] = flat.resolution(flat.across(across, narrow), 1);
+        Some((flat, [u, v]))
+    })
+}
+
+/// Texels that lines report to: half as many along each edge, since light that comes from everywhere has no edges.
+pub(super) fn sinks(dims: [usize; 2]) -> [usize; 2] {
+    dims.map(|n| n.div_ceil(2))
+}
+
+/// Texels of all flats of a scene.
+pub(crate) fn texels(scene: &Scene, across: usize, isovalues: usize) -> usize {
+    shapes(scene, across).flatten().map(|(_, [u, v])| u * v * isovalues).sum()
 }
 
 impl Flats {
     pub(super) fn new(scene: &Scene, across: usize, isovalues: usize) -> Self {
-        let narrow = narrow(scene);
         // Black comes first.
         let mut next = isovalues;
-        let textures = (0..flat::count(scene))
-            .map(|number| {
-                let flat = flat::flat(scene, number)?;
-                if flat.albedo.black() {
-                    return None;
-                }
-                let dims = flat.resolution(flat.across(across, narrow), isovalues);
-                let texels = dims[0] * dims[1];
+        let textures = shapes(scene, across)
+            .map(|shape| {
+                let (flat, [u, v]) = shape?;
+                let texels = u * v;
                 let n = 3 * texels * isovalues;
                 next += texels * isovalues;
-                let sink = [dims[0].div_ceil(2), dims[1].div_ceil(2)];
+                let sink = sinks([u, v]);
                 Some(Texture {
-                    dims,
+                    dims: [u, v, isovalues],
                     sink,
                     albedo: (0..isovalues)
                         .map(|i| flat.albedo.at((i as f64 + 0.5) / isovalues as f64).as_vec3().to_array())
