@@ -4,8 +4,12 @@
 //! the square; read as a squared Euclidean norm, `percent_rms = 100 √⟨|rgb_tex − rgb_ref|²⟩` is what this crate
 //! reports, and that / √3, the RMS per channel, beside it.
 
+mod belongs;
+mod clamped;
 mod floor;
 
+pub use belongs::belongs;
+pub use clamped::clamped_variance;
 pub use floor::{interpolation_floor, through_grid, total_floor};
 
 use crate::error::{Error, Result};
@@ -76,7 +80,8 @@ pub struct Accuracy {
     pub lit: f64,
     /// 95 % confidence interval of `percent_rms`, from the scatter over vertices (as if they were independent).
     pub confidence: [f64; 2],
-    /// What a perfect bake would show against one reference: 100 √⟨Σ variance⟩.
+    /// What a perfect bake would show against one reference: 100 √⟨Σ variance⟩ of clamped rgb, as if the reference's
+    /// noise were Gaussian around what it holds.
     pub noise_floor: f64,
     /// One reference: √(percent_rms² − noise_floor²), 0 where that is negative. Two: `percent_rms`.
     pub percent_rms_without_noise: f64,
@@ -97,6 +102,12 @@ pub const LIT: f64 = 0.02;
 #[inline]
 pub fn display(radiance: DVec3, exposure: f64) -> DVec3 {
     (radiance * exposure).clamp(DVec3::ZERO, DVec3::ONE)
+}
+
+/// Variance of the displayed rgb of vertex `v`, summed over channels.
+fn noise(reference: &ReferenceMesh, v: usize, exposure: f64) -> f64 {
+    let (mean, variance) = (reference.radiance[v] * exposure, reference.variance[v] * exposure * exposure);
+    (0..3).map(|c| clamped_variance(mean[c], variance[c])).sum()
 }
 
 /// Compares `texture` (linear radiance at the vertices) with one or two references on the same mesh. Returns the
@@ -156,7 +167,7 @@ pub fn compare(texture: &[DVec3], references: &[ReferenceMesh], exposure: f64) -
         out.mean += distance;
         out.max = out.max.max(100.0 * distance);
         out.bias += (t - mean).element_sum() / 3.0;
-        out.noise_floor += references.iter().map(|r| r.variance[v].element_sum()).sum::<f64>() / count;
+        out.noise_floor += references.iter().map(|r| noise(r, v, exposure)).sum::<f64>() / count;
     }
     let vertices = chosen.len() as f64;
     let percent = |square: f64| 100.0 * square.max(0.0).sqrt();
@@ -168,7 +179,7 @@ pub fn compare(texture: &[DVec3], references: &[ReferenceMesh], exposure: f64) -
     out.percent_rms_lit = if lit > 0 { percent(lit_sum / lit as f64) } else { 0.0 };
     out.lit = lit as f64 / vertices;
     out.confidence = [percent(square - 1.96 * deviation), percent(square + 1.96 * deviation)];
-    let floor = out.noise_floor / vertices * exposure * exposure;
+    let floor = out.noise_floor / vertices;
     out.noise_floor = percent(floor);
     out.percent_rms_without_noise = if references.len() == 1 { percent(square - floor) } else { out.percent_rms };
     out.mean *= 100.0 / vertices;

@@ -369,10 +369,23 @@ impl Render {
         };
         let exposure = exposure * self.exposure;
         if exr {
+            let shading = match () {
+                () if self.trilinear => "path traced, trilinear",
+                () if self.reference => "path traced",
+                () if self.local || baked.is_none() => "local",
+                () => "baked",
+            };
+            let vector = |v: DVec3| format!("{:?},{:?},{:?}", v.x, v.y, v.z);
             let attributes = [
                 ("isolume".to_owned(), format!("{} ({})", env!("CARGO_PKG_VERSION"), env!("ISOLUME_COMMIT"))),
                 ("source".to_owned(), self.file.display().to_string()),
                 ("isovalue".to_owned(), self.isovalue.to_string()),
+                ("field".to_owned(), self.field.clone().unwrap_or_else(|| scene.name.clone())),
+                ("shading".to_owned(), shading.to_owned()),
+                ("eye".to_owned(), vector(camera.eye)),
+                ("target".to_owned(), vector(camera.target)),
+                ("up".to_owned(), vector(camera.up)),
+                ("fov".to_owned(), camera.fov.to_string()),
                 ("exposure".to_owned(), exposure.to_string()),
                 ("samplesPerPixel".to_owned(), self.samples.to_string()),
                 ("renderTimeSeconds".to_owned(), begun.elapsed().as_secs_f64().to_string()),

@@ -4,9 +4,11 @@
 //! normal) and nothing of the bake's estimators: an unbiased path tracer, and a photon map on the mesh with final
 //! gather. Both run in independent batches; what is reported is the batches' mean and the variance of that mean.
 
+mod origin;
 mod path;
 mod surface_map;
 
+pub use origin::{Origin, light};
 pub use path::{PathTracer, path_picture};
 pub use surface_map::{SurfaceMap, SurfaceMapSettings};
 
@@ -81,11 +83,12 @@ pub struct Reference {
 }
 
 impl Reference {
-    /// Writes the reference of `mesh` as PLY: `radiance_r/g/b`, `variance_r/g/b` and `sampled` per vertex.
+    /// Writes the reference of `mesh` as PLY: `radiance_r/g/b`, `variance_r/g/b` and `sampled` per vertex; `comment` as
+    /// [`Origin::comment`].
     ///
     /// # Errors
     /// As [`ply::write`].
-    pub fn write(&self, path: &Path, mesh: &SurfaceMesh) -> Result<()> {
+    pub fn write(&self, path: &Path, mesh: &SurfaceMesh, comment: String) -> Result<()> {
         let radiance = [0, 1, 2].map(|c| channel(&self.radiance, c));
         let variance = [0, 1, 2].map(|c| channel(&self.variance, c));
         let sampled: Vec<f32> = self.sampled.iter().map(|&s| if s { 1.0 } else { 0.0 }).collect();
@@ -98,7 +101,7 @@ impl Reference {
             ("variance_b", &variance[2]),
             ("sampled", &sampled),
         ];
-        ply::write(path, &mesh.export(&properties))
+        ply::write_with_comments(path, &mesh.export(&properties), &[comment])
     }
 }
 

@@ -17,7 +17,7 @@ use crate::embree::{Device, SurfaceTracer};
 use crate::error::{Error, Result};
 use crate::export::ply;
 use crate::progress::{Progress, processor_seconds, say};
-use crate::reference::{ReferenceSettings, reference};
+use crate::reference::{Origin, ReferenceSettings, reference};
 use crate::scene::Scene;
 use crate::surface_mesh::SurfaceMesh;
 use glam::DVec3;
@@ -148,7 +148,7 @@ impl Study {
         let c = scene.field.sweep().isovalue(isovalue);
         let mesh = SurfaceMesh::extract(scene, c, 1)?;
         let mut out = Vec::new();
-        let job = scene_job(scene);
+        let (job, at) = (scene_job(scene), isovalue);
         for seed in [101, 202] {
             let settings =
                 ReferenceSettings { samples, vertices: Some(vertices), seed, ..ReferenceSettings::default() };
@@ -162,7 +162,7 @@ impl Study {
                 let stage = self.progress.stage(&format!("reference {isovalue}"), count);
                 let result = reference(scene, &tracer, &mesh, c, &settings, &|n| stage.tick(n));
                 stage.end()?;
-                result.write(&path, &mesh)?;
+                result.write(&path, &mesh, Origin::comment(scene, at, &settings))?;
             }
             let mesh = ReferenceMesh::from_ply(&ply::read(&path)?).map_err(|e| e.in_file(&path))?;
             out.push(mesh);

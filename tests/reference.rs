@@ -367,7 +367,17 @@ fn compare_computes_what_it_says() {
     close(a.percent_rms_area, rms([2.0, 1.0, 2.0, 1.0]));
     close(a.percent_rms_lit, rms([1.0, 1.0, 0.0, 1.0]));
     close(a.lit, 0.75);
-    close(a.noise_floor, 100.0 * (3.0 * 1e-6f64 * 4.0).sqrt());
+    // Noise of 0.002: all of it at 0.4, none at white, and one deviation above black that of max(−1, N), which is
+    // 0.751035 (⟨z⟩ = φ(1) − Φ(−1) = 0.083315, ⟨z²⟩ = Φ(1) − φ(1) + Φ(−1) = 1 − φ(1) = 0.758029).
+    let floor = 3.0 * 4e-6 * (2.0 + 0.758_029_275_480_856_6 - 0.083_315_470_587_686_3f64.powi(2)) / 4.0;
+    close(a.noise_floor, 100.0 * floor.sqrt());
+    let mean = squares.iter().sum::<f64>() / 4.0;
+    close(a.percent_rms_without_noise, 100.0 * (mean - (a.noise_floor / 100.0).powi(2)).sqrt());
+    let deviation = (squares.iter().map(|s| (s - mean).powi(2)).sum::<f64>() / 4.0 / 4.0).sqrt();
+    let bounds = [-1.96, 1.96].map(|k| 100.0 * f64::max(mean + k * deviation, 0.0).sqrt());
+    assert!(bounds[0] == 0.0 && bounds[1] > 0.0);
+    close(a.confidence[0], bounds[0]);
+    close(a.confidence[1], bounds[1]);
     close(a.max, 100.0 * 0.2 * 3f64.sqrt());
     close(a.mean, 100.0 * 3f64.sqrt() * (0.1 + 0.004 + 0.2) / 4.0);
     close(a.bias, 100.0 * (0.1 + 0.004 - 0.2) / 4.0);
@@ -378,6 +388,18 @@ fn compare_computes_what_it_says() {
         let message = compare(&texture, r, 2.0).unwrap_err().to_string();
         assert!(message.contains(word), "{message}");
     };
+    // Two vertices of nearly the same error have both bounds; noise above the error leaves nothing.
+    let (near, texture_at) = (flat([0.2; 4], 1e-6), |t: [f64; 4]| t.map(DVec3::splat));
+    let (b, _) = compare(&texture_at([0.25; 4]), std::slice::from_ref(&near), 2.0).unwrap();
+    close(b.confidence[0], b.percent_rms);
+    close(b.confidence[1], b.percent_rms);
+    let (b, _) = compare(&texture_at([0.25, 0.26, 0.25, 0.26]), std::slice::from_ref(&near), 2.0).unwrap();
+    // Squares 0.03 and 0.0432: mean 0.0366, deviation of the mean 0.0033.
+    close(b.confidence[0], 100.0 * (0.0366f64 - 1.96 * 0.0033).sqrt());
+    close(b.confidence[1], 100.0 * (0.0366f64 + 1.96 * 0.0033).sqrt());
+    let (b, _) = compare(&texture_at([0.25; 4]), &[flat([0.2; 4], 0.004)], 2.0).unwrap();
+    assert!(b.noise_floor > b.percent_rms && b.percent_rms_without_noise == 0.0, "{b:?}");
+
     refuses(&[], "no reference");
     refuses(&[reference.clone(), reference.clone()], "--seed");
     // Whatever the seeds, which another one would not change.

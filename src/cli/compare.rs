@@ -1,11 +1,12 @@
 //! `isolume compare`: a bake against one or two references of an isosurface.
 
 use super::{expect_extension, outputs};
-use crate::accuracy::{Accuracy, ReferenceMesh, compare};
+use crate::accuracy::{Accuracy, ReferenceMesh, belongs, compare};
 use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
 use crate::export::{Mesh, ply};
 use crate::progress::{Progress, say};
+use crate::reference::{Origin, light};
 use crate::scene_file::Inputs;
 use crate::surface_mesh::texture;
 use std::path::PathBuf;
@@ -14,6 +15,7 @@ use std::path::PathBuf;
 #[command(after_help = "\
 Colours are linear radiance × π / (largest albedo × E0), clamped to [0, 1]; percent_rms = 100 sqrt(mean |difference|²) over the
 reference's vertices, the squared Euclidean norm over three channels (BB09's printed formula leaves the square out).
+A reference that is of no isosurface of the bake's volume and sweep is refused; one of another material or box is warned of.
 One reference adds its own noise to the result (noise_floor); two of different seeds do not.
 
 Examples:
@@ -39,14 +41,26 @@ impl Compare {
             expect_extension(output, &["ply"])?;
             outputs([&**output], &Inputs::files(self.references.iter().chain([&self.bake]).map(PathBuf::as_path)))?;
         }
-        let references = self
-            .references
-            .iter()
-            .map(|path| ReferenceMesh::from_ply(&ply::read(path)?).map_err(|e| e.in_file(path)))
+        let files = self.references.iter().map(ply::read).collect::<Result<Vec<_>>>()?;
+        let read = files.iter().zip(&self.references);
+        let references = read
+            .map(|(file, path)| ReferenceMesh::from_ply(file).map_err(|e| e.in_file(path)))
             .collect::<Result<Vec<_>>>()?;
         let baked = BakedVolume::read(&self.bake)?;
         if baked.scene.fields() > 1 {
             return Err(Error::not_supported(&self.bake, "holds several volumes; name the .vti of one of them"));
+        }
+        for ((reference, file), path) in references.iter().zip(&files).zip(&self.references) {
+            let origin = Origin::from_comments(&file.comments);
+            belongs(&reference.positions, origin.isovalue, &baked.scene.field).map_err(|e| e.in_file(path))?;
+            let another = |c| origin.light.is_some_and(|known| known != light(&baked.scene, c));
+            if progress == Progress::Shown && origin.isovalue.is_some_and(another) {
+                say!(
+                    "warning: {}: was made of another material or box than {}; the difference counts as error",
+                    path.display(),
+                    self.bake.display()
+                );
+            }
         }
         let colours = texture(&baked, &references[0].positions).map_err(|e| e.in_file(&self.bake))?;
         let (accuracy, errors) = compare(&colours, &references, baked.exposure)?;

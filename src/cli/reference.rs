@@ -6,7 +6,7 @@ use crate::embree::{Device, GraphTracer, SurfaceTracer};
 use crate::error::{Error, Result};
 use crate::export::picture::Picture;
 use crate::progress::{Progress, say};
-use crate::reference::{Integrator, Reference, ReferenceSettings, SurfaceMapSettings, path_picture, reference};
+use crate::reference::{Integrator, Origin, Reference, ReferenceSettings, SurfaceMapSettings, path_picture, reference};
 use crate::render::Camera;
 use crate::scene::Scene;
 use crate::scene_file::{Inputs, SceneOptions};
@@ -19,7 +19,8 @@ use std::time::Instant;
 #[command(after_help = "\
 The PLY holds, per vertex, the outside's outgoing radiance `radiance_r/g/b`, the variance of that mean
 `variance_r/g/b`, and `sampled`: 1 where it was computed, 0 elsewhere (--vertices). The subset is the same for every
-seed, so that two references of different seeds can be compared with a bake without their own noise.
+seed, so that two references of different seeds can be compared with a bake without their own noise. A comment says what it
+is of: isovalue, seed, samples, and a digest of material and box.
 
 Examples:
   isolume reference scene.toml --isovalue 47 -o ref.ply --vertices 4000
@@ -105,7 +106,7 @@ impl ReferenceArgs {
         let (mesh, result, inside) =
             compute(&scene, isovalue, self.refine, self.trilinear, &settings, &device()?, progress)?;
         let seconds = begun.elapsed().as_secs_f64();
-        result.write(&self.output, &mesh)?;
+        result.write(&self.output, &mesh, Origin::comment(&scene, self.isovalue, &settings))?;
         let count = result.sampled.iter().filter(|s| **s).count();
         if self.json {
             let numbers = serde_json::json!({

@@ -20,7 +20,18 @@ const RESERVED: [&str; 9] = ["x", "y", "z", "nx", "ny", "nz", "red", "green", "b
 /// `Invalid` if the arrays do not fit each other, a position is not finite in f32, or a property's name is taken, used
 /// twice or not a plain word; `NotSupported` beyond 2³¹ − 1 vertices or triangles; `Io`.
 pub fn write(path: impl AsRef<Path>, mesh: &Mesh) -> Result<()> {
+    write_with_comments(path, mesh, &[])
+}
+
+/// As [`write()`], with lines of `comments` in its header.
+///
+/// # Errors
+/// As [`write()`]; `Invalid` for a comment that is not one line.
+pub fn write_with_comments(path: impl AsRef<Path>, mesh: &Mesh, comments: &[String]) -> Result<()> {
     let path = path.as_ref();
+    if let Some(c) = comments.iter().find(|c| c.contains(char::is_control)) {
+        return Err(Error::invalid(path, format!("comment {c:?}: must be one line")));
+    }
     mesh.check(path)?;
     for (i, (name, _)) in mesh.properties.iter().enumerate() {
         let word = !name.is_empty() && name.bytes().all(|b| b.is_ascii_graphic());
@@ -32,12 +43,13 @@ pub fn write(path: impl AsRef<Path>, mesh: &Mesh) -> Result<()> {
         }
     }
     let mut file = AtomicFile::create(path)?;
-    let written = write_to(&mut file, mesh);
+    let written = write_to(&mut file, mesh, comments);
     file.finish(written)
 }
 
-fn write_to(out: &mut impl Write, mesh: &Mesh) -> io::Result<()> {
+fn write_to(out: &mut impl Write, mesh: &Mesh, comments: &[String]) -> io::Result<()> {
     writeln!(out, "ply\nformat binary_little_endian 1.0\ncomment isolume {}", env!("CARGO_PKG_VERSION"))?;
+    comments.iter().try_for_each(|c| writeln!(out, "comment {c}"))?;
     writeln!(out, "element vertex {}", mesh.positions.len())?;
     let (lo, hi) =
         mesh.positions.iter().fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(lo, hi), p| (lo.min(*p), hi.max(*p)));
@@ -90,6 +102,8 @@ pub struct PlyMesh {
     pub properties: Vec<(String, Vec<f64>)>,
     /// Triangles as vertex indices, each below `vertices`.
     pub triangles: Vec<[u32; 3]>,
+    /// Comments of the header, in the order of the file.
+    pub comments: Vec<String>,
 }
 
 impl PlyMesh {
@@ -177,6 +191,7 @@ struct Header {
     faces: Option<usize>,
     /// Types of the count and of the indices.
     list: Option<(Scalar, Scalar)>,
+    comments: Vec<String>,
 }
 
 /// Reads the bytes of a PLY file; `name` is for messages. Binary little-endian, vertices before triangles, any scalar
@@ -234,7 +249,7 @@ pub fn parse(bytes: &[u8], name: impl AsRef<Path>) -> Result<PlyMesh> {
             triangles.push(corners.map(|c| c as u32));
         }
     }
-    Ok(PlyMesh { vertices, properties, triangles })
+    Ok(PlyMesh { vertices, properties, triangles, comments: header.comments })
 }
 
 fn not_a_triangle(name: &Path, corners: f64) -> Error {
@@ -263,7 +278,8 @@ fn parse_header<'a>(bytes: &'a [u8], name: &Path) -> Result<(Header, &'a [u8])> 
             _ if number == 1 => return Err(Error::invalid(name, "is not a PLY file: the first line is not \"ply\"")),
             ["format", "binary_little_endian", "1.0"] => format_seen = true,
             ["format", ..] => return Err(unsupported("only binary_little_endian 1.0 is read")),
-            ["comment" | "obj_info", ..] | [] => {}
+            ["comment", ref words @ ..] => header.comments.push(words.join(" ")),
+            ["obj_info", ..] | [] => {}
             ["element", which, count] => {
                 let count = count.parse().map_err(|_| wrong())?;
                 match which {
@@ -315,7 +331,7 @@ mod tests {
 
     fn bytes_of(mesh: &Mesh) -> Vec<u8> {
         let mut bytes = Vec::new();
-        write_to(&mut bytes, mesh).unwrap();
+        write_to(&mut bytes, mesh, &[]).unwrap();
         bytes
     }
 

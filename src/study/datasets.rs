@@ -1,7 +1,7 @@
 //! The table of data sets: error and seconds with and without final gather, and where the error comes from.
 
 use super::{Effort, Study, Subject, Table, accuracy_of, exactly, provenance};
-use crate::accuracy::{ReferenceMesh, interpolation_floor, total_floor};
+use crate::accuracy::{ReferenceMesh, display, interpolation_floor, total_floor};
 use crate::bake::{Bake, BakeOptions, BakeSettings, Engine, StrategyName};
 use crate::embree::{GraphTracer, SurfaceTracer};
 use crate::error::Result;
@@ -177,19 +177,48 @@ fn triangle_error(study: &Study, subject: &Subject, mesh: &SurfaceMesh, isovalue
         seed,
         ..ReferenceSettings::default()
     };
-    let quiet = |_| true;
+    let count = settings(0).vertices.unwrap_or(usize::MAX).min(mesh.local.len()) as u64;
+    let stage = study.progress.stage("triangles", 4 * count * u64::from(settings(0).batches));
+    let tick = |n| stage.tick(n);
     let triangles = SurfaceTracer::new(&study.device, scene, isovalue, 1)?;
     let graph = GraphTracer::new(&study.device, scene)?;
-    let on_triangles = |seed| reference(scene, &triangles, mesh, isovalue, &settings(seed), &quiet);
-    let on_graph = |seed| reference(scene, &graph, mesh, isovalue, &settings(seed), &quiet);
-    // Four independent runs: ⟨(g₁ − t₁)·(g₂ − t₂)⟩ has no noise of its own.
-    let (t1, t2, g1, g2) = (on_triangles(11), on_triangles(12), on_graph(13), on_graph(14));
-    let exposure = scene.exposure();
+    let on_triangles = |seed| reference(scene, &triangles, mesh, isovalue, &settings(seed), &tick);
+    let on_graph = |seed| reference(scene, &graph, mesh, isovalue, &settings(seed), &tick);
+    let pairs = [[on_graph(13), on_triangles(11)], [on_graph(14), on_triangles(12)]];
+    stage.end()?;
+    Ok(displayed_difference(&pairs, scene.exposure()))
+}
+
+/// Percent RMS between the displayed colours of the references of a pair, from two pairs that are independent:
+/// ⟨(g₁ − t₁)·(g₂ − t₂)⟩ has no noise of its own.
+fn displayed_difference(pairs: &[[Reference; 2]; 2], exposure: f64) -> f64 {
     let (mut sum, mut count) = (0.0, 0.0);
-    for v in (0..mesh.local.len()).filter(|&v| t1.sampled[v]) {
-        let d = |a: &crate::reference::Reference, b: &Reference| (a.radiance[v] - b.radiance[v]) * exposure;
-        sum += d(&g1, &t1).dot(d(&g2, &t2));
+    for v in (0..pairs[0][0].sampled.len()).filter(|&v| pairs[0][0].sampled[v]) {
+        let [a, b] = pairs.each_ref().map(|[g, t]| display(g.radiance[v], exposure) - display(t.radiance[v], exposure));
+        sum += a.dot(b);
         count += 1.0;
     }
-    Ok(100.0 * (sum / f64::max(count, 1.0)).max(0.0).sqrt())
+    100.0 * (sum / f64::max(count, 1.0)).max(0.0).sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DVec3;
+
+    /// Exposure 2: 0.4 against 0.2 and 0.6, then white against 3 and 5 times white, then one that is not sampled.
+    #[test]
+    fn triangles_differ_by_what_is_displayed() {
+        let reference = |r: [f64; 3]| Reference {
+            radiance: r.map(DVec3::splat).to_vec(),
+            sampled: vec![true, true, false],
+            ..Reference::default()
+        };
+        let triangles = || reference([0.2, 0.5, 0.0]);
+        let pairs = [[reference([0.1, 1.5, 9.0]), triangles()], [reference([0.3, 2.5, 9.0]), triangles()]];
+        assert_eq!(displayed_difference(&pairs, 2.0), 0.0, "−0.2 · 0.2 is negative");
+        let pairs = [[reference([0.3, 1.5, 9.0]), triangles()], [reference([0.3, 2.5, 9.0]), triangles()]];
+        let expected = 100.0 * (3.0 * 0.2 * 0.2f64 / 2.0).sqrt();
+        assert!((displayed_difference(&pairs, 2.0) - expected).abs() < 1e-9);
+    }
 }

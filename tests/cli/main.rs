@@ -7,8 +7,10 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 mod bad_input;
+mod compare;
 mod engines;
 mod outputs;
+mod pictures;
 mod reproducibility;
 mod volumes;
 

@@ -1,0 +1,158 @@
+//! `compare`: what it takes for a reference of a bake, and what it writes.
+
+use super::{QUICK, isolume, ok, refused, text};
+use glam::DVec3;
+use isolume::export::bake_file::BakedVolume;
+use isolume::export::ply::{self, PlyMesh};
+use isolume::volume::{Lattice, Samples, Volume};
+use std::fs;
+use std::path::Path;
+
+const RANGE: [&str; 3] = ["--isovalues", "3.6", "95"];
+
+/// h = 60 |x − (½, ½, ½)| on a cube of this edge, where x runs over the unit cube.
+fn cone(edge: f64) -> Volume {
+    let lattice = Lattice::aligned([15; 3], DVec3::ZERO, DVec3::splat(edge / 14.0)).unwrap();
+    let at = |o: usize| (DVec3::from_array(lattice.ijk(o).map(|i| i as f64)) / 14.0 - 0.5).length();
+    let samples = (0..lattice.len()).map(|o| 60.0 * at(o) as f32).collect();
+    Volume::new("cone", lattice, Samples::F32(samples)).unwrap()
+}
+
+fn bake(dir: &Path, input: &str, output: &str, more: &[&str]) {
+    ok(dir, &[&["bake", input, "-o", output, "-q"], &QUICK[..], more].concat());
+}
+
+fn reference(dir: &Path, input: &str, output: &str, more: &[&str]) {
+    let few = ["--samples", "4", "--batches", "2", "--vertices", "40", "-q"];
+    ok(dir, &[&["reference", input, "-o", output], &few[..], more].concat());
+}
+
+/// Without the comment that says what it is of, as older versions and other programs write it.
+fn unsigned(dir: &Path, from: &str, to: &str) {
+    let bytes = fs::read(dir.join(from)).unwrap();
+    let mark = b"comment isolume reference ";
+    let start = bytes.windows(mark.len()).position(|w| w == mark).expect("the comment");
+    let end = start + bytes[start..].iter().position(|b| *b == b'\n').unwrap() + 1;
+    fs::write(dir.join(to), [&bytes[..start], &bytes[end..]].concat()).unwrap();
+}
+
+#[test]
+fn references_of_other_volumes_and_isovalues_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "15", "-o", "b.vti", "-q"]);
+    cone(1.0).write(dir.join("cone.vti")).unwrap();
+    cone(40.0).write(dir.join("large.vti")).unwrap();
+    bake(dir, "b.vti", "lit.vti", &RANGE);
+    bake(dir, "b.vti", "upper.vti", &["--isovalues", "40", "95"]);
+    for (input, isovalue) in [("cone.vti", "22"), ("large.vti", "22"), ("b.vti", "20")] {
+        let output = format!("r-{input}.ply");
+        reference(dir, input, &output, &[&RANGE[..], &["--isovalue", isovalue]].concat());
+        unsigned(dir, &output, &format!("u-{input}.ply"));
+    }
+    for signed in ["r", "u"] {
+        let name = |input: &str| format!("{signed}-{input}.ply");
+        let (cone, large, own) = (name("cone.vti"), name("large.vti"), name("b.vti"));
+        refused(dir, &["compare", "lit.vti", &cone], &[&cone, "no isosurface of the bake's volume"]);
+        refused(dir, &["compare", "lit.vti", &large], &[&large, "outside of the bake's volume"]);
+        refused(dir, &["compare", "upper.vti", &own], &[&own, "isovalue 20, outside of the bake's sweep 40 … 95"]);
+        refused(dir, &["compare", "lit.vti", &own, &cone], &[&cone, "no isosurface"]);
+        ok(dir, &["compare", "lit.vti", &own]);
+    }
+}
+
+#[test]
+fn bakes_of_any_grid_and_sweep_take_the_volumes_references() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "15", "-o", "b.vti", "-q"]);
+    for isovalue in ["30", "90"] {
+        reference(dir, "b.vti", "r.ply", &[&RANGE[..], &["--isovalue", isovalue, "--albedo", "0.4"]].concat());
+        unsigned(dir, "r.ply", "u.ply");
+        for grid in ["8,8,8", "2x", "17,16,15"] {
+            // Its end is a reference's isovalue.
+            let range = ["--isovalues", "10", "90", "--grid", grid, "--albedo", "0.4"];
+            bake(dir, "b.vti", "lit.vti", &range);
+            for file in ["r.ply", "u.ply"] {
+                let said = text(&ok(dir, &["compare", "lit.vti", file]).stderr);
+                assert_eq!(said, "", "{isovalue} {grid} {file}");
+            }
+        }
+    }
+}
+
+#[test]
+fn another_material_or_box_is_warned_of() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
+    bake(dir, "b.vti", "lit.vti", &RANGE);
+    let at = |more: &[&str]| reference(dir, "b.vti", "r.ply", &[&RANGE[..], &["--isovalue", "47"], more].concat());
+    for (more, warned) in
+        [(&[][..], false), (&["--seed", "2"], false), (&["--albedo", "0.2"], true), (&["--margin", "0.2"], true)]
+    {
+        at(more);
+        let said = text(&ok(dir, &["compare", "lit.vti", "r.ply", "--json"]).stderr);
+        assert_eq!(said.contains("warning: r.ply: was made of another material or box"), warned, "{more:?}: {said}");
+        assert_eq!(text(&ok(dir, &["compare", "lit.vti", "r.ply", "-q"]).stderr), "", "{more:?}");
+    }
+    // The same walls of another colour, and a brighter lamp.
+    for (name, kd, ke) in [("one", "0.7", "1"), ("red", "0.7 0.1 0.1", "1"), ("bright", "0.7", "2")] {
+        let material = format!("newmtl floor\nKd {kd}\nnewmtl lamp\nKd 0\nKe {ke}\n");
+        fs::write(dir.join(format!("{name}.mtl")), material).unwrap();
+        let quad = |z: f64, order: &str| format!("v 0 0 {z}\nv 1 0 {z}\nv 1 1 {z}\nv 0 1 {z}\nf {order}\n");
+        let (floor, lamp) = (quad(-0.1, "1 2 3 4"), quad(1.1, "8 7 6 5"));
+        let room = format!("mtllib {name}.mtl\nusemtl floor\n{floor}usemtl lamp\n{lamp}");
+        fs::write(dir.join(format!("{name}.obj")), room).unwrap();
+    }
+    bake(dir, "b.vti", "room.vti", &[&RANGE[..], &["--box", "one.obj"]].concat());
+    for (room, warned) in [("one.obj", false), ("red.obj", true), ("bright.obj", true)] {
+        at(&["--box", room]);
+        let said = text(&ok(dir, &["compare", "room.vti", "r.ply"]).stderr);
+        assert_eq!(said.contains("of another material or box than room.vti"), warned, "{room}: {said}");
+    }
+    at(&[]);
+    let comments = ply::read(dir.join("r.ply")).unwrap().comments;
+    assert!(comments[1].starts_with("isolume reference isovalue=47.0 seed=1 samples=4 integrator=path light="));
+    let output = isolume(dir, &["compare", "lit.vti", "b.vti"]);
+    assert_eq!(output.status.code(), Some(2), "a volume is no reference");
+}
+
+/// `error` and colour of every vertex of `compare -o`, from the two files that were compared.
+#[test]
+fn the_mesh_of_errors_holds_them() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
+    bake(dir, "b.vti", "lit.vti", &RANGE);
+    reference(dir, "lit.vti", "r.ply", &["--isovalue", "47"]);
+    ok(dir, &["extract", "lit.vti", "--isovalue", "47", "-o", "t.ply", "-q"]);
+    ok(dir, &["compare", "lit.vti", "r.ply", "-o", "e.ply", "-q"]);
+    let exposure = BakedVolume::read(&dir.join("lit.vti")).unwrap().exposure;
+    let [t, r, e] = ["t.ply", "r.ply", "e.ply"].map(|f| ply::read(dir.join(f)).unwrap());
+    let shown = |m: &PlyMesh| -> Vec<DVec3> {
+        let radiance = m.triple(["radiance_r", "radiance_g", "radiance_b"]).unwrap();
+        radiance.into_iter().map(|c| (DVec3::from(c) * exposure).clamp(DVec3::ZERO, DVec3::ONE)).collect()
+    };
+    let bytes = e.triple(["red", "green", "blue"]).unwrap();
+    let (mut sampled, mut most) = (0, 0.0f64);
+    for (v, (t, r)) in shown(&t).into_iter().zip(shown(&r)).enumerate() {
+        let error = e.property("error").unwrap()[v];
+        if r_sampled(&e, v, &bytes) {
+            sampled += 1;
+            most = most.max(error);
+            assert!((error - (t - r).length()).abs() < 1e-5, "vertex {v}: {error} {t} {r}");
+            let ramp = [0.0, 1.0, 2.0].map(|k| 255.0 * (30.0 * error - k).clamp(0.0, 1.0));
+            assert!((0..3).all(|c| (bytes[v][c] - ramp[c]).abs() < 0.51), "{error} {:?}", bytes[v]);
+        }
+    }
+    assert_eq!(sampled, r.property("sampled").unwrap().iter().filter(|s| **s > 0.0).count());
+    assert!(sampled == 40 && most > 0.01, "{sampled} {most}");
+}
+
+/// Whether a vertex of a mesh of errors was compared: those that were not are grey and have no error.
+fn r_sampled(mesh: &PlyMesh, v: usize, bytes: &[[f64; 3]]) -> bool {
+    let grey = bytes[v] == [96.0; 3];
+    assert!(!grey || mesh.property("error").unwrap()[v] == 0.0);
+    !grey
+}
