@@ -15,7 +15,7 @@ const MOST_LINKS: usize = 40;
 /// Whoever reads the file's own name sees the old content or the complete new one, never a part. Dropped without
 /// commit, the temporary file is removed and the old content stays; only a killed process leaves it behind (hidden,
 /// named `.<name>.<process>-<count>.tmp`). A symbolic link is followed: the file it names is replaced, or made, not the
-/// link.
+/// link. What is replaced hands its mode on.
 #[derive(Debug)]
 pub struct AtomicFile {
     /// `None` once closed.
@@ -29,18 +29,23 @@ impl AtomicFile {
     ///
     /// # Errors
     /// `Io` if the folder does not exist or cannot be written; `Invalid` if `path` has no file name or names something
-    /// other than a regular file (a folder, a device), which a rename would replace.
+    /// other than a regular file (a folder, a device), which a rename would replace, or a file that nobody may write.
     pub fn create(path: impl AsRef<Path>) -> Result<Self> {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let path = path.as_ref();
-        let target = match fs::metadata(path) {
-            Ok(found) if found.is_file() => fs::canonicalize(path).map_err(|e| Error::io(path, e))?,
-            Ok(found) => {
+        let old = fs::metadata(path).ok();
+        match &old {
+            Some(found) if !found.is_file() => {
                 let what = if found.is_dir() { "a folder" } else { "no regular file" };
                 return Err(Error::invalid(path, format!("is {what}; give the name of a file to write")));
             }
-            Err(_) => followed(path).map_err(|e| Error::io(path, e))?,
-        };
+            // A rename would not ask.
+            Some(found) if found.permissions().readonly() => {
+                return Err(Error::invalid(path, "is read-only; make it writable, or name another file to write"));
+            }
+            _ => {}
+        }
+        let target = resolved(path).map_err(|e| Error::io(path, e))?;
         let Some(name) = target.file_name() else {
             return Err(Error::invalid(path, "has no file name; give the name of a file to write"));
         };
@@ -51,7 +56,12 @@ impl AtomicFile {
             hidden.push(format!(".{}-{}.tmp", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed)));
             let temporary = target.with_file_name(hidden);
             match OpenOptions::new().write(true).create_new(true).open(&temporary) {
-                Ok(file) => return Ok(Self { file: Some(BufWriter::new(file)), temporary, target }),
+                Ok(file) => {
+                    if let Some(old) = &old {
+                        take_over(&file, old);
+                    }
+                    return Ok(Self { file: Some(BufWriter::new(file)), temporary, target });
+                }
                 Err(e) if e.kind() == io::ErrorKind::AlreadyExists => {} // left by a killed process of the same number
                 Err(e) => return Err(Error::io(path, e)),
             }
@@ -109,6 +119,22 @@ impl AtomicFile {
     }
 }
 
+/// Gives `file` the mode of the file that it is to replace, at once: nobody else reads what is private meanwhile.
+#[cfg(unix)]
+fn take_over(file: &File, old: &fs::Metadata) {
+    use std::os::unix::fs::PermissionsExt;
+    // File systems without modes refuse, and have nothing to keep.
+    let _ = file.set_permissions(fs::Permissions::from_mode(old.permissions().mode() & 0o777));
+}
+
+#[cfg(not(unix))]
+fn take_over(_: &File, _: &fs::Metadata) {}
+
+/// The file that writing `path` would replace or make.
+fn resolved(path: &Path) -> io::Result<PathBuf> {
+    if path.exists() { fs::canonicalize(path) } else { followed(path) }
+}
+
 /// What `path` names, or would if it were there: through symbolic links that lead to nothing yet.
 fn followed(path: &Path) -> io::Result<PathBuf> {
     let mut named = path.to_path_buf();
@@ -125,6 +151,8 @@ fn followed(path: &Path) -> io::Result<PathBuf> {
 /// Removes the temporary files of `path` whose processes are gone; only where the system lists its processes.
 pub(crate) fn remove_orphans(path: &Path) {
     let processes = Path::new("/proc");
+    // Temporary files stand beside what a link leads to.
+    let Ok(path) = resolved(path) else { return };
     let (Some(name), true) = (path.file_name().and_then(|n| n.to_str()), processes.join("self").exists()) else {
         return;
     };
@@ -228,6 +256,35 @@ mod tests {
         remove_orphans(&folder.path().join("a.bin"));
         assert_eq!(entries(folder.path()).len(), 4);
         assert!(!folder.path().join(".a.bin.0-1.tmp").exists());
+        // By way of a link from elsewhere.
+        let (elsewhere, orphan) = (tempfile::tempdir().unwrap(), folder.path().join(".b.bin.0-1.tmp"));
+        std::os::unix::fs::symlink(folder.path().join("b.bin"), elsewhere.path().join("link")).unwrap();
+        assert!(orphan.exists());
+        remove_orphans(&elsewhere.path().join("link"));
+        assert!(!orphan.exists());
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn modes_are_kept_and_read_only_files_refused() {
+        use std::os::unix::fs::PermissionsExt;
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.bin");
+        fs::write(&path, "old").unwrap();
+        let set = |mode| fs::set_permissions(&path, fs::Permissions::from_mode(mode)).unwrap();
+        let mode = |path: &Path| fs::metadata(path).unwrap().permissions().mode() & 0o777;
+        for kept in [0o600, 0o640, 0o666] {
+            set(kept);
+            let file = AtomicFile::create(&path).unwrap();
+            assert_eq!(mode(&file.temporary), kept, "from the beginning");
+            file.commit().unwrap();
+            assert_eq!(mode(&path), kept);
+        }
+        fs::write(&path, "precious").unwrap();
+        set(0o444);
+        let message = AtomicFile::create(&path).unwrap_err().to_string();
+        assert!(message.contains("a.bin: is read-only"), "{message}");
+        assert_eq!((entries(folder.path()).len(), fs::read(&path).unwrap()), (1, b"precious".to_vec()));
     }
 
     #[cfg(unix)]

@@ -54,6 +54,21 @@ struct State {
     warned: bool,
 }
 
+/// What the file of a checkpoint holds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Held {
+    /// There is none.
+    Nothing,
+    /// This job.
+    This,
+    /// Another job.
+    Another,
+    /// The job of another version, which this one cannot read.
+    AnotherVersion,
+    /// Nothing that can be read.
+    Damage,
+}
+
 /// Stage and number of a block.
 type Key = (u32, u64);
 
@@ -134,11 +149,18 @@ impl Checkpoint {
     /// killed runs are removed.
     ///
     /// # Errors
-    /// `Io`; `Invalid` if the file is damaged or of another job; the message names the first difference.
+    /// `Io`; `Invalid` if the file is damaged, of another version or of another job; the message names the first
+    /// difference.
     pub fn resume(&self) -> Result<bool> {
         atomic::remove_orphans(&self.path);
         if !self.path.exists() {
             return Ok(false);
+        }
+        if self.held()? == Held::AnotherVersion {
+            return Err(Error::invalid(
+                &self.path,
+                "is the checkpoint of another version of isolume; go on with that, or delete it and start without --resume",
+            ));
         }
         let (job, log) = Log::open(&self.path)?.ok_or_else(|| {
             Error::invalid(&self.path, "is no checkpoint or is damaged; delete it and start without --resume")
@@ -158,6 +180,30 @@ impl Checkpoint {
             (state.log, state.resumed) = (Some(log), true);
         }
         Ok(true)
+    }
+
+    /// What the file holds, by its beginning.
+    ///
+    /// # Errors
+    /// `Io`.
+    pub fn held(&self) -> Result<Held> {
+        if !self.path.exists() {
+            return Ok(Held::Nothing);
+        }
+        let mut file = files::open(&self.path)?;
+        let mut read = || -> std::io::Result<Held> {
+            let magic = take(&mut file, MAGIC.len() as u64)?;
+            if magic != MAGIC {
+                let another = magic.starts_with(ANY_MAGIC) && !MAGIC.starts_with(&magic);
+                return Ok(if another { Held::AnotherVersion } else { Held::Damage });
+            }
+            Ok(match job(&mut file)? {
+                Some(job) if job == self.job => Held::This,
+                Some(_) => Held::Another,
+                None => Held::Damage,
+            })
+        };
+        read().map_err(|e| Error::io(&self.path, e))
     }
 
     /// The file.
@@ -286,6 +332,31 @@ fn head((stage, block): Key, bytes: &[u8]) -> [u8; HEAD] {
     head
 }
 
+/// At most `n` bytes: fewer at the end.
+fn take(from: &mut impl Read, n: u64) -> std::io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    from.take(n).read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
+fn number(bytes: &[u8]) -> Option<u64> {
+    bytes.try_into().map(u64::from_le_bytes).ok()
+}
+
+fn small(bytes: &[u8]) -> Option<u32> {
+    bytes.try_into().map(u32::from_le_bytes).ok()
+}
+
+/// The job, which stands behind the magic; `None` if it is damaged.
+fn job(from: &mut impl Read) -> std::io::Result<Option<String>> {
+    let Some(count) = number(&take(from, 8)?) else { return Ok(None) };
+    let job = take(from, count)?;
+    if job.len() as u64 != count || small(&take(from, 4)?) != Some(checksum(&job)) {
+        return Ok(None);
+    }
+    Ok(String::from_utf8(job).ok())
+}
+
 impl Log {
     /// Writes a file of the blocks of an older one that are not replaced, and of `new` ones.
     fn create(path: &Path, job: &str, old: Option<&Self>, new: &BTreeMap<Key, Vec<u8>>) -> Result<Self> {
@@ -332,27 +403,14 @@ impl Log {
     /// The job, where the blocks are, the bytes that are whole and those of blocks since replaced.
     #[allow(clippy::type_complexity, reason = "the parts of a log")]
     fn scan(mut from: impl Read) -> std::io::Result<Option<(String, BTreeMap<Key, (u64, usize)>, u64, u64)>> {
-        // At most `n` bytes: fewer at the end.
-        let mut take = |n: u64| -> std::io::Result<Vec<u8>> {
-            let mut bytes = Vec::new();
-            from.by_ref().take(n).read_to_end(&mut bytes)?;
-            Ok(bytes)
-        };
-        let number = |bytes: &[u8]| bytes.try_into().map(u64::from_le_bytes).ok();
-        let small = |bytes: &[u8]| bytes.try_into().map(u32::from_le_bytes).ok();
-        if take(MAGIC.len() as u64)? != MAGIC {
+        if take(&mut from, MAGIC.len() as u64)? != MAGIC {
             return Ok(None);
         }
-        let Some(count) = number(&take(8)?) else { return Ok(None) };
-        let job = take(count)?;
-        if job.len() as u64 != count || small(&take(4)?) != Some(checksum(&job)) {
-            return Ok(None);
-        }
-        let Ok(job) = String::from_utf8(job) else { return Ok(None) };
+        let Some(job) = job(&mut from)? else { return Ok(None) };
         let mut length = (MAGIC.len() + 8 + job.len() + 4) as u64;
         let (mut blocks, mut dead) = (BTreeMap::new(), 0);
         loop {
-            let head = take(HEAD as u64)?;
+            let head = take(&mut from, HEAD as u64)?;
             if head.len() < HEAD {
                 break;
             }
@@ -364,7 +422,7 @@ impl Log {
             else {
                 return Ok(None);
             };
-            let bytes = take(count)?;
+            let bytes = take(&mut from, count)?;
             if (bytes.len() as u64) < count {
                 break;
             }
@@ -463,6 +521,29 @@ mod tests {
         assert!(message.contains("no checkpoint"), "{message}");
         third.remove();
         assert!(!path.exists());
+    }
+
+    #[test]
+    fn what_a_file_holds_is_told_by_its_beginning() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.checkpoint");
+        let open = |n| Checkpoint::new(&path, job(n), Duration::ZERO).unwrap();
+        assert_eq!(open(1).held().unwrap(), Held::Nothing);
+        let saved = open(1);
+        saved.stage(1).save(0, || vec![3]);
+        saved.save().unwrap();
+        assert_eq!([1, 2].map(|n| open(n).held().unwrap()), [Held::This, Held::Another]);
+        let bytes = std::fs::read(&path).unwrap();
+        for n in ANY_MAGIC.len()..MAGIC.len() + 8 + job(1).len() + 4 {
+            std::fs::write(&path, &bytes[..n]).unwrap();
+            assert_eq!(open(1).held().unwrap(), Held::Damage, "cut at {n}");
+        }
+        for version in ["1", "8", "13", "120"] {
+            std::fs::write(&path, format!("isolume checkpoint {version}\n of whatever")).unwrap();
+            assert_eq!(open(1).held().unwrap(), Held::AnotherVersion, "{version}");
+            let message = open(1).resume().unwrap_err().to_string();
+            assert!(message.contains("of another version"), "{message}");
+        }
     }
 
     /// What an open checkpoint holds.

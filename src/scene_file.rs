@@ -23,6 +23,7 @@ use crate::volume::generate::Generator;
 use crate::volume::raw::RawLayout;
 use crate::volume::statistics::VolumeStatistics;
 use crate::volume::{ElementType, Endian, Lattice, Volume};
+use clap::ArgAction;
 use glam::DVec3;
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
@@ -222,7 +223,8 @@ pub struct BoxOptions {
 #[derive(Clone, Debug, Default, clap::Args)]
 pub struct SceneOptions {
     /// The sweep: lowest and highest isovalue, in the volume's units (default: suggested from the data)
-    #[arg(long, num_args = 2, value_names = ["LO", "HI"], allow_negative_numbers = true)]
+    // Given twice it would be four numbers, of which nobody asks for any.
+    #[arg(long, num_args = 2, value_names = ["LO", "HI"], allow_negative_numbers = true, action = ArgAction::Set)]
     pub isovalues: Option<Vec<f64>>,
     /// The moment of a series of volumes; between two of its frames, their blend
     #[arg(long, value_name = "TIME", allow_hyphen_values = true)]

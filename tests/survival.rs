@@ -245,6 +245,7 @@ fn what_can_never_succeed_leaves_no_checkpoint_and_spares_older_ones() {
     fs::write(&checkpoint, older).unwrap();
     let text = hopeless(dir, &[]);
     assert_eq!(fs::read(&checkpoint).unwrap(), older, "{text}");
+    assert!(text.contains("unfinished bake of another version"), "{text}");
     fs::remove_file(&checkpoint).unwrap();
     // Its own, of an interrupted run, however much this one adds.
     let scene = SceneOptions { isovalues: Some(vec![50.0, 50.00000001]), ..SceneOptions::default() };
@@ -253,6 +254,9 @@ fn what_can_never_succeed_leaves_no_checkpoint_and_spares_older_ones() {
     let job = job(&scene, &BakeSettings::new(&options, &scene).unwrap());
     let interrupted = Checkpoint::new(&checkpoint, job, Duration::ZERO).unwrap();
     interrupted.stage(99).save(0, || vec![7; 100]);
+    let notes = [&[][..], &["--seed", "8"]].map(|more| hopeless(dir, more));
+    assert!(notes[0].contains("--resume would go on with it"), "{}", notes[0]);
+    assert!(notes[1].contains("unfinished bake of other settings"), "{}", notes[1]);
     for every in ["60", "0"] {
         let text = hopeless(dir, &["--resume", "--checkpoint-every", every]);
         assert!(text.contains("1 finished blocks") || every == "0", "{text}");

@@ -170,6 +170,7 @@ fn misspellings_are_told_what_was_meant() {
     for (args, said) in [
         (&["bkae", "x.vti"][..], "'bake'"),
         (&["bake", "x.vti", "-o", "y.vti", "--isovalue", "1", "2"], "'--isovalues'"),
+        (&["bake", "s.toml", "-o", "y.vti", "--isovalues", "1", "2", "--isovalues", "3", "4"], "'--isovalues"),
         (&["bake", "s.toml", "-o", "y.vti"], "s.toml:4: unknown key `photns` in [bake]; did you mean `photons`?"),
         (&["flatland", "f.toml", "-o", "d"], "f.toml:4: unknown key `luminair` in [box]; did you mean `luminaire`?"),
     ] {

@@ -5,7 +5,7 @@ use crate::bake::{
     BakeOptions, BakeReport, BakeSettings, Engine, MemoryEstimate, TimeEstimate, bake_fields, digest, job, left_out,
     supported,
 };
-use crate::checkpoint::Checkpoint;
+use crate::checkpoint::{Checkpoint, Held};
 use crate::error::{Error, Result};
 use crate::export::bake_file::{self, BakedVolume};
 use crate::field::Sweep;
@@ -367,8 +367,15 @@ impl Bake {
         let checkpoint = Checkpoint::new(&path, job, self.every()?)?;
         let label = if self.resume { "resumed" } else { "note" };
         if !self.resume {
-            if path.exists() {
-                say!("{label:>14}  {} holds an unfinished bake; --resume would go on with it", path.display());
+            let held = match checkpoint.held()? {
+                Held::Nothing => None,
+                Held::This => Some("an unfinished bake; --resume would go on with it"),
+                Held::Another => Some("an unfinished bake of other settings, which this one will replace"),
+                Held::AnotherVersion => Some("an unfinished bake of another version, which this one will replace"),
+                Held::Damage => Some("nothing that can be resumed; this bake will replace it"),
+            };
+            if let Some(what) = held {
+                say!("{label:>14}  {} holds {what}", path.display());
             }
         } else if checkpoint.resume()? {
             say!("{label:>14}  {} finished blocks from {}", checkpoint.blocks(), path.display());
