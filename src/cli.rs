@@ -358,14 +358,15 @@ impl Render {
         }
         let rendered = if self.reference {
             baked.as_ref().map_or(Ok(()), BakedVolume::whole).map_err(|e| e.in_file(&self.file))?;
-            let picture = reference::picture(scene, isovalue, &camera, self.samples, self.trilinear, &device()?)?;
+            let picture =
+                reference::picture(scene, isovalue, &camera, self.samples, self.trilinear, &device()?, progress)?;
             Rendered { picture, unbaked: 0.0 }
         } else {
             let shading = match &baked {
                 Some(baked) if !self.local => Shading::Baked(baked),
                 _ => Shading::Local(exposure),
             };
-            render(scene, isovalue, &camera, shading, self.samples, &device()?)?
+            render(scene, isovalue, &camera, shading, self.samples, &device()?, progress)?
         };
         let exposure = exposure * self.exposure;
         if exr {

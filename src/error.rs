@@ -24,7 +24,7 @@ pub enum Error {
     #[error("Embree: {0}")]
     Embree(String),
     /// The user interrupted the work.
-    #[error("interrupted; no output was written")]
+    #[error("interrupted; no unfinished output was written")]
     Interrupted,
     /// A check on results failed (`compare`, `selftest`).
     #[error("{0}")]

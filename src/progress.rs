@@ -29,6 +29,14 @@ pub fn interrupted() -> bool {
     INTERRUPTED.load(Ordering::Relaxed)
 }
 
+/// Goes on unless someone has asked to stop.
+///
+/// # Errors
+/// `Interrupted`.
+pub fn unless_interrupted() -> Result<()> {
+    if interrupted() { Err(Error::Interrupted) } else { Ok(()) }
+}
+
 /// Where progress goes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Progress {
@@ -117,9 +125,7 @@ impl Stage {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
-        if interrupted() {
-            return Err(Error::Interrupted);
-        }
+        unless_interrupted()?;
         if self.shown {
             say!("{:>14}  {seconds:.2} s", self.name);
         }

@@ -7,6 +7,7 @@ use crate::export::bake_file::BakedVolume;
 use crate::export::picture::Picture;
 use crate::flat;
 use crate::flattened::{FlattenedHit, FlattenedRay, Side, Target, split_face};
+use crate::progress::Progress;
 use crate::rng::{Sobol, Stage};
 use crate::scene::Scene;
 use crate::tracer::Tracer;
@@ -83,7 +84,7 @@ pub struct Rendered {
 /// Renders the isosurface at `isovalue` (source units) with `samples` rays per pixel.
 ///
 /// # Errors
-/// `Invalid` for an isovalue outside the sweep or an impossible camera; `Embree`.
+/// `Invalid` for an isovalue outside the sweep or an impossible camera; `Embree`; `Interrupted`.
 pub fn render(
     scene: &Scene,
     isovalue: f64,
@@ -91,6 +92,7 @@ pub fn render(
     shading: Shading<'_>,
     samples: u32,
     device: &Device,
+    progress: Progress,
 ) -> Result<Rendered> {
     let sweep = scene.field.sweep();
     if !(isovalue >= sweep.lo() && isovalue <= sweep.hi()) {
@@ -110,7 +112,7 @@ pub fn render(
             DVec3::ZERO
         }),
     };
-    let picture = trace_picture(scene, &tracer, c, camera, samples, &shade)?;
+    let picture = trace_picture(scene, &tracer, c, camera, samples, &shade, progress)?;
     let total = (camera.size[0] * camera.size[1]) as f64 * f64::from(samples);
     Ok(Rendered { picture, unbaked: unbaked.into_inner() as f64 / total })
 }
@@ -119,7 +121,7 @@ pub fn render(
 /// misses are black.
 ///
 /// # Errors
-/// `Invalid` for an impossible camera.
+/// `Invalid` for an impossible camera; `Interrupted`.
 pub fn trace_picture<T: Tracer>(
     scene: &Scene,
     tracer: &T,
@@ -127,12 +129,17 @@ pub fn trace_picture<T: Tracer>(
     camera: &Camera,
     samples: u32,
     shade: &(dyn Fn(&FlattenedRay, FlattenedHit, DVec3) -> DVec3 + Sync),
+    progress: Progress,
 ) -> Result<Picture> {
     let [forward, right, down] = camera.basis().map(|[f, r, u]| [f, r, -u])?;
     let [width, height] = camera.size;
     let eye = scene.lattice().to_index(camera.eye).as_vec3();
     let mut picture = Picture::new(width, height);
+    let stage = progress.stage("picture", (width * height) as u64);
     picture.rgb.par_iter_mut().enumerate().with_min_len(64).for_each(|(i, pixel)| {
+        if !stage.tick(1) {
+            return;
+        }
         let set = Sobol::set(0, Stage::Picture, i as u64);
         let mut sum = DVec3::ZERO;
         for s in 0..samples {
@@ -146,6 +153,7 @@ pub fn trace_picture<T: Tracer>(
         }
         *pixel = (sum / f64::from(samples)).as_vec3().to_array();
     });
+    stage.end()?;
     Ok(picture)
 }
 

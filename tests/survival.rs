@@ -218,6 +218,42 @@ fn a_full_disk_is_one_clear_line_and_keeps_the_last_checkpoint() {
     assert!(light(&dir.join("out.vti")) == light(&dir.join("whole.vti")));
 }
 
+#[test]
+fn pictures_can_be_interrupted_and_keep_older_ones() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    volume(dir, "33");
+    let flat = "[field]\ngenerator = \"bumps2\"\n";
+    fs::write(dir.join("flat.toml"), flat).unwrap();
+    fs::create_dir(dir.join("flat")).unwrap();
+    let kept = ["out.png", "flat/flattened.png"];
+    kept.iter().for_each(|name| fs::write(dir.join(name), "precious").unwrap());
+    // Minutes of work.
+    let render = ["render", "b.vti", "--isovalue", "50", "-o", "out.png", "--samples", "60000"];
+    for args in [
+        &[&render[..], &["--reference"]].concat()[..],
+        &[&render[..], &["--reference", "--trilinear"]].concat(),
+        &[&render[..], &["--local"]].concat(),
+        &["flatland", "flat.toml", "-o", "flat", "--gather", "60000"],
+        &["flatland", "flat.toml", "-o", "flat", "--gather", "4", "--width", "8192"],
+    ] {
+        let mut command = Command::new(PROGRAM);
+        command.current_dir(dir).args(args).stdout(Stdio::null()).stderr(Stdio::piped());
+        let child = command.spawn().unwrap();
+        std::thread::sleep(Duration::from_secs(1));
+        let begun = std::time::Instant::now();
+        assert!(Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());
+        let (output, text) = finish(child);
+        assert_eq!(output.status.code(), Some(130), "{args:?}: {text}");
+        assert!(text.contains("interrupted"), "{args:?}: {text}");
+        println!("{args:?} {:?}", begun.elapsed());
+        assert!(begun.elapsed() < Duration::from_secs(20), "{args:?}: {:?}", begun.elapsed());
+    }
+    for name in kept {
+        assert_eq!(fs::read(dir.join(name)).unwrap(), b"precious", "{name}");
+    }
+}
+
 /// A bake that no resuming can help: no grid point holds anything of its sweep.
 fn hopeless(dir: &Path, more: &[&str]) -> String {
     let mut command = Command::new(PROGRAM);

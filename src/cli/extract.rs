@@ -4,7 +4,7 @@ use super::{expect_extension, outputs};
 use crate::error::{Error, Result};
 use crate::export::Mesh;
 use crate::export::bake_file::BakedVolume;
-use crate::progress::{Progress, say};
+use crate::progress::{Progress, say, unless_interrupted};
 use crate::scene::Scene;
 use crate::scene_file::{Inputs, SceneOptions, load};
 use crate::series::is_pattern;
@@ -54,6 +54,7 @@ impl Extract {
             Some(_) => unit_isovalue(&scene.field, self.isovalue).map_err(|e| self.without_light(&e))?,
             None => scene.field.sweep().isovalue(self.isovalue),
         };
+        unless_interrupted()?;
         let mesh = SurfaceMesh::extract(&scene, isovalue, self.refine)?;
         let radiance = baked.as_ref().map(|b| texture(b, &mesh.positions)).transpose()?;
         let channels: Option<[Vec<f32>; 3]> = radiance.as_ref().map(|r| [0, 1, 2].map(|c| channel(r, c)));
@@ -62,6 +63,7 @@ impl Extract {
             Some([r, g, b]) => vec![("radiance_r", r), ("radiance_g", g), ("radiance_b", b)],
             None => Vec::new(),
         };
+        unless_interrupted()?;
         Mesh { colours: colours.as_deref(), ..mesh.export(&properties) }.write(&self.output)?;
         if self.json {
             let numbers = serde_json::json!({

@@ -167,11 +167,12 @@ pub(super) fn picture(
     samples: u32,
     trilinear: bool,
     device: &Device,
+    progress: Progress,
 ) -> Result<Picture> {
     let isovalue = unit_isovalue(&scene.field, isovalue)?;
     if trilinear {
-        path_picture(scene, &GraphTracer::new(device, scene)?, isovalue, camera, samples)
+        path_picture(scene, &GraphTracer::new(device, scene)?, isovalue, camera, samples, progress)
     } else {
-        path_picture(scene, &SurfaceTracer::new(device, scene, isovalue, 1)?, isovalue, camera, samples)
+        path_picture(scene, &SurfaceTracer::new(device, scene, isovalue, 1)?, isovalue, camera, samples, progress)
     }
 }

@@ -8,6 +8,7 @@ use crate::embree::Device;
 use crate::error::Result;
 use crate::export::picture::Picture;
 use crate::flattened::{FlattenedRay, Side, Target};
+use crate::progress::{interrupted, unless_interrupted};
 use crate::rng::{Sobol, Stage};
 use crate::tracer::Tracer;
 use glam::{DVec2, DVec3};
@@ -59,13 +60,14 @@ struct Raster {
 }
 
 impl Raster {
+    /// Nothing once someone has asked to stop.
     fn new(world: &World, factor: usize, light: impl Fn(&Receiver) -> DVec3 + Sync) -> Self {
         let dims = world.scene.field.dims().map(|n| (n - 1) * factor + 1);
         let values = (0..dims[0] * dims[1])
             .into_par_iter()
             .map(|o| {
                 let p = DVec2::new((o % dims[0]) as f64, (o / dims[0]) as f64) / factor as f64;
-                let receiver = world.graph_receiver(p, world.scene.outside);
+                let receiver = (!interrupted()).then(|| world.graph_receiver(p, world.scene.outside)).flatten();
                 receiver.map_or([f32::NAN; 3], |r| light(&r).as_vec3().to_array())
             })
             .collect();
@@ -191,11 +193,14 @@ impl<'a> View<'a> {
         }
     }
 
-    /// Averages `shade` over stratified rays per pixel.
+    /// Averages `shade` over stratified rays per pixel; black once someone has asked to stop.
     fn draw(&self, samples: u32, shade: impl Fn(Seen) -> DVec3 + Sync) -> Picture {
         let [w, h] = self.size;
         let mut picture = Picture::new(w, h);
         picture.rgb.par_iter_mut().enumerate().for_each(|(o, pixel)| {
+            if interrupted() {
+                return;
+            }
             let set = Sobol::set(1, Stage::Picture, o as u64);
             let mut sum = DVec3::ZERO;
             for i in 0..samples {
@@ -292,7 +297,7 @@ pub(super) fn side_by_side(pictures: &[Picture]) -> Picture {
 /// [`PictureSettings::paths`] photons. Returns the names.
 ///
 /// # Errors
-/// `Io`, `Embree`.
+/// `Io`, `Embree`, `Interrupted`.
 pub fn write_pictures(
     folder: &Path,
     device: &Device,
@@ -320,8 +325,10 @@ pub fn write_pictures(
             ("isolume:transport".to_owned(), name.to_owned()),
             ("isolume:exposure".to_owned(), look.exposure.to_string()),
         ];
+        unless_interrupted()?;
         linear.write_exr(folder.join(format!("{name}.exr")), &attributes)?;
         let shown = lit(&view, &look, settings.samples, &[], 1.0);
+        unless_interrupted()?;
         shown.write_png(folder.join(format!("{name}.png")), 1.0)?;
         names.extend([format!("{name}.png"), format!("{name}.exr")]);
         both.push(shown);
@@ -331,7 +338,9 @@ pub fn write_pictures(
         side_by_side(&both).write_png(folder.join("both.png"), 1.0)?;
         names.push("both.png".into());
     }
-    lit(&view, &looks[0], settings.samples, &levels, 1.0).write_png(folder.join("waterlines.png"), 1.0)?;
+    let waterlines = lit(&view, &looks[0], settings.samples, &levels, 1.0);
+    unless_interrupted()?;
+    waterlines.write_png(folder.join("waterlines.png"), 1.0)?;
     write_svg(&folder.join("levelsets.svg"), &first.scene, &levels)?;
     names.extend(["waterlines.png".to_owned(), "levelsets.svg".to_owned()]);
     if settings.paths > 0 {
@@ -343,6 +352,7 @@ pub fn write_pictures(
             draw_paths(&view, look.world, &mut picture, plane, settings.paths);
             pictures.push(picture);
         }
+        unless_interrupted()?;
         side_by_side(&pictures).write_png(folder.join("paths.png"), 1.0)?;
         names.push("paths.png".into());
     }

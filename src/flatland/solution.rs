@@ -2,9 +2,9 @@
 //! others over fixed stratified directions until nothing changes.
 
 use super::{Landing, Receiver, World};
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::flattened::Side;
-use crate::progress::interrupted;
+use crate::progress::{interrupted, unless_interrupted};
 use crate::rng::{Sobol, Stage};
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
@@ -113,14 +113,13 @@ impl Solution {
                     .collect()
             })
             .collect();
-        if interrupted() {
-            return Err(Error::Interrupted);
-        }
+        unless_interrupted()?;
         // The other side of the graph matters only if light gets there.
         let other = outside.opposite();
         let meets_other = |r: &Row| r.landings.iter().any(|l| matches!(l, Landing::Graph(_, _, s) if *s == other));
         if graph[outside.index()].par_iter().flatten().any(meets_other) {
             graph[other.index()] = graph_rows(other);
+            unless_interrupted()?;
         }
         let points: usize = graph.iter().map(Vec::len).chain(walls.iter().map(Vec::len)).sum();
         solution.rays = points as u64 * u64::from(settings.gather + settings.shadow);
@@ -151,9 +150,7 @@ impl Solution {
             if !(change > 1e-5 * most) || solution.passes == MAX_PASSES {
                 return Ok(solution);
             }
-            if interrupted() {
-                return Err(Error::Interrupted);
-            }
+            unless_interrupted()?;
         }
     }
 
@@ -195,7 +192,11 @@ impl Solution {
     }
 }
 
+/// Nothing once someone has asked to stop.
 fn row(world: &World, settings: &SolveSettings, receiver: &Receiver, albedo: DVec3, key: u64) -> Row {
+    if interrupted() {
+        return Row { albedo, direct: DVec3::ZERO, landings: Vec::new() };
+    }
     let set = Sobol::set(settings.seed, Stage::Cache, key);
     let landings =
         (0..settings.gather).map(|i| world.trace(receiver, world.direction(receiver, set.point2(i, 0)))).collect();

@@ -171,9 +171,7 @@ impl Bench {
             .enumerate()
             .filter_map(|(i, &p)| Some((p, self.radiance(p, 12, self.settings.gather, i as u64)?)))
             .collect();
-        if crate::progress::interrupted() {
-            return Err(Error::Interrupted);
-        }
+        crate::progress::unless_interrupted()?;
         let grid = self.shepard(&samples);
         let seconds = begun.elapsed().as_secs_f64();
         let exposure = self.world.exposure();

@@ -7,6 +7,7 @@ use crate::export::picture::Picture;
 use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Target};
 use crate::landing::{landing, touches};
 use crate::luminaire::{Aim, unoccluded};
+use crate::progress::Progress;
 use crate::render::{Camera, trace_picture};
 use crate::rng::{Rng, Sobol, Stage};
 use crate::scene::Scene;
@@ -130,20 +131,21 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
 /// A picture of hyperplane `isovalue` by `samples` paths per pixel; luminaires are seen.
 ///
 /// # Errors
-/// `Invalid` for an impossible camera.
+/// `Invalid` for an impossible camera; `Interrupted`.
 pub fn path_picture<T: Tracer>(
     scene: &Scene,
     tracer: &T,
     isovalue: f32,
     camera: &Camera,
     samples: u32,
+    progress: Progress,
 ) -> Result<Picture> {
     // Paths are told apart by their ray: the same picture on any number of threads.
     let shade = |ray: &FlattenedRay, hit, direction: DVec3| {
         let key = direction.to_array().iter().fold(0u64, |k, x| (k ^ x.to_bits()).wrapping_mul(0x9e37_79b9_7f4a_7c15));
         path_radiance(scene, tracer, ray, hit, &mut Rng::stream(1, Stage::Path, key))
     };
-    trace_picture(scene, tracer, isovalue, camera, samples, &shade)
+    trace_picture(scene, tracer, isovalue, camera, samples, &shade, progress)
 }
 
 /// Radiance seen along `ray` of a picture, from one path; what a luminaire emits is seen.

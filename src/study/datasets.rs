@@ -6,6 +6,7 @@ use crate::bake::{Bake, BakeOptions, BakeSettings, Engine, StrategyName};
 use crate::embree::{GraphTracer, SurfaceTracer};
 use crate::error::Result;
 use crate::illumination_grid::{GridSize, IlluminationGrid};
+use crate::progress::Progress;
 use crate::reference::{Reference, ReferenceSettings, path_picture, reference};
 use crate::render::Camera;
 use crate::scene::Scene;
@@ -147,7 +148,7 @@ fn reference_picture(study: &Study, scene: &Scene, isovalue: f32) -> Result<f64>
     let tracer = SurfaceTracer::new(&study.device, scene, isovalue, 1)?;
     let camera = Camera { size: [400; 2], ..Camera::facing(scene, 400) };
     let samples = if study.quick { 4 } else { 64 };
-    path_picture(scene, &tracer, isovalue, &camera, samples)?;
+    path_picture(scene, &tracer, isovalue, &camera, samples, Progress::Quiet)?;
     Ok(begun.elapsed().as_secs_f64())
 }
 

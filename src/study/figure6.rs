@@ -5,6 +5,7 @@ use crate::bake::{Bake, StrategyName};
 use crate::error::Result;
 use crate::export::bake_file::BakedVolume;
 use crate::export::picture::Picture;
+use crate::progress::Progress;
 use crate::render::{Camera, Shading, render};
 use crate::sampling::positions;
 use glam::DVec3;
@@ -26,8 +27,16 @@ pub(super) fn figure6(study: &Study, subject: &Subject, name: &str, strategy: St
     let panels = [
         samples(&baked, strategy, seed)?,
         slice(&baked, 0.4),
-        render(&baked.scene, subject.main_isovalue(), &square(&baked), Shading::Baked(&baked), 8, &study.device)?
-            .picture,
+        render(
+            &baked.scene,
+            subject.main_isovalue(),
+            &square(&baked),
+            Shading::Baked(&baked),
+            8,
+            &study.device,
+            Progress::Quiet,
+        )?
+        .picture,
     ];
     let mut sheet = Picture::new(3 * PANEL + 2 * GAP, PANEL);
     sheet.rgb.fill([1.0 / baked.exposure as f32; 3]);
