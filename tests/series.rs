@@ -115,8 +115,16 @@ fn frames_are_single_bakes_and_blends_those_of_blended_volumes() {
     assert!((0..3).all(|n| report(n)["photons"]["emitted"] == 4000 && report(n)["job"].is_string()));
     assert_ne!(report(0)["job"], report(1)["job"]);
     assert!(light(&dir.join("lit_0001.vti")) == first);
-    let text = ok(dir, &with(&["bake", "ball_%03d.nrrd", "-o", "lit.vti", "--resume", "--seed", "2"]));
-    assert!(!text.contains("is complete"), "{text}");
+    // Nor is a series of other settings replaced, unless this one was begun.
+    let other = with(&["bake", "ball_%03d.nrrd", "-o", "lit.vti", "--resume", "--seed", "2"]);
+    let before: Vec<_> = (0..3).map(written).collect();
+    let output = isolume(dir, &other);
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.code() == Some(2) && text.contains("lit_0000.vti: is a bake of other settings"), "{text}");
+    assert!((0..3).map(written).eq(before.iter().copied()), "{text}");
+    fs::remove_file(dir.join("lit_0000.vti")).unwrap();
+    let text = ok(dir, &other);
+    assert!(!text.contains("is complete") && light(&dir.join("lit_0001.vti")) != first, "{text}");
     ok(dir, &with(&["bake", "ball_%03d.nrrd", "-o", "lit.vti"]));
     assert!(written(0) > before[0], "without --resume all is done again");
 }

@@ -86,7 +86,7 @@ impl Bake {
         let series = if self.scene.time.is_none() { load_series(&self.input, &self.scene)? } else { None };
         let Some(series) = series else {
             outputs(self.outputs(), &inputs)?;
-            return self.one(begun, progress).map(drop);
+            return self.one(begun, progress, false).map(drop);
         };
         let frames: Vec<Self> = (0..series.times().len()).map(|n| self.frame(n)).collect();
         let collection = self.output.with_extension("pvd");
@@ -135,7 +135,7 @@ impl Bake {
             }
             scene.time = Some(time);
             let frame = Self { scene: scene.clone(), ..frame };
-            let sweep = frame.one(Clock::start(), progress)?;
+            let sweep = frame.one(Clock::start(), progress, n == 0)?;
             scene.isovalues = Some(vec![sweep.lo(), sweep.hi()]);
             if self.dry_run {
                 say!("{:>14}  that for each of {} frames", "series", series.times().len());
@@ -150,10 +150,11 @@ impl Bake {
         Ok(())
     }
 
-    /// The output, if it is there, whole and of this job.
-    fn complete(&self, job: &str) -> Option<BakedVolume> {
-        let found = self.output.exists().then(|| BakedVolume::read(&self.output).ok()).flatten();
-        found.filter(|b| b.report.get("job").and_then(|j| j.as_str()) == Some(&digest(job)))
+    /// The output, if it is there and whole, and whether it is of this job.
+    fn complete(&self, job: &str) -> Option<(BakedVolume, bool)> {
+        let found = self.output.exists().then(|| BakedVolume::read(&self.output).ok()).flatten()?;
+        let same = found.report.get("job").and_then(|j| j.as_str()) == Some(&digest(job));
+        Some((found, same))
     }
 
     /// Writes or prints the report, if that is wanted.
@@ -169,8 +170,8 @@ impl Bake {
         Ok(())
     }
 
-    /// One bake; returns its sweep.
-    fn one(&self, begun: Clock, progress: Progress) -> Result<Sweep> {
+    /// One bake, which may be the first of a series; returns its sweep.
+    fn one(&self, begun: Clock, progress: Progress, first: bool) -> Result<Sweep> {
         let loaded = load(&self.input, &self.scene)?;
         let load_seconds = begun.seconds();
         let extension = self.output.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
@@ -284,11 +285,21 @@ impl Bake {
         let job = job(&loaded.scene, &settings);
         if self.resume
             && self.scene.time.is_some()
-            && let Some(baked) = self.complete(&job)
+            && let Some((baked, same)) = self.complete(&job)
         {
-            say!("{:>14}  {} is complete", "resumed", self.output.display());
-            self.hand_out(&baked.report)?;
-            return Ok(sweep);
+            if same {
+                say!("{:>14}  {} is complete", "resumed", self.output.display());
+                self.hand_out(&baked.report)?;
+                return Ok(sweep);
+            }
+            // Had this series been begun, its first frame or a checkpoint of that would be there.
+            if first && Checkpoint::new(&self.checkpoint_path(), job.clone(), self.every()?)?.held()? != Held::This {
+                return Err(Error::invalid(
+                    &self.output,
+                    "is a bake of other settings or of another version, which --resume cannot go on with; give its settings, \
+                     or leave --resume out to replace the series",
+                ));
+            }
         }
         let checkpoint = self.checkpoint(job)?;
         let work = || -> Result<(Vec<crate::bake::Bake>, Clock)> {
