@@ -22,7 +22,7 @@ use crate::render::{Camera, Rendered, Shading, render};
 use crate::scene::{Policy, Scene};
 use crate::scene_file::{self, Inputs, RawOptions, SceneOptions, load};
 use crate::volume::statistics::VolumeStatistics;
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use glam::DVec3;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -179,7 +179,23 @@ struct Render {
 /// More are of no use to any machine, and take long to start.
 const MOST_THREADS: usize = 1024;
 
+/// The command, whose options all take negative numbers: a value out of its range is better named than an unknown
+/// option.
+fn with_negative_numbers(command: clap::Command) -> clap::Command {
+    let numbers = |arg: clap::Arg| {
+        let option = !arg.is_positional() && arg.get_action().takes_values();
+        if option { arg.allow_negative_numbers(true) } else { arg }
+    };
+    command.mut_args(numbers).mut_subcommands(with_negative_numbers)
+}
+
 impl Cli {
+    /// From the arguments of the process, which ends here if they are wrong or ask for help.
+    pub fn from_arguments() -> Self {
+        let matches = with_negative_numbers(Self::command()).get_matches();
+        Self::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())
+    }
+
     /// Runs the verb.
     ///
     /// # Errors
@@ -255,7 +271,8 @@ fn expect_extension(path: &Path, known: &[&str]) -> Result<()> {
     if known.contains(&found.as_str()) {
         return Ok(());
     }
-    Err(Error::invalid(path, format!("cannot write '.{found}'; name a file that ends in .{}", known.join(" or ."))))
+    let what = if found.is_empty() { "has no extension".into() } else { format!("cannot write '.{found}'") };
+    Err(Error::invalid(path, format!("{what}; name a file that ends in .{}", known.join(" or ."))))
 }
 
 fn device() -> Result<Device> {

@@ -28,7 +28,9 @@ impl Sweep {
         if lo.is_finite() && hi.is_finite() && lo < hi && (hi - lo).is_finite() {
             Ok(Self { lo, hi })
         } else {
-            Err(Error::Invalid(format!("isovalues {lo} {hi}: the sweep needs two finite numbers, the lower first")))
+            Err(Error::Invalid(format!(
+                "isovalues {lo} {hi}: the sweep needs two different finite numbers, the lower first"
+            )))
         }
     }
 

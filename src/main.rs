@@ -1,13 +1,12 @@
 //! The command line's entry: parse, run, one clear line and an exit code on failure.
 
-use clap::Parser;
 use isolume::cli::Cli;
 use std::io::Write;
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
     end_quietly_when_nobody_reads();
-    match Cli::parse().run() {
+    match Cli::from_arguments().run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
             let _ = writeln!(std::io::stderr(), "isolume: {e}");

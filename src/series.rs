@@ -25,7 +25,7 @@ impl Series {
         let times = times.unwrap_or_else(|| (0..files.len()).map(|n| n as f64).collect());
         let fail = |what: String| Err(Error::Invalid(what));
         if files.len() < 2 {
-            return fail(format!("a series of {} file(s): it needs two or more", files.len()));
+            return fail(format!("a series of {} file(s) needs two or more", files.len()));
         }
         if times.len() != files.len() {
             return fail(format!("times: {} for {} files; give one each", times.len(), files.len()));
@@ -56,6 +56,9 @@ impl Series {
             if let Some(number) = number(pattern, Path::new(&file)) {
                 found.push((number, pattern.with_file_name(file)));
             }
+        }
+        if found.is_empty() {
+            return Err(Error::invalid(pattern, "no file has such a name; a series needs two or more"));
         }
         found.sort();
         let numbers = found.iter().map(|f| f.0 as f64).collect();

@@ -440,6 +440,9 @@ impl Volume {
             ("raw", "") => {
                 Err(Error::invalid(path, "has no header: give its dimensions, sample type, byte order and spacing too"))
             }
+            ("toml" | "vtm", "") => {
+                Err(Error::not_supported(path, "names volumes, of which this takes one: give that volume's file"))
+            }
             _ => Err(Error::not_supported(
                 path,
                 format!("unknown extension; {READ} are read, and .raw with its layout given"),

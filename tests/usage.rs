@@ -149,6 +149,13 @@ fn results_as_json() {
     ok(dir, &["generate", "bumps", "--size", "15", "-o", "b.vti", "-q"]);
     let bake = ["bake", "b.vti", "--isovalues", "3.6", "95", "-o", "out.vti", "--photons", "4000", "--gather", "4"];
     let parse = |text: String| -> serde_json::Value { serde_json::from_str(&text).unwrap() };
+    let dry = parse(ok(dir, &[&bake[..], &["--dry-run", "--json", "--report", "r.json"]].concat()));
+    assert_eq!((&dry["settings"]["engine"], &dry["settings"]["photons"]), (&"photon".into(), &4000.into()), "{dry}");
+    let stages = |key: &str| dry[key].as_object().unwrap().values().map(|v| v.as_f64().unwrap()).collect::<Vec<_>>();
+    let close = |a: f64, b: &serde_json::Value| (a / b.as_f64().unwrap() - 1.0).abs() < 1e-9;
+    assert!(close(stages("seconds").iter().sum(), &dry["total_seconds"]), "{dry}");
+    assert!(close(stages("bytes").iter().copied().fold(0.0, f64::max), &dry["peak_bytes"]), "{dry}");
+    assert!(!dir.join("r.json").exists() && !dir.join("out.vti").exists());
     let report = parse(ok(dir, &[&bake[..], &["--samples", "2000", "--json", "--report", "r.json"]].concat()));
     assert_eq!(report["photons"]["emitted"], 4000);
     assert_eq!(report["settings"], parse(fs::read_to_string(dir.join("r.json")).unwrap())["settings"]);

@@ -45,7 +45,7 @@ pub(super) struct Bake {
     /// Write seconds, rays, counts and settings as JSON
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
-    /// Print the same JSON
+    /// Print the same JSON; with --dry-run the estimates
     #[arg(long)]
     json: bool,
     /// Where progress is kept until the bake is done (default: OUTPUT.checkpoint)
@@ -61,7 +61,7 @@ pub(super) struct Bake {
     /// isovalues cut into bands; refuse a bake that still needs more
     #[arg(long, value_name = "BYTES", value_parser = bytes)]
     max_memory: Option<u64>,
-    /// Print what memory and time it would take, check everything, and stop before the work
+    /// Print what memory and time it would take, check everything, and stop before the work; nothing is written
     #[arg(long)]
     dry_run: bool,
     #[command(flatten)]
@@ -278,7 +278,18 @@ impl Bake {
             if let Err(e) = fits {
                 say!("warning: {e}");
             }
-            say!("{:>14}  {}", "time", TimeEstimate::new(&loaded.scene, &settings, &device)?);
+            let time = TimeEstimate::new(&loaded.scene, &settings, &device)?;
+            say!("{:>14}  {time}", "time");
+            if self.json {
+                let json = serde_json::json!({
+                    "settings": settings,
+                    "bytes": memory.stages.iter().copied().collect::<BTreeMap<_, _>>(),
+                    "peak_bytes": memory.peak(),
+                    "seconds": time.stages.iter().copied().collect::<BTreeMap<_, _>>(),
+                    "total_seconds": time.total(),
+                });
+                println!("{json:#}");
+            }
             return Ok(sweep);
         }
         fits?;

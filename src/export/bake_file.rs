@@ -300,6 +300,10 @@ impl BakedVolume {
             let fields = multi_block::read(path)?.iter().map(|file| Self::one(file)).collect::<Result<Vec<_>>>()?;
             return Self::seen_from(fields, 0).map_err(|e| e.in_file(path));
         }
+        if !path.extension().is_some_and(|e| e.eq_ignore_ascii_case("vti")) {
+            std::fs::metadata(path).map_err(|e| Error::io(path, e))?;
+            return Err(Error::invalid(path, "is no bake (.vti, .vtm); make one with `isolume bake`"));
+        }
         Self::one(path)
     }
 

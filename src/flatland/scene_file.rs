@@ -7,6 +7,7 @@ use crate::flattened::Side;
 use crate::scene_file::{OutsideName, Rgb, fault, numbers};
 use glam::{DVec2, DVec3};
 use serde::Deserialize;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 #[derive(Debug, Deserialize)]
@@ -55,7 +56,10 @@ struct BoxKeys {
 /// # Errors
 /// `Io`; `Invalid` with file, line and key; what reading the field returns.
 pub fn load(path: &Path) -> Result<FlatScene> {
-    let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+    let text = std::fs::read_to_string(path).map_err(|e| match e.kind() {
+        ErrorKind::InvalidData => Error::invalid(path, "is no text; a scene file of n = 2 (.toml) is wanted"),
+        _ => Error::io(path, e),
+    })?;
     let file: File = toml::from_str(&text).map_err(|e| fault(path, &text, &e))?;
     build(path, &file).map_err(|e| match e {
         // What is wrong in the field's own file names that file already.

@@ -46,6 +46,23 @@ fn bad_input_is_one_clear_line_and_leaves_nothing() {
     refused(dir, &["bake", "ramp.nrrd", "-o", "out.png"], &["out.png", ".vti"]);
     refused(dir, &["bake", "ramp.nrrd", "-o", "out.nrrd"], &["out.nrrd", "isolume export"]);
 
+    // Files of another kind, by what is wanted instead.
+    fs::write(dir.join("s.toml"), "[volume]\ngenerator = \"bumps\"\n").unwrap();
+    for file in ["ramp.nrrd", "s.toml"] {
+        refused(dir, &["render", file, "--isovalue", "5", "-o", "out.png"], &[file, "no bake", "isolume bake"]);
+        refused(dir, &["view", file, "-o", "out.html"], &[file, "no bake", "isolume bake"]);
+    }
+    refused(dir, &["info", "s.toml"], &["s.toml", "give that volume's file"]);
+    refused(dir, &["export", "s.toml", "-o", "out.nrrd"], &["s.toml", "give that volume's file"]);
+    refused(dir, &["flatland", "cut.nrrd", "-o", "out"], &["cut.nrrd", "scene file", ".toml"]);
+    refused(dir, &["bake", "none_%03d.nrrd", "-o", "out.vti"], &["none_%03d.nrrd", "no file has such a name"]);
+    refused(dir, &["bake", "ramp.nrrd", "-o", "out"], &["out: has no extension", ".vti"]);
+    // Negative numbers are values, not options.
+    refused(dir, &with(&["--margin", "-3"]), &["margin", "-3"]);
+    refused(dir, &with(&["--tau", "-3"]), &["tau", "-3"]);
+    let render = ["render", "nowhere.vti", "--isovalue", "5", "-o", "out.png", "--exposure", "-3"];
+    refused(dir, &render, &["--exposure -3", "positive"]);
+
     // Before the file is opened, which is not there.
     for exposure in ["nan", "inf", "-inf", "-1", "0", "-0"] {
         for output in ["out.png", "out.exr"] {
