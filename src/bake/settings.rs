@@ -413,25 +413,33 @@ impl BakeSettings {
             seed: o.seed.unwrap_or(1),
             bands: o.bands.unwrap_or(1),
         };
-        let checks = [
+        let s = &settings;
+        let checks: [(&str, &dyn std::fmt::Display, bool, &str); 10] = [
             (
                 "directions",
-                settings.directions.is_power_of_two() && (8..=1 << 20).contains(&settings.directions),
+                &s.directions,
+                s.directions.is_power_of_two() && (8..=1 << 20).contains(&s.directions),
                 "a power of two, 8 to 1048576",
             ),
             (
                 "light-points",
-                settings.light_points.is_power_of_two() && settings.light_points <= 1 << 16,
+                &s.light_points,
+                s.light_points.is_power_of_two() && s.light_points <= 1 << 16,
                 "a power of two, at most 65536",
             ),
-            ("samples", settings.samples != Some(0), "at least 1"),
-            ("photons-per-estimate", (2..=4096).contains(&settings.photons_per_estimate), "2 to 4096"),
-            ("neighbours", (1..=1024).contains(&settings.neighbours), "1 to 1024"),
-            ("shadow-rays", (1..=1 << 20).contains(&settings.shadow_rays), "1 to 1048576"),
-            ("gather", settings.gather_rays <= 1 << 20, "0 to 1048576"),
-            ("bands", (1..=MOST_BANDS).contains(&settings.bands), "1 to 256"),
-            ("tau", settings.tau > 0.0 && settings.tau.is_finite(), "above 0"),
-            ("wall-resolution", (2..=2048).contains(&settings.wall_resolution), "2 to 2048"),
+            ("samples", &0, s.samples != Some(0), "at least 1"),
+            (
+                "photons-per-estimate",
+                &s.photons_per_estimate,
+                (2..=4096).contains(&s.photons_per_estimate),
+                "2 to 4096",
+            ),
+            ("neighbours", &s.neighbours, (1..=1024).contains(&s.neighbours), "1 to 1024"),
+            ("shadow-rays", &s.shadow_rays, (1..=1 << 20).contains(&s.shadow_rays), "1 to 1048576"),
+            ("gather", &s.gather_rays, s.gather_rays <= 1 << 20, "0 to 1048576"),
+            ("bands", &s.bands, (1..=MOST_BANDS).contains(&s.bands), "1 to 256"),
+            ("tau", &s.tau, s.tau > 0.0 && s.tau.is_finite(), "above 0"),
+            ("wall-resolution", &s.wall_resolution, (2..=2048).contains(&s.wall_resolution), "2 to 2048"),
         ];
         if settings.engine == Engine::Sweep && settings.bands > 1 {
             return Err(Error::Invalid(
@@ -440,10 +448,10 @@ impl BakeSettings {
                     .into(),
             ));
         }
-        match checks.into_iter().find(|(_, ok, _)| !ok) {
-            Some((name, _, range)) => Err(Error::Invalid(format!("{name}: must be {range}"))),
-            None => Ok(settings),
+        if let Some((name, value, _, range)) = checks.into_iter().find(|(_, _, ok, _)| !ok) {
+            return Err(Error::Invalid(format!("{name} {value}: must be {range}")));
         }
+        Ok(settings)
     }
 
     pub(super) fn sweep(&self) -> SweepSettings {
@@ -490,8 +498,14 @@ mod tests {
             BakeSettings::with_engine(&o, Engine::Sweep).err().map(|e| e.to_string())
         };
         assert_eq!(fails(1 << 20, 1 << 16), None);
-        assert!(fails(1 << 32, 64).is_some_and(|e| e.contains("directions: must be a power of two, 8 to 1048576")));
-        assert!(fails(64, 1 << 33).is_some_and(|e| e.contains("light-points: must be a power of two, at most 65536")));
+        assert!(
+            fails(1 << 32, 64)
+                .is_some_and(|e| e.contains("directions 4294967296: must be a power of two, 8 to 1048576"))
+        );
+        assert!(
+            fails(64, 1 << 33)
+                .is_some_and(|e| e.contains("light-points 8589934592: must be a power of two, at most 65536"))
+        );
     }
 
     #[test]
