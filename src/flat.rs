@@ -5,6 +5,7 @@ use crate::flattened::{Departure, Side};
 use crate::reflectance::Reflectance;
 use crate::scene::{Boundary, Scene};
 use glam::DVec3;
+use rayon::prelude::*;
 
 /// A flat's place and material in the world.
 #[derive(Clone, Debug)]
@@ -133,11 +134,12 @@ impl Flat {
             .collect();
         // Slivers see too little to speak for themselves.
         let counts = |t: &Texel| t.covered > 1e-3;
-        let all: Vec<usize> = (0..texels.len()).filter(|&n| counts(&texels[n])).collect();
-        for n in (0..texels.len()).filter(|n| all.binary_search(n).is_err()).collect::<Vec<_>>() {
-            let away = |&m: &usize| (n % nu).abs_diff(m % nu).pow(2) + (n / nu).abs_diff(m / nu).pow(2);
-            if let Some(source) = all.iter().copied().min_by_key(away) {
-                texels[n] = Texel { covered: 0.0, at: texels[source].at, source };
+        let counting: Vec<bool> = texels.iter().map(counts).collect();
+        if counting.contains(&false) {
+            for (n, source) in nearest(&counting, nu).into_iter().enumerate().filter(|&(n, _)| !counting[n]) {
+                if let Some(source) = source {
+                    texels[n] = Texel { covered: 0.0, at: texels[source].at, source };
+                }
             }
         }
         texels
@@ -168,6 +170,49 @@ fn clipped(mut points: Vec<[f64; 2]>) -> Vec<[f64; 2]> {
         points = kept;
     }
     points
+}
+
+/// The nearest of those that count for each in a raster of rows of `nu`, the first of several as near.
+fn nearest(counting: &[bool], nu: usize) -> Vec<Option<usize>> {
+    // By row, the column of the nearest in it, the left of two.
+    let in_row: Vec<Option<usize>> = counting
+        .chunks(nu)
+        .flat_map(|row| {
+            let mut found = vec![None; nu];
+            let mut left = None;
+            for (i, found) in found.iter_mut().enumerate() {
+                left = if row[i] { Some(i) } else { left };
+                *found = left;
+            }
+            let mut right: Option<usize> = None;
+            for (i, found) in found.iter_mut().enumerate().rev() {
+                right = if row[i] { Some(i) } else { right };
+                let nearer = |r: usize| found.is_none_or(|l| r - i < i - l);
+                *found = right.filter(|&r| nearer(r)).or(*found);
+            }
+            found
+        })
+        .collect();
+    let nv = in_row.len() / nu;
+    let search = |n: usize| {
+        let (i, j) = (n % nu, n / nu);
+        let mut best = None;
+        // Rows further and further away, as long as they may hold one as near.
+        for away in 0..nv {
+            if best.is_some_and(|(least, _)| away * away > least) {
+                break;
+            }
+            let rows = [j.checked_sub(away), Some(j + away).filter(|&r| r < nv && away > 0)];
+            for row in rows.into_iter().flatten() {
+                if let Some(c) = in_row[row * nu + i] {
+                    let found = (away * away + i.abs_diff(c).pow(2), row * nu + c);
+                    best = Some(best.map_or(found, |b: (usize, usize)| b.min(found)));
+                }
+            }
+        }
+        best.map(|b| b.1)
+    };
+    (0..counting.len()).into_par_iter().map(|n| if counting[n] { Some(n) } else { search(n) }).collect()
 }
 
 /// Area and centroid of a convex polygon; the middle of the unit square if it has none.
@@ -267,6 +312,25 @@ pub fn texels(scene: &Scene, across: usize, isovalues: usize) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_nearest_is_that_of_a_search_through_all() {
+        let mut state = 1u32;
+        let mut random = |most: u32| {
+            state = state.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
+            (state >> 16) % most
+        };
+        for case in 0..200 {
+            let (nu, nv) = (1 + random(12) as usize, 1 + random(12) as usize);
+            let share = [1, 2, 10, 40][case % 4];
+            let counting: Vec<bool> = (0..nu * nv).map(|_| random(share) == 0 && case % 7 > 0).collect();
+            let all: Vec<usize> = (0..nu * nv).filter(|&n| counting[n]).collect();
+            for (n, found) in nearest(&counting, nu).into_iter().enumerate() {
+                let away = |&m: &usize| (n % nu).abs_diff(m % nu).pow(2) + (n / nu).abs_diff(m / nu).pow(2);
+                assert_eq!(found, all.iter().copied().min_by_key(away), "{n} of {nu}×{nv}");
+            }
+        }
+    }
 
     #[test]
     fn long_walls_have_more_texels_across() {

@@ -75,21 +75,22 @@ impl Axis {
         self.page[0] + (v - lo) / (hi - lo) * (self.page[1] - self.page[0])
     }
 
-    /// Tick values: 1, 2, 5 × powers of ten.
-    fn ticks(&self) -> Vec<f64> {
+    /// Ticks, at 1, 2, 5 × powers of ten, with their labels.
+    fn ticks(&self) -> Vec<(f64, String)> {
         let [lo, hi] = self.range;
         if self.log {
             #[allow(clippy::cast_possible_truncation, reason = "exponents of what is plotted")]
             let (first, last) = (lo.floor() as i32, hi.ceil() as i32);
             let steps: &[f64] = if hi - lo < 2.5 { &[1.0, 2.0, 5.0] } else { &[1.0] };
             let all = (first..=last).flat_map(|e| steps.iter().map(move |s| s * 10f64.powi(e)));
-            return all.filter(|v| (lo..=hi).contains(&v.log10())).collect();
+            return all.filter(|v| (lo..=hi).contains(&v.log10())).map(|v| (v, label(v, v))).collect();
         }
         let raw = (hi - lo) / 6.0;
         let power = 10f64.powf(raw.log10().floor());
         let step = [1.0, 2.0, 5.0, 10.0].map(|s| s * power).into_iter().find(|s| *s >= raw).unwrap_or(raw);
         let first = (lo / step).ceil();
-        (0..12).map(|i| (first + f64::from(i)) * step).take_while(|v| *v <= hi + 1e-9 * step).collect()
+        let all = (0..12).map(|i| (first + f64::from(i)) * step).take_while(|v| *v <= hi + 1e-9 * step);
+        all.map(|v| (v, label(v, step))).collect()
     }
 }
 
@@ -97,12 +98,19 @@ fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
 }
 
-/// A number as an axis shows it.
-fn tick_label(v: f64) -> String {
-    if v != 0.0 && !(1e-3..1e5).contains(&v.abs()) {
-        format!("{v:.0e}")
+/// A number as an axis shows it, to the digit that tells it from one `step` away.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "digits of an f64")]
+fn label(v: f64, step: f64) -> String {
+    let exponent = |x: f64| x.abs().max(f64::MIN_POSITIVE).log10().floor();
+    // As `{}` shows it without zeros at its end.
+    let shortest = |text: String| text.parse::<f64>().unwrap_or(v);
+    let last = exponent(step);
+    if v == 0.0 || v.abs() < 1e-9 * step {
+        "0".into()
+    } else if (1e-3..1e5).contains(&v.abs()) {
+        format!("{}", shortest(format!("{v:.0$}", (-last).clamp(0.0, 17.0) as usize)))
     } else {
-        format!("{}", (v * 1e6).round() / 1e6)
+        format!("{:e}", shortest(format!("{v:.0$e}", (exponent(v) - last).clamp(0.0, 17.0) as usize)))
     }
 }
 
@@ -126,23 +134,21 @@ impl Plot {
             "<text x=\"{middle}\" y=\"22\" text-anchor=\"middle\" font-size=\"15\">{}</text>\n",
             escaped(&self.title)
         ));
-        for v in x_axis.ticks() {
+        for (v, label) in x_axis.ticks() {
             let x = x_axis.at(v);
             put(format_args!("<path d=\"M{x:.1} {top}V{:.1}\" stroke=\"#ddd\"/>", HEIGHT - bottom));
             put(format_args!(
-                "<text x=\"{x:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{}</text>\n",
+                "<text x=\"{x:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{label}</text>\n",
                 HEIGHT - bottom + 17.0,
-                tick_label(v)
             ));
         }
-        for v in y_axis.ticks() {
+        for (v, label) in y_axis.ticks() {
             let y = y_axis.at(v);
             put(format_args!("<path d=\"M{left} {y:.1}H{:.1}\" stroke=\"#ddd\"/>", WIDTH - right));
             put(format_args!(
-                "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">{}</text>\n",
+                "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">{label}</text>\n",
                 left - 6.0,
                 y + 4.0,
-                tick_label(v)
             ));
         }
         for &v in self.guides.iter().filter(|v| (x_axis.page[0]..=x_axis.page[1]).contains(&x_axis.at(**v))) {
@@ -243,8 +249,25 @@ mod tests {
     #[test]
     fn ticks_are_round_and_inside() {
         let axis = Axis { range: [3.6, 95.0], log: false, page: [0.0, 1.0] };
-        assert_eq!(axis.ticks(), [20.0, 40.0, 60.0, 80.0]);
+        let [values, labels] = [true, false].map(|values| {
+            move |axis: &Axis| -> Vec<String> {
+                axis.ticks().into_iter().map(|(v, label)| if values { v.to_string() } else { label }).collect()
+            }
+        });
+        assert_eq!((values(&axis), labels(&axis)), (labels(&axis), ["20", "40", "60", "80"].map(String::from).into()));
         let axis = Axis { range: [-0.1, 1.1], log: true, page: [0.0, 1.0] };
-        assert_eq!(axis.ticks(), [1.0, 2.0, 5.0, 10.0]);
+        assert_eq!((values(&axis), labels(&axis)), (labels(&axis), ["1", "2", "5", "10"].map(String::from).into()));
+        let shown = |lo: f64, hi: f64| labels(&Axis { range: [lo, hi], log: false, page: [0.0, 1.0] });
+        assert_eq!(shown(-0.29, 0.3), ["-0.2", "-0.1", "0", "0.1", "0.2", "0.3"]);
+        assert_eq!(shown(110_000.0, 190_000.0), ["1.2e5", "1.4e5", "1.6e5", "1.8e5"]);
+        assert_eq!(shown(1.1e-7, 3.6e-7), ["1.5e-7", "2e-7", "2.5e-7", "3e-7", "3.5e-7"]);
+        for (lo, width) in
+            [(50.0, 1e-7), (-50.0, 1e-7), (1e6, 3.0), (1e12, 0.7), (1e-5, 1e-9), (0.0, 1e-12), (3.0, 7e20)]
+        {
+            let mut all = shown(lo, lo + width);
+            let count = all.len();
+            all.dedup();
+            assert!(count >= 3 && all.len() == count, "{all:?}");
+        }
     }
 }

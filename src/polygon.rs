@@ -70,6 +70,15 @@ impl Polygon {
         if let Some(i) = (0..n).find(|&i| turn(i) < -1e-9 * size * size) {
             return fail(format!("not convex at vertex {}; split it into triangles", (i + 1) % n + 1));
         }
+        // A pentagram turns left everywhere, twice around.
+        let angle = |i: usize| {
+            let [a, b] = [1, 2].map(|k| vertices[(i + k) % n] - vertices[(i + k - 1) % n]);
+            a.cross(b).dot(normal).atan2(a.dot(b))
+        };
+        let turns = (0..n).map(angle).sum::<f64>() / std::f64::consts::TAU;
+        if turns > 1.5 {
+            return fail(format!("winds {turns:.0} times around; split it into triangles"));
+        }
         if !(albedo.cmpge(DVec3::ZERO).all() && albedo.cmple(DVec3::ONE).all()) {
             return fail(format!("albedo {albedo} must lie in [0, 1]"));
         }
@@ -383,6 +392,10 @@ mod tests {
 
     #[test]
     fn rejects_what_is_no_polygon() {
+        // Every so many of seven corners.
+        let star = |step: u32| -> Vec<(f64, f64, f64)> {
+            (0..7).map(|n| f64::from(n * step) * std::f64::consts::TAU / 7.0).map(|a| (a.cos(), a.sin(), 5.0)).collect()
+        };
         let p = |v: &[(f64, f64, f64)]| {
             Polygon::new("x", v.iter().map(|&(x, y, z)| DVec3::new(x, y, z)).collect(), DVec3::ONE, DVec3::ZERO)
         };
@@ -391,9 +404,12 @@ mod tests {
             (vec![(0., 0., 0.), (1., 0., 0.), (2., 0., 0.)], "area"),
             (vec![(0., 0., 0.), (1., 0., 0.), (1., 1., 0.1), (0., 1., 0.)], "plane"),
             (vec![(0., 0., 0.), (2., 0., 0.), (0.5, 0.5, 0.), (0., 2., 0.)], "convex"),
+            (star(2), "2 times around"),
+            (star(3), "3 times around"),
         ] {
             assert!(p(&vertices).unwrap_err().to_string().contains(word), "{word}");
         }
+        assert!(p(&star(1)).is_ok());
     }
 
     #[test]

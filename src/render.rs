@@ -163,7 +163,8 @@ fn radiance(baked: &BakedVolume, ray: &FlattenedRay, hit: FlattenedHit) -> Optio
     let p = ray.at(hit.t);
     let texture = |baked: &BakedVolume, number: usize, uv: [f64; 2]| {
         let t = baked.flats.get(number)?.as_ref()?;
-        Some(t.lookup([uv[0], uv[1], f64::from(ray.isovalue)]))
+        // Beyond the outermost centres linear functions go on, below 0 where light ends.
+        Some(t.lookup([uv[0], uv[1], f64::from(ray.isovalue)]).max(DVec3::ZERO))
     };
     match hit.target {
         Target::Surface(side) => baked.radiance(side, p),

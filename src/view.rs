@@ -119,9 +119,18 @@ impl Payload {
 
     /// The page as text.
     pub fn to_html(&self) -> String {
+        self.html(PART)
+    }
+
+    /// The page whose data come in parts of `part` characters, which each can be decoded by itself.
+    fn html(&self, part: usize) -> String {
         let mut packed = ZlibEncoder::new(Vec::new(), Compression::new(7));
         let packed = packed.write_all(&self.bytes).and_then(|()| packed.finish()).expect("memory does not fail");
-        let data = base64::engine::general_purpose::STANDARD.encode(packed);
+        let element = |bytes: &[u8]| {
+            let text = base64::engine::general_purpose::STANDARD.encode(bytes);
+            format!("<script type=\"text/plain\" class=\"data\">{text}</script>\n")
+        };
+        let data: String = packed.chunks(part / 4 * 3).map(element).collect();
         // Inside a script element, only a tag could end the text.
         let description = self.description.to_string().replace('<', "\\u003c");
         let (head, rest) = include_str!("view/page.html").split_once("@description@").expect("the page's own mark");
@@ -131,6 +140,9 @@ impl Payload {
         [head, &description, middle, &data, before, &script, tail].concat()
     }
 }
+
+/// Characters of one part of the data: browsers' strings end at 2²⁹ or 2³⁰.
+const PART: usize = 1 << 27;
 
 /// Polygons that a page draws at most, each by itself.
 pub const MOST_POLYGONS: usize = 2048;
@@ -195,4 +207,24 @@ pub fn write(path: &Path, baked: &BakedVolume, title: &str) -> Result<usize> {
     file.write_all(html.as_bytes()).map_err(|e| Error::io(path, e))?;
     file.commit()?;
     Ok(html.len())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parts_are_short_and_make_up_the_whole() {
+        let bytes: Vec<u8> = (0..5000u64).map(|n| (n * n % 251) as u8).collect();
+        let payload = Payload { description: json!({}), bytes };
+        let html = payload.html(64);
+        let parts: Vec<&str> =
+            html.split("class=\"data\">").skip(1).map(|part| part.split_once("</script>").unwrap().0).collect();
+        assert!(parts.len() > 5 && parts.iter().all(|p| p.len() <= 64), "{}", parts.len());
+        let decoded = |part: &&str| base64::engine::general_purpose::STANDARD.decode(part).unwrap();
+        let packed: Vec<u8> = parts.iter().flat_map(decoded).collect();
+        let mut found = Vec::new();
+        std::io::Read::read_to_end(&mut flate2::read::ZlibDecoder::new(&packed[..]), &mut found).unwrap();
+        assert!(found == payload.bytes);
+    }
 }

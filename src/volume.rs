@@ -37,11 +37,15 @@ pub struct Lattice {
     inverse: DMat3,
 }
 
+/// Samples along an axis: half of what 32-bit floats number.
+const MOST_ALONG: usize = 1 << 23;
+
 impl Lattice {
     /// Builds a lattice. Column a of `axes` is the world step of one index along axis a.
     ///
     /// # Errors
-    /// `Invalid` if a dimension is below 2, the sample count overflows, or the axes are singular or not finite.
+    /// `Invalid` if a dimension is below 2 or above 2²³, the sample count overflows, or the axes are singular or not
+    /// finite.
     pub fn new(dims: [usize; 3], origin: DVec3, axes: DMat3) -> Result<Self> {
         if dims.iter().any(|&n| n < 2) {
             return Err(Error::Invalid(format!(
@@ -55,6 +59,9 @@ impl Lattice {
                 "lattice of {}×{}×{} samples: too large for this machine's address space",
                 dims[0], dims[1], dims[2]
             )));
+        }
+        if let Some(n) = dims.into_iter().find(|&n| n > MOST_ALONG) {
+            return Err(Error::Invalid(format!("lattice of {n} samples along an axis: {MOST_ALONG} at most")));
         }
         let size: f64 = (0..3).map(|a| axes.col(a).length()).product();
         let inverse = axes.inverse();

@@ -49,7 +49,9 @@ fn the_page_holds_the_bake_and_nothing_from_elsewhere() {
     }
     let description: serde_json::Value = serde_json::from_str(element(&page, "description")).unwrap();
     assert_eq!(description["title"], "</script><b>&");
-    let packed = base64::engine::general_purpose::STANDARD.decode(element(&page, "data")).unwrap();
+    let packed = base64::engine::general_purpose::STANDARD
+        .decode(page.split_once("class=\"data\">").unwrap().1.split_once("</script>").unwrap().0)
+        .unwrap();
     let mut bytes = Vec::new();
     flate2::read::ZlibDecoder::new(&packed[..]).read_to_end(&mut bytes).unwrap();
     assert_eq!(description["length"], bytes.len());

@@ -127,7 +127,8 @@ pub fn curve(study: &Study, subjects: &[Subject], base: &BakeOptions, limit: Opt
         }
     }
     let left_out = limit.map_or(String::new(), |s| format!("Ways estimated at more than {s} s were left out.\n\n"));
-    summarise(study, subjects, &table, &left_out)
+    let counts: Vec<usize> = compared.iter().map(Vec::len).collect();
+    summarise(study, subjects, &counts, &table, &left_out)
 }
 
 /// What a row is about, in words.
@@ -149,9 +150,10 @@ fn pareto(mut points: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
     points
 }
 
-fn summarise(study: &Study, subjects: &[Subject], table: &Table, left_out: &str) -> Result<()> {
+/// `counts`: the isovalues compared of each subject.
+fn summarise(study: &Study, subjects: &[Subject], counts: &[usize], table: &Table, left_out: &str) -> Result<()> {
     let mut notes = left_out.to_owned();
-    for subject in subjects {
+    for (subject, count) in subjects.iter().zip(counts) {
         let rows: Vec<&Vec<String>> = table.rows().iter().filter(|r| r[0] == subject.name).collect();
         let point = |r: &&Vec<String>| (table.number(r, "seconds"), table.number(r, "percent_rms"));
         let front = pareto(rows.iter().map(point).collect());
@@ -173,7 +175,10 @@ fn summarise(study: &Study, subjects: &[Subject], table: &Table, left_out: &str)
         let plot = Plot {
             title: format!("{}: error against time", subject.name),
             x_label: "wall seconds".into(),
-            y_label: "percent RMS over five isovalues".into(),
+            y_label: match count {
+                1 => "percent RMS at one isovalue".into(),
+                n => format!("percent RMS over {n} isovalues"),
+            },
             log_x: true,
             log_y: true,
             series,

@@ -31,14 +31,18 @@ function albedo(stops) {
   const [[c0, a], [c1, b]] = stops.slice(next - 1, next + 1);
   return add(a, add(b, a, -1), (state.iso - c0) / (c1 - c0));
 }
-const digits = (v) => String(Number(v.toPrecision(5)));
+/// Five digits of the sweep's width.
+const precision = ([lo, hi]) => clamp(5 + Math.floor(Math.log10(Math.max(Math.abs(lo), Math.abs(hi)) / (hi - lo))), 5, 15);
+const digits = (v) => String(Number(v.toPrecision(precision(scene.isovalues))));
 
 async function unpack() {
-  const text = $("data").textContent;
-  $("data").textContent = "";
-  const binary = atob(text), packed = new Uint8Array(binary.length);
-  for (let i = 0; i < packed.length; ++i) packed[i] = binary.charCodeAt(i);
-  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
+  const packed = [...document.querySelectorAll("script.data")].map((part) => {
+    const binary = atob(part.textContent), out = new Uint8Array(binary.length);
+    part.remove();
+    for (let i = 0; i < out.length; ++i) out[i] = binary.charCodeAt(i);
+    return out;
+  });
+  const stream = new Blob(packed).stream().pipeThrough(new DecompressionStream("deflate"));
   const bytes = new Uint8Array(await new Response(stream).arrayBuffer());
   if (bytes.length !== scene.length) throw new Error(`the data hold ${bytes.length} bytes instead of ${scene.length}`);
   return bytes;

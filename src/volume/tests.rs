@@ -56,3 +56,11 @@ fn files_are_told_apart_by_their_extension() {
         assert!(message.contains(name) && !message.contains("extension"), "{message}");
     }
 }
+
+#[test]
+fn no_axis_is_longer_than_32_bit_floats_number() {
+    let along = |n: usize| Lattice::aligned([2, n, 2], DVec3::ZERO, DVec3::ONE);
+    assert!(along(1 << 23).is_ok());
+    let message = along((1 << 23) + 1).unwrap_err().to_string();
+    assert!(message.contains("8388609 samples along an axis"), "{message}");
+}
