@@ -217,7 +217,8 @@ fn between(field: &Field, p: DVec3, [lowest, highest]: [(f64, DVec3); 2], isoval
         let h = field.value(middle);
         if (0.0..=1.0).contains(&h) {
             let step = f64::from(f32::EPSILON) * middle.max_element();
-            let rise = field.value_and_gradient(middle).1.abs().element_sum() * step;
+            let slope = field.lattice().axes().transpose() * field.value_and_gradient(middle).1;
+            let rise = slope.abs().element_sum() * step;
             return (rise < COARSEST).then_some(middle);
         }
         if h < isovalue {
@@ -294,25 +295,34 @@ mod tests {
         assert!((0.1..0.5).contains(&half), "{half}");
     }
 
-    /// Waves over a sweep of a thousandth of a voxel's step: every point whose cells it crosses has places in it.
+    /// Waves over a sweep of a thousandth of a voxel's step: every point whose cells it crosses has places in it, the
+    /// same in any unit of length.
     #[test]
     fn thin_sweeps_have_stand_ins_everywhere() {
         let lattice = Lattice::aligned([16; 3], DVec3::ZERO, DVec3::ONE).unwrap();
+        let scaled = |s: f64| Lattice::aligned([16; 3], DVec3::ZERO, DVec3::splat(s)).unwrap();
         let h = |o: usize| {
             let [i, j, k] = lattice.ijk(o).map(|i| i as f64);
             (0.7 * i).sin() + (0.5 * j + 1.0).cos() + 0.3 * k
         };
         let samples = Samples::F64((0..lattice.len()).map(h).collect());
-        let volume = Volume::new("waves", lattice.clone(), samples).unwrap();
+        let with = |lattice: &Lattice, lo: f64, hi: f64| {
+            let volume = Volume::new("waves", lattice.clone(), samples.clone()).unwrap();
+            Field::new(&volume, Sweep::new(lo, hi).unwrap()).unwrap()
+        };
         // Wide enough for points to fall into it, it may have fewer than are asked for.
-        for (lo, hi, wanted) in [(2.0, 2.0003, 4), (2.0, 2.3, 1)] {
-            let field = Field::new(&volume, Sweep::new(lo, hi).unwrap()).unwrap();
+        for (lo, hi, wanted) in [(2.0, 2.00003, 4), (2.0, 2.0003, 4), (2.0, 2.3, 1)] {
+            let field = with(&lattice, lo, hi);
+            let others = [1e-3, 1e3].map(|s| with(&scaled(s), lo, hi));
             let masks = masks(&field, &lattice);
             let filled: Vec<usize> = (0..masks.len()).filter(|&o| masks[o] == Mask::Filled).collect();
             let mut all = 0;
             for &o in &filled {
                 let places: [Option<DVec3>; 4] = stand_ins(&field, &lattice, o, 1);
                 all += usize::from(places[wanted - 1].is_some());
+                for other in &others {
+                    assert_eq!(stand_ins(other, other.lattice(), o, 1), places, "{lo} {hi} {o}");
+                }
                 for p in places.into_iter().flatten() {
                     let far = (p - local_position(&field, &lattice, o)).abs().max_element();
                     assert!((0.0..=1.0).contains(&field.value(p)) && far <= 1.0, "{lo} {hi} {o}: {p}");
