@@ -568,8 +568,8 @@ mod tests {
         let dims = [9, 9, 9];
         let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::ONE).unwrap();
         let cells = Cells::new([1; 3], dims);
-        // From the fill value down to 1/8 within the last rounding before node 1: all level sets above stand there, 7/8 of
-        // the sweep on 64 faces, or all of it where h is rounded.
+        // From the fill value down to 1/8 within the last rounding before node 1: all level sets above stand there, 7/8
+        // of the sweep on 64 faces, or all of it where h is rounded.
         let filled = field(lattice, |ijk| if ijk[0] == 0 { 1e20 } else { ijk[0] as f64 / 8.0 });
         let measure = |at: f32| -> f64 {
             let (_, found) = bins(&filled, &cells, 0.1);
