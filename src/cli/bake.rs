@@ -12,7 +12,7 @@ use crate::field::Sweep;
 use crate::flattened::Side;
 use crate::isa::Isa;
 use crate::progress::{Clock, Progress, say};
-use crate::scene::{Boundary, Policy, Scene};
+use crate::scene::{Boundary, Member, Policy, Scene};
 use crate::scene_file::{Inputs, SceneOptions, load, load_series};
 use crate::series::{Series, write_collection};
 use crate::sweep::lit_within_solids;
@@ -230,6 +230,12 @@ impl Bake {
                      will be black; use outside = \"lower\" or boundary = \"open\""
                 );
             }
+            if let Some([a, b]) = same_caps(&members).filter(|_| scene.policy() == Policy::Joint) {
+                say!(
+                    "warning: boundary = \"capped\": '{a}' and '{b}' end in the same faces; where both are solid there, \
+                     neither cap lies before the other and light near it is uncertain; let one end within the other"
+                );
+            }
             // Sweeps that nobody asked for were chosen because they leave out nothing to speak of.
             if settings.engine == Engine::Sweep
                 && !options.leaves_engine()
@@ -406,6 +412,25 @@ impl Bake {
         }
         Ok(checkpoint)
     }
+}
+
+/// The names of two volumes whose caps lie in the same faces.
+fn same_caps(members: &[Member]) -> Option<[&str; 2]> {
+    let frame = |m: &Member| {
+        let (lattice, far) = (m.field.lattice(), m.field.lattice().far());
+        let axes = lattice.axes();
+        [lattice.origin(), axes.x_axis * far.x, axes.y_axis * far.y, axes.z_axis * far.z]
+    };
+    let same = |a: &Member, b: &Member| {
+        let (a, b) = (frame(a), frame(b));
+        let size = a[1..].iter().map(|e| e.length()).fold(0.0, f64::max);
+        a.iter().zip(&b).all(|(a, b)| (*a - *b).length() <= 1e-6 * size)
+    };
+    let capped: Vec<&Member> = members.iter().filter(|m| m.boundary == Boundary::Capped).collect();
+    capped.iter().enumerate().find_map(|(n, &a)| {
+        let other = capped[..n].iter().find(|b| same(a, b))?;
+        Some([other.name.as_str(), a.name.as_str()])
+    })
 }
 
 /// The share of indirect light that may be missing without a word: five times what sweeps settle for.

@@ -94,6 +94,33 @@ fn an_outside_that_caps_close_off_is_warned_of() {
     }
 }
 
+/// Two solids that end in the same face: whose cap is seen there nothing tells.
+#[test]
+fn caps_in_the_same_faces_are_warned_of() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let volume = |name: &str, generator: &str, more: &str| {
+        format!("[[volume]]\nname = \"{name}\"\ngenerator = \"{generator}\"\nisovalues = [0.05, 0.2]\n{more}\n")
+    };
+    let capped = "boundary = \"capped\"\n";
+    for (one, other, warned) in [
+        ("size = 9\n", "size = 9\n", true),
+        ("size = 9\n", "size = 13\n", true),
+        ("size = 9\n", "size = 9\norigin = [0.1, 0.1, 0.1]\nscale = 0.7\n", false),
+    ] {
+        for (both, expected) in [(capped, warned), ("", false)] {
+            let volumes = [
+                volume("a", "bumps", &[one, capped].concat()).replace("[0.05, 0.2]", "[10, 90]"),
+                volume("b", "sphere", &[other, both].concat()),
+            ];
+            fs::write(dir.join("two.toml"), format!("{}[box]\nmargin = 0.1\n", volumes.concat())).unwrap();
+            let lines = text(&ok(dir, &["bake", "two.toml", "-o", "two.vtm", "--dry-run"]).stderr);
+            let found = lines.contains("'a' and 'b' end in the same faces");
+            assert_eq!(found, expected, "{one} {other} {both}: {lines}");
+        }
+    }
+}
+
 /// A solid that caps close towards the camera: its reference is no triangles, and a bake shows the same.
 #[test]
 fn capped_solids_have_a_path_traced_picture() {
