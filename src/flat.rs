@@ -312,18 +312,15 @@ pub fn texels(scene: &Scene, across: usize, isovalues: usize) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::rng::{Rng, Stage};
 
     #[test]
     fn the_nearest_is_that_of_a_search_through_all() {
-        let mut state = 1u32;
-        let mut random = |most: u32| {
-            state = state.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
-            (state >> 16) % most
-        };
+        let mut rng = Rng::stream(7, Stage::Test, 0);
         for case in 0..200 {
-            let (nu, nv) = (1 + random(12) as usize, 1 + random(12) as usize);
-            let share = [1, 2, 10, 40][case % 4];
-            let counting: Vec<bool> = (0..nu * nv).map(|_| random(share) == 0 && case % 7 > 0).collect();
+            let [nu, nv] = rng.unit2().map(|u| 1 + (12.0 * u) as usize);
+            let share = if case % 7 > 0 { [1.0, 0.5, 0.1, 0.025][case % 4] } else { 0.0 };
+            let counting: Vec<bool> = (0..nu * nv).map(|_| rng.unit() < share).collect();
             let all: Vec<usize> = (0..nu * nv).filter(|&n| counting[n]).collect();
             for (n, found) in nearest(&counting, nu).into_iter().enumerate() {
                 let away = |&m: &usize| (n % nu).abs_diff(m % nu).pow(2) + (n / nu).abs_diff(m / nu).pow(2);

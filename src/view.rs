@@ -126,11 +126,12 @@ impl Payload {
     fn html(&self, part: usize) -> String {
         let mut packed = ZlibEncoder::new(Vec::new(), Compression::new(7));
         let packed = packed.write_all(&self.bytes).and_then(|()| packed.finish()).expect("memory does not fail");
-        let element = |bytes: &[u8]| {
-            let text = base64::engine::general_purpose::STANDARD.encode(bytes);
-            format!("<script type=\"text/plain\" class=\"data\">{text}</script>\n")
-        };
-        let data: String = packed.chunks(part / 4 * 3).map(element).collect();
+        let mut data = String::new();
+        for bytes in packed.chunks(part / 4 * 3) {
+            data.push_str("<script type=\"text/plain\" class=\"data\">");
+            base64::engine::general_purpose::STANDARD.encode_string(bytes, &mut data);
+            data.push_str("</script>\n");
+        }
         // Inside a script element, only a tag could end the text.
         let description = self.description.to_string().replace('<', "\\u003c");
         let (head, rest) = include_str!("view/page.html").split_once("@description@").expect("the page's own mark");

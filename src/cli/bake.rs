@@ -12,7 +12,7 @@ use crate::field::Sweep;
 use crate::flattened::Side;
 use crate::isa::Isa;
 use crate::progress::{Clock, Progress, say};
-use crate::scene::{Boundary, Member, Policy, Scene};
+use crate::scene::{Boundary, Policy, Scene};
 use crate::scene_file::{Inputs, SceneOptions, load, load_series};
 use crate::series::{Series, write_collection};
 use crate::sweep::lit_within_solids;
@@ -150,11 +150,9 @@ impl Bake {
         Ok(())
     }
 
-    /// The output, if it is there and whole, and whether it is of this job.
-    fn complete(&self, job: &str) -> Option<(BakedVolume, bool)> {
-        let found = self.output.exists().then(|| BakedVolume::read(&self.output).ok()).flatten()?;
-        let same = found.report.get("job").and_then(|j| j.as_str()) == Some(&digest(job));
-        Some((found, same))
+    /// The output, if it is there and whole.
+    fn whole(&self) -> Option<BakedVolume> {
+        self.output.exists().then(|| BakedVolume::read(&self.output).ok()).flatten()
     }
 
     /// Writes or prints the report, if that is wanted.
@@ -230,7 +228,7 @@ impl Bake {
                      will be black; use outside = \"lower\" or boundary = \"open\""
                 );
             }
-            if let Some([a, b]) = same_caps(&members).filter(|_| scene.policy() == Policy::Joint) {
+            if let Some([a, b]) = scene.coplanar_caps() {
                 say!(
                     "warning: boundary = \"capped\": '{a}' and '{b}' end in the same faces; where both are solid there, \
                      neither cap lies before the other and light near it is uncertain; let one end within the other"
@@ -300,25 +298,24 @@ impl Bake {
         }
         fits?;
         let job = job(&loaded.scene, &settings);
-        if self.resume
-            && self.scene.time.is_some()
-            && let Some((baked, same)) = self.complete(&job)
-        {
-            if same {
-                say!("{:>14}  {} is complete", "resumed", self.output.display());
-                self.hand_out(&baked.report)?;
-                return Ok(sweep);
-            }
-            // Had this series been begun, its first frame or a checkpoint of that would be there.
-            if first && Checkpoint::new(&self.checkpoint_path(), job.clone(), self.every()?)?.held()? != Held::This {
-                return Err(Error::invalid(
-                    &self.output,
-                    "is a bake of other settings or of another version, which --resume cannot go on with; give its settings, \
-                     or leave --resume out to replace the series",
-                ));
-            }
+        // Of a series, what is there.
+        let whole = (self.resume && self.scene.time.is_some()).then(|| self.whole()).flatten();
+        let same = |b: &BakedVolume| b.report.get("job").and_then(|j| j.as_str()) == Some(&digest(&job));
+        if let Some(baked) = whole.as_ref().filter(|b| same(b)) {
+            say!("{:>14}  {} is complete", "resumed", self.output.display());
+            self.hand_out(&baked.report)?;
+            return Ok(sweep);
         }
-        let checkpoint = self.checkpoint(job)?;
+        let checkpoint = Checkpoint::new(&self.checkpoint_path(), job, self.every()?)?;
+        // Had this series been begun, its first frame or a checkpoint of that would be there.
+        if first && whole.is_some() && checkpoint.held()? != Held::This {
+            return Err(Error::invalid(
+                &self.output,
+                "is a bake of other settings or of another version, which --resume cannot go on with; give its settings, \
+                 or leave --resume out to replace the series",
+            ));
+        }
+        self.take_up(&checkpoint)?;
         let work = || -> Result<(Vec<crate::bake::Bake>, Clock)> {
             let mut bakes = bake_fields(&loaded.scene, &settings, &device, progress, Some(&checkpoint))?;
             let export = Clock::start();
@@ -389,10 +386,9 @@ impl Bake {
         }
     }
 
-    /// The checkpoint of this bake, with what an interrupted run left if that is wanted.
-    fn checkpoint(&self, job: String) -> Result<Checkpoint> {
-        let path = self.checkpoint_path();
-        let checkpoint = Checkpoint::new(&path, job, self.every()?)?;
+    /// Takes up what an interrupted run left in the checkpoint, if that is wanted, or says that it is there.
+    fn take_up(&self, checkpoint: &Checkpoint) -> Result<()> {
+        let path = checkpoint.path();
         let label = if self.resume { "resumed" } else { "note" };
         if !self.resume {
             let held = match checkpoint.held()? {
@@ -410,27 +406,8 @@ impl Bake {
         } else {
             say!("{label:>14}  nothing: there is no {}; starting from the beginning", path.display());
         }
-        Ok(checkpoint)
+        Ok(())
     }
-}
-
-/// The names of two volumes whose caps lie in the same faces.
-fn same_caps(members: &[Member]) -> Option<[&str; 2]> {
-    let frame = |m: &Member| {
-        let (lattice, far) = (m.field.lattice(), m.field.lattice().far());
-        let axes = lattice.axes();
-        [lattice.origin(), axes.x_axis * far.x, axes.y_axis * far.y, axes.z_axis * far.z]
-    };
-    let same = |a: &Member, b: &Member| {
-        let (a, b) = (frame(a), frame(b));
-        let size = a[1..].iter().map(|e| e.length()).fold(0.0, f64::max);
-        a.iter().zip(&b).all(|(a, b)| (*a - *b).length() <= 1e-6 * size)
-    };
-    let capped: Vec<&Member> = members.iter().filter(|m| m.boundary == Boundary::Capped).collect();
-    capped.iter().enumerate().find_map(|(n, &a)| {
-        let other = capped[..n].iter().find(|b| same(a, b))?;
-        Some([other.name.as_str(), a.name.as_str()])
-    })
 }
 
 /// The share of indirect light that may be missing without a word: five times what sweeps settle for.

@@ -224,6 +224,27 @@ impl Scene {
         all
     }
 
+    /// The names of two fields that light each other and whose caps lie in the same faces (to a millionth of them):
+    /// where both are solid there, neither lies before the other.
+    pub fn coplanar_caps(&self) -> Option<[String; 2]> {
+        let corner = |m: &Member| {
+            let (lattice, far) = (m.field.lattice(), m.field.lattice().far());
+            let axes = lattice.axes();
+            [lattice.origin(), axes.x_axis * far.x, axes.y_axis * far.y, axes.z_axis * far.z]
+        };
+        let same = |a: &Member, b: &Member| {
+            let (a, b) = (corner(a), corner(b));
+            let size = a[1..].iter().map(|e| e.length()).fold(0.0, f64::max);
+            a.iter().zip(&b).all(|(a, b)| (*a - *b).length() <= 1e-6 * size)
+        };
+        let mut capped = self.members();
+        capped.retain(|m| m.boundary == Boundary::Capped && self.policy == Policy::Joint);
+        capped.iter().enumerate().find_map(|(n, a)| {
+            let other = capped[..n].iter().find(|b| same(a, b))?;
+            Some([other.name.clone(), a.name.clone()])
+        })
+    }
+
     /// The same scene from the point of view of field `number`.
     #[must_use]
     pub fn seen_from(&self, number: usize) -> Self {

@@ -45,8 +45,10 @@ pub(crate) fn reports(scene: &Scene, across: usize, isovalues: usize) -> f64 {
         shapes(scene, across).flatten().map(|(flat, dims)| flat.area() / sinks(dims).iter().product::<usize>() as f64)
     };
     let [near, past] = strides(scene, areas(), all);
-    let fronts = areas().count().min(2) as f64;
-    2.0 * fronts * (volume / (near * near) + (all - volume) / (past * past)) * (12 * isovalues + 40) as f64
+    let reporting = volume / (near * near) + (all - volume) / (past * past);
+    // At either end of a line may be a wall; RGB of each isovalue in f32, and where it ends.
+    let ends = areas().count().min(2) as f64;
+    2.0 * reporting * ends * (12 * isovalues + 40) as f64
 }
 
 /// A line that meets Ω: its pack, B of this side and the other, its lane, and where it enters and leaves.

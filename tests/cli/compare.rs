@@ -138,7 +138,7 @@ fn the_mesh_of_errors_holds_them() {
     let (mut sampled, mut most) = (0, 0.0f64);
     for (v, (t, r)) in shown(&t).into_iter().zip(shown(&r)).enumerate() {
         let error = e.property("error").unwrap()[v];
-        if r_sampled(&e, v, &bytes) {
+        if was_compared(&e, v, &bytes) {
             sampled += 1;
             most = most.max(error);
             assert!((error - (t - r).length()).abs() < 1e-5, "vertex {v}: {error} {t} {r}");
@@ -151,7 +151,7 @@ fn the_mesh_of_errors_holds_them() {
 }
 
 /// Whether a vertex of a mesh of errors was compared: those that were not are grey and have no error.
-fn r_sampled(mesh: &PlyMesh, v: usize, bytes: &[[f64; 3]]) -> bool {
+fn was_compared(mesh: &PlyMesh, v: usize, bytes: &[[f64; 3]]) -> bool {
     let grey = bytes[v] == [96.0; 3];
     assert!(!grey || mesh.property("error").unwrap()[v] == 0.0);
     !grey

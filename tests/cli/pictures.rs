@@ -177,3 +177,19 @@ fn an_exr_says_what_made_it() {
     assert_eq!(["field", "isovalue"].map(&found), ["b", "0.11"]);
     assert_eq!(attributes(&["two.toml", "--local", "--isovalue", "50"])("field"), "a");
 }
+
+/// At 10 the isosurface shadows walls up to their edges, where the linear functions between texels go on below 0.
+#[test]
+fn pictures_hold_no_negative_light() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "11", "-o", "b.vti", "-q"]);
+    let bake =
+        ["bake", "b.vti", "-o", "lit.vti", "-q", "--isovalues", "3.6", "95", "--engine", "photon", "--bounces", "0"];
+    ok(dir, &[&bake[..], &QUICK].concat());
+    ok(dir, &["render", "lit.vti", "--isovalue", "10", "--height", "60", "--samples", "4", "-o", "p.exr", "-q"]);
+    let image = exr::prelude::read_all_flat_layers_from_file(dir.join("p.exr")).unwrap();
+    let values = image.layer_data[0].channel_data.list.iter().flat_map(|c| c.sample_data.values_as_f32());
+    let values: Vec<f32> = values.collect();
+    assert_eq!(values.iter().find(|v| **v < 0.0), None);
+}
