@@ -15,13 +15,15 @@ mod view;
 
 use crate::embree::Device;
 use crate::error::{Error, Result};
-use crate::export::bake_file::BakedVolume;
+use crate::export::bake_file::{BakeSummary, BakedVolume};
 use crate::isa::Isa;
 use crate::progress::{self, Progress, say};
 use crate::render::{Camera, Rendered, Shading, render};
 use crate::scene::{Policy, Scene};
 use crate::scene_file::{self, Inputs, RawOptions, SceneOptions, load};
+use crate::volume::Volume;
 use crate::volume::statistics::VolumeStatistics;
+use crate::volume::vti::VtiFile;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use glam::DVec3;
 use std::path::{Path, PathBuf};
@@ -65,7 +67,7 @@ pub struct Cli {
 #[derive(Subcommand, Debug)]
 #[allow(clippy::large_enum_variant, reason = "one value per process")]
 enum Verb {
-    /// Print what a volume holds: lattice, type, range, percentiles, histogram, a suggested sweep
+    /// Print what a volume holds: lattice, type, range, percentiles, histogram, a suggested sweep; how a bake was made
     Info(Info),
     /// Write a commented scene file for a volume, with a suggested sweep
     Init(init::Init),
@@ -104,9 +106,11 @@ The suggested sweep leaves out background and noise; it is what `bake` takes if 
 Examples:
   isolume info head.nii.gz
   isolume info head.nii.gz --json                        the same for scripts
+  isolume info lit.vti                                   a bake: also its isovalues and settings
   isolume info scan.raw --raw-dims 305,224,14 --raw-type u8")]
 struct Info {
-    /// Volume: NIfTI, NRRD, MetaImage, MRC/CCP4, cube, VTK, NumPy, TIFF stack, or a headerless file with --raw-dims
+    /// Volume: NIfTI, NRRD, MetaImage, MRC/CCP4, cube, VTK (bakes, too), NumPy, TIFF stack, or a headerless file with
+    /// --raw-dims
     file: PathBuf,
     /// Print JSON
     #[arg(long)]
@@ -282,12 +286,23 @@ fn device() -> Result<Device> {
 
 impl Info {
     fn run(self) -> Result<()> {
-        let volume = export::open(&self.file, &self.raw)?;
+        let vti = !self.raw.given() && self.file.extension().is_some_and(|e| e.eq_ignore_ascii_case("vti"));
+        let (volume, bake) = if vti {
+            let file = VtiFile::read(&self.file)?;
+            let bake = BakeSummary::of(&file).map_err(|e| e.in_file(&self.file))?;
+            (Volume::of_vti(&self.file, file)?, bake)
+        } else {
+            (export::open(&self.file, &self.raw)?, None)
+        };
         let statistics = VolumeStatistics::of(&volume);
         if self.json {
-            println!("{}", serde_json::to_string_pretty(&statistics).expect("statistics are plain data"));
+            let mut all = serde_json::to_value(&statistics).expect("statistics are plain data");
+            if let Some(bake) = bake {
+                all["bake"] = serde_json::to_value(bake).expect("a summary is plain data");
+            }
+            println!("{all:#}");
         } else {
-            print!("{}", statistics.to_text());
+            print!("{}{}", statistics.to_text(), bake.map_or_else(String::new, |b| b.to_text()));
         }
         Ok(())
     }

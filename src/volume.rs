@@ -435,12 +435,7 @@ impl Volume {
             ("mha" | "mhd", "") => metaimage::read(path),
             ("mrc" | "map" | "ccp4" | "rec", "" | "gz") => mrc::read(path),
             ("cube" | "cub", "" | "gz") => cube::read(path),
-            ("vti", "") => {
-                let file = vti::VtiFile::read(path)?;
-                let space = file.space();
-                let (lattice, samples) = file.into_scalars().map_err(|e| e.in_file(path))?;
-                Ok(Self { space, ..Self::new(path.display().to_string(), lattice, samples)? })
-            }
+            ("vti", "") => Self::of_vti(path, vti::VtiFile::read(path)?),
             ("vtk", "") => legacy_vtk::read(path),
             ("npy", "") => npy::read(path),
             ("tif" | "tiff", "" | "zip") => tiff::read(path),
@@ -455,6 +450,16 @@ impl Volume {
                 format!("unknown extension; {READ} are read, and .raw with its layout given"),
             )),
         }
+    }
+
+    /// The volume in a `.vti` that was read from `path`, as [`Volume::open`] takes it.
+    ///
+    /// # Errors
+    /// `Invalid` with the list of arrays if none are its scalars.
+    pub fn of_vti(path: &Path, file: vti::VtiFile) -> Result<Self> {
+        let space = file.space();
+        let (lattice, samples) = file.into_scalars().map_err(|e| e.in_file(path))?;
+        Ok(Self { space, ..Self::new(path.display().to_string(), lattice, samples)? })
     }
 
     /// Writes a `.vti` (one point array `value`, active), a `.nrrd` or a `.npy` (without its place in the world), by

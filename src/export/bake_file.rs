@@ -73,6 +73,71 @@ struct PolygonDescription {
     other_face: i32,
 }
 
+impl Description {
+    /// What a file holds, if it is a bake.
+    fn of(file: &VtiFile) -> Result<Option<Self>> {
+        // Other files may use the name for something else, as generated volumes did.
+        let own = |(name, text): &&(String, String)| name == DESCRIPTION && text.starts_with('{');
+        let Some((_, text)) = file.field_strings.iter().find(own) else { return Ok(None) };
+        let parsed = serde_json::from_str(text);
+        parsed.map(Some).map_err(|e| Error::Invalid(format!("field data '{DESCRIPTION}': {e}")))
+    }
+}
+
+/// What a bake is, without its light.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct BakeSummary {
+    /// Ends of the sweep, in source units.
+    pub isovalues: [f64; 2],
+    /// The side that is outside: `lower` or `higher`.
+    pub outside: String,
+    /// Whether the inside has light too.
+    pub both_sides: bool,
+    /// Whether isosurfaces are closed at the volume's faces.
+    pub capped: bool,
+    /// Walls and luminaires.
+    pub polygons: usize,
+    /// The report, as written.
+    pub report: serde_json::Value,
+}
+
+impl BakeSummary {
+    /// What a file says of its illumination; `None` if it has none.
+    ///
+    /// # Errors
+    /// `Invalid` if that cannot be read.
+    pub fn of(file: &VtiFile) -> Result<Option<Self>> {
+        let found = Description::of(file)?;
+        Ok(found.map(|d| {
+            let Description { isovalues, outside, both_sides, capped, report, .. } = d;
+            Self { isovalues, outside, both_sides, capped, polygons: d.polygons.len(), report }
+        }))
+    }
+
+    /// Lines of a key and what it says, in columns as those of a volume's statistics.
+    pub fn to_text(&self) -> String {
+        let [lo, hi] = self.isovalues;
+        let sides = if self.both_sides { "both sides".into() } else { format!("the {} side", self.outside) };
+        let ends = if self.capped { "capped" } else { "open" };
+        let said = |pointer: &str| match self.report.pointer(pointer) {
+            None => "unknown".into(),
+            Some(serde_json::Value::String(s)) => s.clone(),
+            Some(other) => other.to_string(),
+        };
+        let [preset, engine, grid, seed] =
+            ["preset", "engine", "grid", "seed"].map(|s| said(&format!("/settings/{s}")));
+        let seconds = self.report.pointer("/seconds/total").and_then(serde_json::Value::as_f64).unwrap_or(f64::NAN);
+        format!(
+            "{:<18}isovalues {lo} … {hi} on {sides}, {ends}, {} polygons\n\
+             {:<18}preset {preset}, engine {engine}, grid {grid}, seed {seed}: {seconds:.1} s on {} threads\n",
+            "illumination",
+            self.polygons,
+            "baked with",
+            said("/threads"),
+        )
+    }
+}
+
 /// Suffix of the arrays of stored side number `i`: the outside has none.
 fn suffix(i: usize) -> &'static str {
     if i == 0 { "" } else { "_inside" }
@@ -319,16 +384,11 @@ impl BakedVolume {
     /// `Io`; `Invalid` if the file is damaged.
     pub fn try_read(path: &Path) -> Result<Option<Self>> {
         let file = VtiFile::read(path)?;
-        // Other files may use the name for something else, as generated volumes did.
-        let own = |(name, text): &&(String, String)| name == DESCRIPTION && text.starts_with('{');
-        let text = file.field_strings.iter().find(own).map(|(_, text)| text.clone());
-        let Some(text) = text else { return Ok(None) };
-        Self::from_parts(path, file, &text).map(Some).map_err(|e| e.in_file(path))
+        let Some(d) = Description::of(&file).map_err(|e| e.in_file(path))? else { return Ok(None) };
+        Self::from_parts(path, file, d).map(Some).map_err(|e| e.in_file(path))
     }
 
-    fn from_parts(path: &Path, file: VtiFile, text: &str) -> Result<Self> {
-        let d: Description =
-            serde_json::from_str(text).map_err(|e| Error::Invalid(format!("field data '{DESCRIPTION}': {e}")))?;
+    fn from_parts(path: &Path, file: VtiFile, d: Description) -> Result<Self> {
         let points = file.lattice.len();
         let array = |arrays: &[VtiArray], name: &str| -> Result<Samples> {
             let found = arrays.iter().find(|a| a.name == name);

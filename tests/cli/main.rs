@@ -66,6 +66,19 @@ fn generate_info_bake_render() {
     for key in ["load", "build", "photons", "samples", "interpolate", "export", "total"] {
         assert!(report["seconds"][key].is_number(), "seconds.{key}");
     }
+    assert_eq!(json.get("bake"), None, "of a volume");
+    let info: serde_json::Value = serde_json::from_slice(&ok(dir, &["info", "out.vti", "--json"]).stdout).unwrap();
+    assert_eq!(info["dims"], json["dims"]);
+    let [own, written] =
+        [&info["bake"]["report"], &report].map(|r| ["settings", "job", "rays"].map(|key| r[key].clone()));
+    assert_eq!(own, written);
+    let expected = serde_json::json!([[3.6, 95.0], "lower", true, false, 6]);
+    let found = ["isovalues", "outside", "both_sides", "capped", "polygons"].map(|key| info["bake"][key].clone());
+    assert_eq!(serde_json::json!(found), expected);
+    let info = text(&ok(dir, &["info", "out.vti"]).stdout);
+    assert!(info.contains("isovalues 3.6 … 95 on both sides, open, 6 polygons\n"), "{info}");
+    assert!(info.contains("engine photon, grid 1x, seed 1: "), "{info}");
+    assert!(!text(&ok(dir, &["info", "b.nrrd"]).stdout).contains("polygons"), "of a volume");
     for key in ["load", "samples", "total"] {
         let worked = report["processor_seconds"][key].as_f64().unwrap();
         assert!(worked > 0.0 || key != "total" && worked == 0.0, "the clock ticks every 10 ms: {key} {worked}");
