@@ -289,7 +289,11 @@ impl Info {
         let vti = !self.raw.given() && self.file.extension().is_some_and(|e| e.eq_ignore_ascii_case("vti"));
         let (volume, bake) = if vti {
             let file = VtiFile::read(&self.file)?;
-            let bake = BakeSummary::of(&file).map_err(|e| e.in_file(&self.file))?;
+            // Whatever it says of itself, its samples can be examined.
+            let bake = BakeSummary::of(&file).unwrap_or_else(|e| {
+                say!("warning: {}", e.in_file(&self.file));
+                None
+            });
             (Volume::of_vti(&self.file, file)?, bake)
         } else {
             (export::open(&self.file, &self.raw)?, None)

@@ -150,9 +150,10 @@ impl Bake {
         Ok(())
     }
 
-    /// The output, if it is there and whole.
-    fn whole(&self) -> Option<BakedVolume> {
-        self.output.exists().then(|| BakedVolume::read(&self.output).ok()).flatten()
+    /// The report of the output, if that is there and whole.
+    fn whole(&self) -> Option<serde_json::Value> {
+        let found = self.output.exists().then(|| BakedVolume::read(&self.output).ok()).flatten()?;
+        Some(found.report)
     }
 
     /// Writes or prints the report, if that is wanted.
@@ -300,10 +301,10 @@ impl Bake {
         let job = job(&loaded.scene, &settings);
         // Of a series, what is there.
         let whole = (self.resume && self.scene.time.is_some()).then(|| self.whole()).flatten();
-        let same = |b: &BakedVolume| b.report.get("job").and_then(|j| j.as_str()) == Some(&digest(&job));
-        if let Some(baked) = whole.as_ref().filter(|b| same(b)) {
+        let same = |report: &&serde_json::Value| report.get("job").and_then(|j| j.as_str()) == Some(&digest(&job));
+        if let Some(report) = whole.as_ref().filter(same) {
             say!("{:>14}  {} is complete", "resumed", self.output.display());
-            self.hand_out(&baked.report)?;
+            self.hand_out(report)?;
             return Ok(sweep);
         }
         let checkpoint = Checkpoint::new(&self.checkpoint_path(), job, self.every()?)?;

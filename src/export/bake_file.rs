@@ -126,10 +126,11 @@ impl BakeSummary {
         };
         let [preset, engine, grid, seed] =
             ["preset", "engine", "grid", "seed"].map(|s| said(&format!("/settings/{s}")));
-        let seconds = self.report.pointer("/seconds/total").and_then(serde_json::Value::as_f64).unwrap_or(f64::NAN);
+        let seconds = self.report.pointer("/seconds/total").and_then(serde_json::Value::as_f64);
+        let seconds = seconds.map_or("unknown".into(), |s| format!("{s:.1}"));
         format!(
             "{:<18}isovalues {lo} … {hi} on {sides}, {ends}, {} polygons\n\
-             {:<18}preset {preset}, engine {engine}, grid {grid}, seed {seed}: {seconds:.1} s on {} threads\n",
+             {:<18}preset {preset}, engine {engine}, grid {grid}, seed {seed}: {seconds} s on {} threads\n",
             "illumination",
             self.polygons,
             "baked with",

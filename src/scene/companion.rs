@@ -227,13 +227,13 @@ impl Scene {
     /// The names of two fields that light each other and whose caps lie in the same faces (to a millionth of them):
     /// where both are solid there, neither lies before the other.
     pub fn coplanar_caps(&self) -> Option<[String; 2]> {
-        let corner = |m: &Member| {
+        let frame = |m: &Member| {
             let (lattice, far) = (m.field.lattice(), m.field.lattice().far());
             let axes = lattice.axes();
             [lattice.origin(), axes.x_axis * far.x, axes.y_axis * far.y, axes.z_axis * far.z]
         };
         let same = |a: &Member, b: &Member| {
-            let (a, b) = (corner(a), corner(b));
+            let (a, b) = (frame(a), frame(b));
             let size = a[1..].iter().map(|e| e.length()).fold(0.0, f64::max);
             a.iter().zip(&b).all(|(a, b)| (*a - *b).length() <= 1e-6 * size)
         };

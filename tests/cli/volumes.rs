@@ -2,8 +2,9 @@
 //! several in a scene.
 
 use super::{QUICK, ok, refused, text};
+use glam::DVec3;
 use isolume::volume::vti::VtiFile;
-use isolume::volume::{Samples, Volume};
+use isolume::volume::{Lattice, Samples, Volume};
 use std::fs;
 
 #[test]
@@ -181,4 +182,18 @@ fn several_volumes_in_one_scene() {
     assert_ne!(fs::read(dir.join("two-a.vti")).unwrap(), first);
     fs::remove_file(dir.join("two-b.vti")).unwrap();
     refused(dir, &["render", "two.vtm", "--isovalue", "50", "-o", "c.png"], &["two-b.vti"]);
+}
+
+#[test]
+fn info_of_a_damaged_bake_is_that_of_its_volume() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let lattice = Lattice::aligned([3; 3], DVec3::ZERO, DVec3::ONE).unwrap();
+    let volume = Volume::new("v", lattice, Samples::F32((0u8..27).map(f32::from).collect())).unwrap();
+    volume.write_with_notes(dir.join("v.vti"), &[("isolume".into(), "{}".into())]).unwrap();
+    let output = ok(dir, &["info", "v.vti", "--json"]);
+    let info: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!((&info["range"], info.get("bake")), (&serde_json::json!([0.0, 26.0]), None));
+    let said = text(&output.stderr);
+    assert!(said.contains("v.vti") && said.contains("'isolume'") && said.contains("isovalues"), "{said}");
 }
