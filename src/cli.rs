@@ -16,6 +16,7 @@ mod view;
 use crate::embree::Device;
 use crate::error::{Error, Result};
 use crate::export::bake_file::{BakeSummary, BakedVolume};
+use crate::field::Shortest;
 use crate::isa::Isa;
 use crate::progress::{self, Progress, say};
 use crate::render::{Camera, Rendered, Shading, render};
@@ -57,7 +58,7 @@ pub struct Cli {
     /// Instruction set of the vector kernels, at most (default: the widest that the machine has)
     #[arg(long, global = true, value_name = "SET", value_parser = clap::builder::PossibleValuesParser::new(Isa::NAMES))]
     isa: Option<String>,
-    /// No progress and no summary
+    /// No progress and no summary, only warnings and errors
     #[arg(long, short, global = true)]
     quiet: bool,
     #[command(subcommand)]
@@ -325,8 +326,8 @@ fn first_isovalue(scene: &Scene, name: &str, isovalue: f64) -> Result<f64> {
     let member = scene.members().swap_remove(scene.field_named(name)?);
     let sweep = member.field.sweep();
     if !(sweep.lo()..=sweep.hi()).contains(&isovalue) {
-        let (lo, hi) = (sweep.lo(), sweep.hi());
-        return Err(Error::Invalid(format!("--isovalue {isovalue}: outside the range of '{name}', {lo} … {hi}")));
+        let isovalue = Shortest(isovalue);
+        return Err(Error::Invalid(format!("--isovalue {isovalue}: outside the range of '{name}', {sweep}")));
     }
     Ok(scene.field.sweep().from_unit(sweep.to_unit(isovalue)))
 }
@@ -435,12 +436,12 @@ impl Render {
         if progress == Progress::Shown {
             let seconds = begun.elapsed().as_secs_f64();
             say!("{}: {}×{} in {seconds:.2} s", self.output.display(), camera.size[0], camera.size[1]);
-            if rendered.unbaked > 0.001 {
-                say!(
-                    "warning: {:.1} % of the picture shows the surface's inside, which was not baked; use --sides both",
-                    100.0 * rendered.unbaked
-                );
-            }
+        }
+        if rendered.unbaked > 0.001 {
+            say!(
+                "warning: {:.1} % of the picture shows the surface's inside, which was not baked; use --sides both",
+                100.0 * rendered.unbaked
+            );
         }
         Ok(())
     }

@@ -10,6 +10,7 @@ use crate::neighbourhood::neighbourhood;
 use crate::volume::{Lattice, Volume};
 use glam::DVec3;
 use rayon::prelude::*;
+use std::fmt;
 use std::sync::Arc;
 
 /// The sweep's isovalue range I = [lo, hi] in source units, mapped affinely to [0, 1].
@@ -29,7 +30,9 @@ impl Sweep {
             Ok(Self { lo, hi })
         } else {
             Err(Error::Invalid(format!(
-                "isovalues {lo} {hi}: the sweep needs two different finite numbers, the lower first"
+                "isovalues {} {}: the sweep needs two different finite numbers, the lower first",
+                Shortest(lo),
+                Shortest(hi)
             )))
         }
     }
@@ -65,6 +68,30 @@ impl Sweep {
     }
 }
 
+impl fmt::Display for Sweep {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str(&span((self.lo, self.hi)))
+    }
+}
+
+/// A range as people write it.
+pub fn span((lo, hi): (f64, f64)) -> String {
+    format!("{} … {}", Shortest(lo), Shortest(hi))
+}
+
+/// A number as people write it: all digits that tell it from others, an exponent where it is very large or small.
+pub struct Shortest(
+    /// The number.
+    pub f64,
+);
+
+impl fmt::Display for Shortest {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        let text = format!("{:?}", self.0);
+        f.write_str(text.strip_suffix(".0").unwrap_or(&text))
+    }
+}
+
 /// h in units of the sweep. Positions are index coordinates of the lattice, clamped to Ω.
 #[derive(Clone, Debug)]
 pub struct Field {
@@ -93,22 +120,20 @@ impl Field {
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32; overflow is checked")]
     pub fn new(volume: &Volume, sweep: Sweep) -> Result<Self> {
         let name = &volume.name;
-        let Some((min, max)) = volume.range() else {
+        let Some(data @ (min, max)) = volume.range() else {
             return Err(Error::Invalid(format!("{name}: none of its {} samples is finite", volume.samples().len())));
         };
         if sweep.hi() <= min || sweep.lo() >= max {
             return Err(Error::Invalid(format!(
-                "{name}: the sweep {} … {} lies outside the data, which span {min} … {max}; choose --isovalues inside",
-                sweep.lo(),
-                sweep.hi()
+                "{name}: the sweep {sweep} lies outside the data, which span {}; choose --isovalues inside",
+                span(data)
             )));
         }
         let largest = [min, max].iter().fold(0f32, |m, &v| m.max((sweep.to_unit(v) as f32).abs()));
         if !largest.is_finite() {
             return Err(Error::Invalid(format!(
-                "{name}: data {min} … {max} in units of the sweep {} … {} do not fit 32-bit floats; widen the sweep",
-                sweep.lo(),
-                sweep.hi()
+                "{name}: data {} in units of the sweep {sweep} do not fit 32-bit floats; widen the sweep",
+                span(data)
             )));
         }
         let samples: Vec<f32> = (0..volume.samples().len())
@@ -419,6 +444,14 @@ pub(crate) fn has_direction(v: DVec3) -> bool {
 mod tests {
     use super::*;
     use crate::volume::Samples;
+
+    #[test]
+    fn numbers_have_their_digits_and_no_more() {
+        let written = [47.0, -0.25, 0.1 + 0.2, 1e300, 5e-324, 7.18e299].map(|v| Shortest(v).to_string());
+        assert_eq!(written, ["47", "-0.25", "0.30000000000000004", "1e300", "5e-324", "7.18e299"]);
+        assert_eq!(Sweep::new(-3.5, 1e20).unwrap().to_string(), "-3.5 … 1e20");
+        assert!(Sweep::new(1e300, 1.0).unwrap_err().to_string().contains("isovalues 1e300 1:"));
+    }
 
     #[test]
     fn no_unit_vector_comes_from_a_nan() {

@@ -18,6 +18,7 @@ mod table;
 mod tests;
 
 use crate::error::{Error, Result};
+use crate::progress::{interrupted, unless_interrupted};
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 use source::{Plain, Refined, Source};
@@ -66,7 +67,7 @@ impl Isosurface {
 ///
 /// # Errors
 /// `Invalid` if a dimension is below 2, `samples` does not hold their product or the isovalue is not finite;
-/// `NotSupported` if the mesh has more vertices than u32 can name.
+/// `NotSupported` if the mesh has more vertices than u32 can name; `Interrupted`.
 pub fn extract(dims: [usize; 3], samples: &[f32], isovalue: f32) -> Result<Isosurface> {
     check(dims, samples, isovalue)?;
     march(&Plain { dims, samples }, f64::from(isovalue))
@@ -165,11 +166,15 @@ impl Bits {
             .map_init(
                 || vec![0.0; nx],
                 |row, (k, plane)| {
+                    if interrupted() {
+                        return true;
+                    }
                     let rows = plane.chunks_mut(words).enumerate();
                     rows.fold(true, |finite, (j, bits)| source.classify(j, k, c, row, bits) & finite)
                 },
             )
             .reduce(|| true, |a, b| a & b);
+        unless_interrupted()?;
         let usable = (!finite).then(|| usable_cells(source, words)).transpose()?;
         Ok(Self { dims, words, inside, usable })
     }
@@ -340,7 +345,7 @@ fn march(source: &impl Source, c: f64) -> Result<Isosurface> {
     }
     slabs.into_par_iter().for_each(|(planes, vertices, triangles)| {
         let (mut vertices, mut triangles) = (vertices.iter_mut(), triangles.iter_mut());
-        for k in planes {
+        for k in planes.take_while(|_| !interrupted()) {
             for j in 0..ny {
                 place_vertices(source, &bits, c, j, k, &mut vertices);
                 if j + 1 < ny && k + 1 < nz {
@@ -349,6 +354,7 @@ fn march(source: &impl Source, c: f64) -> Result<Isosurface> {
             }
         }
     });
+    unless_interrupted()?;
     Ok(Isosurface { vertices, triangles })
 }
 

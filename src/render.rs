@@ -5,6 +5,7 @@ use crate::embree::{Device, GraphTracer};
 use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
 use crate::export::picture::Picture;
+use crate::field::Shortest;
 use crate::flat;
 use crate::flattened::{FlattenedHit, FlattenedRay, Side, Target, split_face};
 use crate::progress::Progress;
@@ -97,9 +98,8 @@ pub fn render(
     let sweep = scene.field.sweep();
     if !(isovalue >= sweep.lo() && isovalue <= sweep.hi()) {
         return Err(Error::Invalid(format!(
-            "isovalue {isovalue} lies outside the sweep {} … {}; choose one inside, or bake a wider sweep",
-            sweep.lo(),
-            sweep.hi()
+            "isovalue {} lies outside the sweep {sweep}; choose one inside, or bake a wider sweep",
+            Shortest(isovalue)
         )));
     }
     let tracer = GraphTracer::new(device, scene)?;

@@ -141,16 +141,16 @@ pub struct RawOptions {
     #[arg(long = "raw-type", value_name = "TYPE")]
     #[serde(rename = "type")]
     pub element: Option<String>,
-    /// Byte order of a headerless file: little or big
+    /// Byte order of a headerless file: little (default) or big
     #[arg(long = "raw-endian", value_name = "ORDER")]
     pub endian: Option<String>,
-    /// World distance between samples of a headerless file, negative where an axis is flipped
+    /// World distance between samples of a headerless file, negative where an axis is flipped (default: 1,1,1)
     #[arg(long = "raw-spacing", value_name = "DX,DY,DZ", value_delimiter = ',', allow_hyphen_values = true)]
     pub spacing: Option<Vec<f64>>,
-    /// World position of the first sample of a headerless file
+    /// World position of the first sample of a headerless file (default: 0,0,0)
     #[arg(long = "raw-origin", value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true)]
     pub origin: Option<Vec<f64>>,
-    /// Bytes to skip at the start of a headerless file
+    /// Bytes to skip at the start of a headerless file (default: 0)
     #[arg(long = "raw-skip", value_name = "BYTES")]
     pub skip: Option<u64>,
 }

@@ -109,8 +109,12 @@ impl Study {
     /// either engine, and `quick`. Rows of `table` that bear a subject's name must be of its digest.
     ///
     /// # Errors
-    /// `Invalid` if some are not, if two scenes that differ have one name, or if neither engine takes what `base` sets.
-    fn jobs(&self, table: &Table, subjects: &[Subject], base: &BakeOptions) -> Result<Vec<String>> {
+    /// `Invalid` if some are not, if two scenes that differ have one name, if neither engine takes what `base` sets, or
+    /// if that is one of the options that the study `varies` itself.
+    fn jobs(&self, table: &Table, subjects: &[Subject], base: &BakeOptions, varies: &[&str]) -> Result<Vec<String>> {
+        if let Some(option) = base.set().iter().find(|o| varies.contains(&o.as_str())) {
+            return Err(Error::Invalid(format!("--{option}: this study gives it values of its own; leave it out")));
+        }
         let settings = [Engine::Photon, Engine::Sweep].map(|engine| BakeSettings::with_engine(base, engine));
         let settings = match settings {
             [Err(e), Err(_)] => return Err(e),

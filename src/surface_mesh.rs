@@ -4,7 +4,7 @@ use crate::error::{Error, Result};
 use crate::export::Mesh;
 use crate::export::bake_file::BakedVolume;
 use crate::export::picture::srgb_encode;
-use crate::field::Field;
+use crate::field::{Field, Shortest};
 use crate::flattened::Side;
 use crate::isosurface::{Isosurface, extract_refined};
 use crate::scene::Scene;
@@ -33,8 +33,8 @@ pub fn unit_isovalue(field: &Field, isovalue: f64) -> Result<f32> {
     if isovalue >= sweep.lo() && isovalue <= sweep.hi() {
         return Ok(sweep.isovalue(isovalue));
     }
-    let (lo, hi) = (sweep.lo(), sweep.hi());
-    Err(Error::Invalid(format!("--isovalue {isovalue}: outside the sweep {lo} … {hi}; choose one inside")))
+    let isovalue = Shortest(isovalue);
+    Err(Error::Invalid(format!("--isovalue {isovalue}: outside the sweep {sweep}; choose one inside")))
 }
 
 impl SurfaceMesh {

@@ -15,6 +15,15 @@ fn document(name: &str) -> String {
     fs::read_to_string(root().join(name)).unwrap_or_else(|e| panic!("{name}: {e}"))
 }
 
+/// What `isolume help bake` says about a flag, on one line.
+fn help(flag: &str) -> String {
+    let output = Command::new(env!("CARGO_BIN_EXE_isolume")).args(["help", "bake"]).output().unwrap();
+    let text = String::from_utf8(output.stdout).unwrap();
+    let from = text.find(&format!("      --{flag} ")).unwrap_or_else(|| panic!("no --{flag} in: {text}"));
+    let about = text[from..].lines().skip(1).take_while(|l| !l.trim_start().starts_with('-'));
+    about.flat_map(str::split_whitespace).collect::<Vec<_>>().join(" ")
+}
+
 /// The texts between backticks.
 fn quoted(text: &str) -> Vec<&str> {
     text.split('`').skip(1).step_by(2).collect()
@@ -102,6 +111,17 @@ fn the_defaults_of_bakes_are_the_described_ones() {
             let key = quoted(row[0])[0].replace('-', "_");
             let key = if key == "gather" { "gather_rays" } else { &key };
             let cells: Vec<&str> = row[2].split(" / ").collect();
+            // Options say the same.
+            let (flag, about) = (quoted(row[0])[0], help(quoted(row[0])[0]));
+            let values = cells.iter().map(|c| number(c).map(|n| n.to_string())).collect::<Option<Vec<_>>>();
+            let said = match (values, quoted(row[2]).first()) {
+                (Some(each), _) if each.len() > 1 => format!("by preset {}", each.join(" / ")),
+                (Some(one), _) => format!("default: {}", one[0]),
+                (None, Some(name)) => name.trim_matches('"').to_owned(),
+                (None, None) => "default".to_owned(),
+            };
+            assert!(about.contains("by preset") || about.contains("default"), "--{flag}: {about}");
+            assert!(about.contains(&said), "--{flag}: no '{said}' in: {about}");
             let cell = cells[i.min(cells.len() - 1)];
             if let Some(described) = number(cell) {
                 assert_eq!(settings[key].as_f64(), Some(described), "{key}, {preset:?}");

@@ -67,8 +67,12 @@ fn frames_are_single_bakes_and_blends_those_of_blended_volumes() {
     }
     let range = ["--isovalues", "0.9", "0.97"];
     let with = |args: &[&'static str]| [args, &range].concat();
-    let text = ok(dir, &with(&["bake", "ball_%03d.nrrd", "-o", "lit.vti"]));
+    let output = isolume(dir, &with(&["bake", "ball_%03d.nrrd", "-o", "lit.vti", "--tau", "0.1", "--json"]));
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(text.contains("frame  3 of 3, time 10") && text.contains("lit.pvd"), "{text}");
+    // One document, a report each.
+    let reports: Vec<serde_json::Value> = serde_json::from_slice(&output.stdout).unwrap();
+    assert!(reports.len() == 3 && reports.iter().all(|r| r["photons"]["emitted"] == 4000), "{reports:?}");
     // As ParaView opens it: a collection whose files, beside it, are image data.
     let text = fs::read_to_string(dir.join("lit.pvd")).unwrap();
     let collection = roxmltree::Document::parse(&text).unwrap();

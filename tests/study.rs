@@ -83,8 +83,10 @@ fn settings_are_checked_before_anything_is_computed() {
     let output = isolume(dir, &["study", "datasets", "t_%d.vti", "-o", "st", "--quick"]);
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.code() == Some(2) && said.contains("name one of its files"), "{said}");
-    for study in ["datasets", "strategies", "curve"] {
-        for (option, value) in [("--gather", "2000000"), ("--wall-resolution", "1"), ("--bands", "1000")] {
+    // Of the last, each study has values of its own.
+    let own = [("--strategy", "planes"), ("--samples", "1000"), ("--photons", "1000")];
+    for (study, own) in ["datasets", "strategies", "curve"].into_iter().zip(own) {
+        for (option, value) in [("--gather", "2000000"), ("--wall-resolution", "1"), ("--bands", "1000"), own] {
             let output = isolume(dir, &["study", study, "b.vti", "-o", "st", "--quick", option, value]);
             let said = String::from_utf8_lossy(&output.stderr);
             assert!(output.status.code() == Some(2) && said.lines().count() == 1, "{study} {option}: {said}");

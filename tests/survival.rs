@@ -219,21 +219,22 @@ fn a_full_disk_is_one_clear_line_and_keeps_the_last_checkpoint() {
 }
 
 #[test]
-fn pictures_can_be_interrupted_and_keep_older_ones() {
+fn pictures_and_meshes_can_be_interrupted_and_keep_older_ones() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     volume(dir, "33");
     let flat = "[field]\ngenerator = \"bumps2\"\n";
     fs::write(dir.join("flat.toml"), flat).unwrap();
     fs::create_dir(dir.join("flat")).unwrap();
-    let kept = ["out.png", "flat/flattened.png"];
+    let kept = ["out.png", "out.ply", "flat/flattened.png"];
     kept.iter().for_each(|name| fs::write(dir.join(name), "precious").unwrap());
-    // Minutes of work.
+    // Seconds to minutes of work.
     let render = ["render", "b.vti", "--isovalue", "50", "-o", "out.png", "--samples", "60000"];
     for args in [
         &[&render[..], &["--reference"]].concat()[..],
         &[&render[..], &["--reference", "--trilinear"]].concat(),
         &[&render[..], &["--local"]].concat(),
+        &["extract", "b.vti", "--isovalue", "50", "--refine", "64", "-o", "out.ply"],
         &["flatland", "flat.toml", "-o", "flat", "--gather", "60000"],
         &["flatland", "flat.toml", "-o", "flat", "--gather", "4", "--width", "8192"],
     ] {

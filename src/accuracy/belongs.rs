@@ -1,7 +1,7 @@
 //! Whether a mesh is an isosurface of a volume.
 
 use crate::error::{Error, Result};
-use crate::field::Field;
+use crate::field::{Field, Shortest};
 use glam::DVec3;
 
 /// How far h may be from the isovalue everywhere, in units of the sweep: the rounding of positions and samples.
@@ -45,11 +45,10 @@ pub fn belongs(positions: &[DVec3], isovalue: Option<f64>, field: &Field) -> Res
     };
     // A median has digits that mean nothing.
     let rounded = || format!("{:.4e}", sweep.from_unit(c)).parse().unwrap_or(middle);
-    let said: f64 = isovalue.unwrap_or_else(rounded);
+    let said = Shortest(isovalue.unwrap_or_else(rounded));
     if !(-slack..=1.0 + slack).contains(&c) {
-        let (lo, hi) = (sweep.lo(), sweep.hi());
         return Err(Error::Invalid(format!(
-            "is of isovalue {said}, outside of the bake's sweep {lo} … {hi}; make one inside, or bake a wider sweep"
+            "is of isovalue {said}, outside of the bake's sweep {sweep}; make one inside, or bake a wider sweep"
         )));
     }
     let share = if isovalue.is_some() { 1.0 } else { UNKNOWN };

@@ -84,32 +84,34 @@ pub enum Interpolation {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, clap::Args)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
 pub struct BakeOptions {
-    /// Amount of work: preview (seconds), standard (minutes) or reference
+    /// Amount of work: preview (seconds), standard (minutes, default) or reference
     #[arg(long)]
     pub preset: Option<Preset>,
     /// How light is computed (default: sweep, or photon for scenes that cannot be swept, for binary volumes, and with
     /// options that are its own)
     #[arg(long)]
     pub engine: Option<Engine>,
-    /// Sweep engine: directions per pass and replicate (a power of two, 8 or more)
+    /// Sweep engine: directions per pass and replicate (a power of two, 8 or more; by preset 64 / 256 / 512)
     #[arg(long, value_name = "N")]
     pub directions: Option<usize>,
-    /// Sweep engine: points per luminaire and replicate (a power of two)
+    /// Sweep engine: points per luminaire and replicate (a power of two; by preset 16 / 64 / 128)
     #[arg(long, value_name = "N")]
     pub light_points: Option<usize>,
-    /// Photons to emit
+    /// Photons to emit (by preset 524288 / 4194304 / 16777216)
     #[arg(long, value_name = "N")]
     pub photons: Option<u64>,
-    /// Reflections after which a photon is cut off (default: Russian roulette only)
+    /// Reflections after which a photon is cut off (default: 65535, left to Russian roulette)
     #[arg(long, value_name = "N")]
     pub bounces: Option<u16>,
-    /// Which photons an irradiance estimate looks at: bins of the lattice, the k nearest, or all within a radius
+    /// Which photons an irradiance estimate looks at: bins of the lattice (splat, default), the k nearest, or all
+    /// within a radius
     #[arg(long, value_name = "NAME")]
     pub estimator: Option<Estimator>,
-    /// Photons per irradiance estimate (the bins': at least; within a radius: on average)
+    /// Photons per irradiance estimate (the bins': at least; within a radius: on average; default: 64, of bins without
+    /// gather rays 1000)
     #[arg(long, value_name = "K")]
     pub photons_per_estimate: Option<usize>,
-    /// Largest isovalue difference of a photon to its estimate, as a fraction of the sweep
+    /// Largest isovalue difference of a photon to its estimate, as a fraction of the sweep (default: 0.1)
     #[arg(long, value_name = "TAU")]
     pub tau: Option<f64>,
     /// Scattered radiance samples per side (default: one at each grid point)
@@ -118,30 +120,32 @@ pub struct BakeOptions {
     /// Where samples are placed (default: nodes, or uniform if --samples is given)
     #[arg(long)]
     pub strategy: Option<StrategyName>,
-    /// Shadow rays per sample and luminaire: the most; a quarter where all or none reach it
+    /// Shadow rays per sample and luminaire: the most; a quarter where all or none reach it (by preset 64 / 256 / 1024)
     #[arg(long, value_name = "N")]
     pub shadow_rays: Option<u32>,
-    /// Final gather rays per sample; 0 takes indirect light straight from the photon map (BB09's mode)
+    /// Final gather rays per sample (by preset 32 / 64 / 256); 0 takes indirect light straight from the photon map
+    /// (BB09's mode)
     #[arg(long = "gather", value_name = "M")]
     #[serde(rename = "gather")]
     pub gather_rays: Option<u32>,
     /// Whether light gathered at the grid's points is smoothed over neighbouring ones where that lowers its error
+    /// (default: true)
     #[arg(long, value_name = "BOOL")]
     pub smoothing: Option<bool>,
-    /// Nearest samples that interpolation looks at
+    /// Nearest samples that interpolation looks at (default: 8, by irradiance 16)
     #[arg(long, value_name = "K")]
     pub neighbours: Option<usize>,
-    /// How samples become grid values
+    /// How scattered samples become grid values (default: irradiance)
     #[arg(long)]
     pub interpolation: Option<Interpolation>,
-    /// Size of the illumination grid: a factor of the volume's such as 2x, or NX,NY,NZ points
+    /// Size of the illumination grid: a factor of the volume's such as 2x, or NX,NY,NZ points (default: 1x)
     #[arg(long, value_name = "SIZE")]
     #[serde(default, with = "grid_text")]
     pub grid: Option<GridSize>,
-    /// Texels along the longer edge of a wall
+    /// Texels along the longer edge of a wall (by preset 32 / 64 / 128)
     #[arg(long, value_name = "N")]
     pub wall_resolution: Option<usize>,
-    /// Seed of all random numbers
+    /// Seed of all random numbers (default: 1)
     #[arg(long)]
     pub seed: Option<u64>,
     /// Bands of isovalues baked one after another, which takes less memory (default: 1, or what --max-memory asks for)
@@ -192,6 +196,13 @@ impl BakeOptions {
             seed: self.seed.or(other.seed),
             bands: self.bands.or(other.bands),
         }
+    }
+
+    /// The names of those that are set, as flags and files spell them.
+    pub fn set(&self) -> Vec<String> {
+        let all = serde_json::to_value(self).expect("options are plain data");
+        let all = all.as_object().into_iter().flatten();
+        all.filter(|(_, value)| !value.is_null()).map(|(name, _)| name.clone()).collect()
     }
 
     /// Options that mean nothing to sweeps, by name, and whether they are set.

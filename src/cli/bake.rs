@@ -1,26 +1,25 @@
 //! `isolume bake`: from a volume or scene to the file that holds it with its light.
 
+mod warnings;
+
 use super::{device, expect_extension, outputs};
 use crate::bake::{
-    BakeOptions, BakeReport, BakeSettings, Engine, MemoryEstimate, TimeEstimate, bake_fields, digest, job, left_out,
-    supported,
+    BakeOptions, BakeReport, BakeSettings, Engine, MemoryEstimate, TimeEstimate, bake_fields, digest, job, supported,
 };
 use crate::checkpoint::{Checkpoint, Held};
 use crate::error::{Error, Result};
 use crate::export::bake_file::{self, BakedVolume};
 use crate::field::Sweep;
-use crate::flattened::Side;
 use crate::isa::Isa;
 use crate::progress::{Clock, Progress, say};
-use crate::scene::{Boundary, Policy, Scene};
+use crate::scene::{Policy, Scene};
 use crate::scene_file::{Inputs, SceneOptions, load, load_series};
 use crate::series::{Series, write_collection};
-use crate::sweep::lit_within_solids;
 use crate::volume::Volume;
-use glam::DVec3;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::time::Duration;
+use warnings::warnings;
 
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
@@ -45,7 +44,7 @@ pub(super) struct Bake {
     /// Write seconds, rays, counts and settings as JSON
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
-    /// Print the same JSON; with --dry-run the estimates
+    /// Print the same JSON, of a series a list of its frames'; with --dry-run the estimates
     #[arg(long)]
     json: bool,
     /// Where progress is kept until the bake is done (default: OUTPUT.checkpoint)
@@ -86,7 +85,9 @@ impl Bake {
         let series = if self.scene.time.is_none() { load_series(&self.input, &self.scene)? } else { None };
         let Some(series) = series else {
             outputs(self.outputs(), &inputs)?;
-            return self.one(begun, progress, false).map(drop);
+            let (_, json) = self.one(begun, progress, false, &mut BTreeSet::new())?;
+            self.print(&json);
+            return Ok(());
         };
         let frames: Vec<Self> = (0..series.times().len()).map(|n| self.frame(n)).collect();
         let collection = self.output.with_extension("pvd");
@@ -128,22 +129,25 @@ impl Bake {
     /// Every frame of a series, with the same sweep and seed, and the collection of those that are done.
     fn frames(&self, series: &Series, frames: Vec<Self>, progress: Progress) -> Result<()> {
         let mut scene = self.scene.clone();
-        let mut done = Vec::new();
+        let (mut done, mut reports, mut said) = (Vec::new(), Vec::new(), BTreeSet::new());
         for (n, (&time, frame)) in series.times().iter().zip(frames).enumerate() {
             if progress == Progress::Shown {
                 say!("{:>14}  {} of {}, time {time}", "frame", n + 1, series.times().len());
             }
             scene.time = Some(time);
             let frame = Self { scene: scene.clone(), ..frame };
-            let sweep = frame.one(Clock::start(), progress, n == 0)?;
+            let (sweep, json) = frame.one(Clock::start(), progress, n == 0, &mut said)?;
             scene.isovalues = Some(vec![sweep.lo(), sweep.hi()]);
             if self.dry_run {
+                self.print(&json);
                 say!("{:>14}  that for each of {} frames", "series", series.times().len());
                 return Ok(());
             }
             done.push((time, frame.output));
+            reports.push(json);
             write_collection(&self.output.with_extension("pvd"), &done)?;
         }
+        self.print(&reports.into());
         if progress == Progress::Shown {
             say!("{:>14}  {}", "written", self.output.with_extension("pvd").display());
         }
@@ -156,21 +160,30 @@ impl Bake {
         Some(found.report)
     }
 
-    /// Writes or prints the report, if that is wanted.
+    /// Writes the report, if that is wanted.
     fn hand_out(&self, report: &serde_json::Value) -> Result<()> {
-        if let Some(path) = &self.report {
-            let mut file = crate::atomic::AtomicFile::create(path)?;
-            serde_json::to_writer_pretty(&mut file, report).map_err(|e| Error::io(path, e.into()))?;
-            file.commit()?;
-        }
-        if self.json {
-            println!("{report:#}");
-        }
-        Ok(())
+        let Some(path) = &self.report else { return Ok(()) };
+        let mut file = crate::atomic::AtomicFile::create(path)?;
+        serde_json::to_writer_pretty(&mut file, report).map_err(|e| Error::io(path, e.into()))?;
+        file.commit()
     }
 
-    /// One bake, which may be the first of a series; returns its sweep.
-    fn one(&self, begun: Clock, progress: Progress, first: bool) -> Result<Sweep> {
+    /// Prints reports or estimates, if that is wanted.
+    fn print(&self, json: &serde_json::Value) {
+        if self.json {
+            println!("{json:#}");
+        }
+    }
+
+    /// One bake, which may be the first of a series, without the warnings that were `said` before; its sweep, and what
+    /// there is to print about it.
+    fn one(
+        &self,
+        begun: Clock,
+        progress: Progress,
+        first: bool,
+        said: &mut BTreeSet<String>,
+    ) -> Result<(Sweep, serde_json::Value)> {
         let loaded = load(&self.input, &self.scene)?;
         let load_seconds = begun.seconds();
         let extension = self.output.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
@@ -204,47 +217,18 @@ impl Bake {
             for member in &members {
                 let ([nx, ny, nz], sweep) = (member.field.lattice().dims(), member.field.sweep());
                 say!(
-                    "{}{}: {nx}×{ny}×{nz}, isovalues {} … {}, {} luminaire(s), {} threads, {}",
+                    "{}{}: {nx}×{ny}×{nz}, isovalues {sweep}, {} luminaire(s), {} threads, {}",
                     self.input.display(),
                     if members.len() > 1 { format!(" '{}'", member.name) } else { String::new() },
-                    sweep.lo(),
-                    sweep.hi(),
                     loaded.scene.luminaires().len(),
                     rayon::current_num_threads(),
                     Isa::current().name()
                 );
             }
-            for idle in options.idle(&settings) {
-                say!("warning: {idle}");
-            }
-            let dark = members.iter().all(|m| m.surface.emission == DVec3::ZERO);
-            if loaded.scene.luminaires().is_empty() && dark {
-                say!("warning: nothing emits light; everything will be black");
-            }
-            let scene = &loaded.scene;
-            let sealed = scene.boundary == Boundary::Capped && scene.surface.outside == Side::Higher;
-            if sealed && scene.fields() == 1 && !lit_within_solids(scene) {
-                say!(
-                    "warning: boundary = \"capped\" closes the higher side of surfaces off, which is to be their outside: it \
-                     will be black; use outside = \"lower\" or boundary = \"open\""
-                );
-            }
-            if let Some([a, b]) = scene.coplanar_caps() {
-                say!(
-                    "warning: boundary = \"capped\": '{a}' and '{b}' end in the same faces; where both are solid there, \
-                     neither cap lies before the other and light near it is uncertain; let one end within the other"
-                );
-            }
-            // Sweeps that nobody asked for were chosen because they leave out nothing to speak of.
-            if settings.engine == Engine::Sweep
-                && !options.leaves_engine()
-                && let Some(share) = left_out(&loaded.scene, &settings.grid)?
-            {
-                say!(
-                    "warning: samples jump over the whole sweep at {:.0} % of the points that surfaces need, where sweeps leave \
-                     out what surfaces reflect; use --engine photon, a finer --grid or smoother samples",
-                    100.0 * share
-                );
+        }
+        for warning in warnings(&loaded.scene, &options, &settings)? {
+            if said.insert(warning.clone()) {
+                say!("warning: {warning}");
             }
         }
         let device = device()?;
@@ -285,31 +269,33 @@ impl Bake {
             }
             let time = TimeEstimate::new(&loaded.scene, &settings, &device)?;
             say!("{:>14}  {time}", "time");
-            if self.json {
-                let json = serde_json::json!({
-                    "settings": settings,
-                    "bytes": memory.stages.iter().copied().collect::<BTreeMap<_, _>>(),
-                    "peak_bytes": memory.peak(),
-                    "seconds": time.stages.iter().copied().collect::<BTreeMap<_, _>>(),
-                    "total_seconds": time.total(),
-                });
-                println!("{json:#}");
-            }
-            return Ok(sweep);
+            let json = serde_json::json!({
+                "settings": settings,
+                "bytes": memory.stages.iter().copied().collect::<BTreeMap<_, _>>(),
+                "peak_bytes": memory.peak(),
+                "seconds": time.stages.iter().copied().collect::<BTreeMap<_, _>>(),
+                "total_seconds": time.total(),
+            });
+            return Ok((sweep, json));
         }
         fits?;
         let job = job(&loaded.scene, &settings);
         // Of a series, what is there.
         let whole = (self.resume && self.scene.time.is_some()).then(|| self.whole()).flatten();
-        let same = |report: &&serde_json::Value| report.get("job").and_then(|j| j.as_str()) == Some(&digest(&job));
-        if let Some(report) = whole.as_ref().filter(same) {
-            say!("{:>14}  {} is complete", "resumed", self.output.display());
-            self.hand_out(report)?;
-            return Ok(sweep);
-        }
+        let same = |report: &serde_json::Value| report.get("job").and_then(|j| j.as_str()) == Some(&digest(&job));
+        let another = match whole {
+            Some(report) if same(&report) => {
+                if progress == Progress::Shown {
+                    say!("{:>14}  {} is complete", "resumed", self.output.display());
+                }
+                self.hand_out(&report)?;
+                return Ok((sweep, report));
+            }
+            found => found.is_some(),
+        };
         let checkpoint = Checkpoint::new(&self.checkpoint_path(), job, self.every()?)?;
         // Had this series been begun, its first frame or a checkpoint of that would be there.
-        if first && whole.is_some() && checkpoint.held()? != Held::This {
+        if first && another && checkpoint.held()? != Held::This {
             return Err(Error::invalid(
                 &self.output,
                 "is a bake of other settings or of another version, which --resume cannot go on with; give its settings, \
@@ -344,7 +330,15 @@ impl Bake {
         if progress == Progress::Shown {
             self.summarise(&loaded.scene, &reports);
         }
-        Ok(sweep)
+        if let Some(r) = reports.iter().find(|r| r.unsettled > UNSETTLED) {
+            say!(
+                "warning: light has not settled in {} bounces: {:.0} % of what is reflected may be missing; use --engine photon, \
+                 or smaller albedos",
+                r.sweep_bounces,
+                100.0 * r.unsettled
+            );
+        }
+        Ok((sweep, json))
     }
 
     /// What was done, for people.
@@ -373,14 +367,6 @@ impl Bake {
             sum(|r| r.samples_without_gradient),
             each(|r| r.non_finite + r.non_finite_voxels)
         );
-        if let Some(r) = runs.iter().find(|r| r.unsettled > UNSETTLED) {
-            say!(
-                "warning: light has not settled in {} bounces: {:.0} % of what is reflected may be missing; use --engine photon, \
-                 or smaller albedos",
-                r.sweep_bounces,
-                100.0 * r.unsettled
-            );
-        }
         say!("{:>14}  {}", "written", self.output.display());
         for member in scene.members().iter().filter(|_| reports.len() > 1) {
             say!("{:>14}  {}", "", bake_file::field_file(&self.output, &member.name).display());

@@ -54,7 +54,7 @@ impl Compare {
             let origin = Origin::from_comments(&file.comments);
             belongs(&reference.positions, origin.isovalue, &baked.scene.field).map_err(|e| e.in_file(path))?;
             let another = |c| origin.light.is_some_and(|known| known != light(&baked.scene, c));
-            if progress == Progress::Shown && origin.isovalue.is_some_and(another) {
+            if origin.isovalue.is_some_and(another) {
                 say!(
                     "warning: {}: was made of another material or box than {}; the difference counts as error",
                     path.display(),

@@ -52,7 +52,7 @@ struct Flatland {
 #[command(after_help = "\
 Writes CSV, Markdown and SVG into DIR; rows that are there are kept, so that an interrupted study goes on where it
 stopped. They must be of the same scene and settings: others need a folder of their own. References are cached in
-DIR/references.
+DIR/references. Options that a study gives values of its own are refused.
 
 Examples:
   isolume study strategies scenes/cornell-bumps.toml -o results

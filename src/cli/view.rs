@@ -33,7 +33,7 @@ impl View {
         expect_extension(&self.output, &["html", "htm"])?;
         outputs([&*self.output], &Inputs::files([&*self.file]))?;
         let baked = BakedVolume::read(&self.file)?;
-        if view::leaves_out(&baked.scene) && progress == Progress::Shown {
+        if view::leaves_out(&baked.scene) {
             say!(
                 "warning: context geometry is left out: {} polygons, and a page draws {}",
                 baked.scene.polygons().len(),

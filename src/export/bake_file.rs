@@ -6,7 +6,7 @@ use super::picture::srgb_encode;
 use crate::atomic::AtomicFile;
 use crate::bake::Bake;
 use crate::error::{Error, Result};
-use crate::field::{Field, FieldRows, Sweep};
+use crate::field::{Field, FieldRows, Sweep, span};
 use crate::flat::{self, FlatTexture};
 use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
@@ -129,9 +129,10 @@ impl BakeSummary {
         let seconds = self.report.pointer("/seconds/total").and_then(serde_json::Value::as_f64);
         let seconds = seconds.map_or("unknown".into(), |s| format!("{s:.1}"));
         format!(
-            "{:<18}isovalues {lo} … {hi} on {sides}, {ends}, {} polygons\n\
+            "{:<18}isovalues {} on {sides}, {ends}, {} polygons\n\
              {:<18}preset {preset}, engine {engine}, grid {grid}, seed {seed}: {seconds} s on {} threads\n",
             "illumination",
+            span((lo, hi)),
             self.polygons,
             "baked with",
             said("/threads"),

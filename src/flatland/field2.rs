@@ -1,7 +1,7 @@
 //! h₂: samples on a rectangle, bilinear in every cell, in units of the sweep.
 
 use crate::error::{Error, Result};
-use crate::field::Sweep;
+use crate::field::{Sweep, span};
 use crate::volume::Volume;
 use crate::volume::plane::Plane;
 use glam::DVec2;
@@ -43,15 +43,17 @@ impl HeightField {
         let (min, max) = (finite().fold(f64::INFINITY, f64::min), finite().fold(f64::NEG_INFINITY, f64::max));
         if !(min < sweep.hi() && max > sweep.lo()) {
             return fail(format!(
-                "isovalues {} … {} lie outside the data, which span {min} … {max}; choose isovalues inside",
-                sweep.lo(),
-                sweep.hi()
+                "isovalues {sweep} lie outside the data, which span {}; choose isovalues inside",
+                span((min, max))
             ));
         }
         let samples: Vec<f32> =
             values.iter().map(|&v| if v.is_finite() { sweep.isovalue(v) } else { f32::NAN }).collect();
         if samples.iter().any(|s| s.is_infinite()) {
-            return fail(format!("data {min} … {max} in units of the sweep do not fit 32-bit floats; widen the sweep"));
+            return fail(format!(
+                "data {} in units of the sweep do not fit 32-bit floats; widen the sweep",
+                span((min, max))
+            ));
         }
         Ok(Self { dims, origin, spacing, sweep, samples })
     }

@@ -66,7 +66,7 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
     let modes =
         modes.into_iter().filter(|(_, options)| base.engine.is_none_or(|engine| options.engine == Some(engine)));
     let modes: Vec<(&str, BakeOptions)> = modes.collect();
-    let jobs = study.jobs(&table, subjects, base)?;
+    let jobs = study.jobs(&table, subjects, base, &["strategy"])?;
     for (subject, job) in subjects.iter().zip(&jobs) {
         let scene = &subject.scene;
         let c = subject.main_isovalue();

@@ -41,7 +41,7 @@ const STRATEGIES: [(StrategyName, &str); 4] = [
 pub fn strategies(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Result<()> {
     let mut table = Table::open(study.folder.join("strategies.csv"), &COLUMNS, 4)?;
     let counts: &[u64] = if study.quick { &[20_000, 100_000] } else { &[100_000, 1_000_000, 10_000_000] };
-    let jobs = study.jobs(&table, subjects, base)?;
+    let jobs = study.jobs(&table, subjects, base, &["engine", "samples", "strategy"])?;
     let isovalues = subjects.iter().map(|s| isovalues(study, s)).collect::<Result<Vec<_>>>()?;
     let works: Vec<Work> = subjects
         .iter()

@@ -17,6 +17,8 @@ fn a_second_bake_never_harms_the_first_unless_it_finishes() {
     let mut bake = vec!["bake", "b.vti", "-o", "keep.vti", "--isovalues", "3.6", "95", "-q"];
     bake.extend(QUICK);
     assert_eq!(text(&ok(dir, &bake).stderr), "", "--quiet is quiet");
+    let lines = text(&ok(dir, &[&bake[..], &["--directions", "64", "--engine", "photon"]].concat()).stderr);
+    assert_eq!(lines, "warning: directions has no effect with engine = \"photon\"\n", "but for warnings");
     assert!(VtiFile::read(&dir.join("keep.vti")).is_ok());
 }
 

@@ -124,10 +124,14 @@ fn sorted(a: f64, b: f64) -> [f64; 2] {
 /// Both ends as multiples of 1, 2 or 5 · 10ⁿ, at most a `parts`-th of the sweep apart.
 fn nice([lo, hi]: [f64; 2], parts: f64) -> [f64; 2] {
     let most = (hi - lo) / parts;
-    let power = 10f64.powf(most.log10().floor());
-    let step = [5.0, 2.0, 1.0].into_iter().map(|m| m * power).find(|s| *s <= most).unwrap_or(power);
-    // Dividing by the inverse of a small step gives decimals like 0.3, multiplying 0.30000000000000004.
-    let round = |v: f64| if step < 1.0 { (v / step).round() / (1.0 / step).round() } else { (v / step).round() * step };
+    let exponent = most.log10().floor();
+    let power = 10f64.powf(exponent);
+    let multiple = [5.0, 2.0, 1.0].into_iter().find(|m| m * power <= most).unwrap_or(1.0);
+    // Written down and read: decimals like 0.3, where multiplying gives 0.30000000000000004.
+    let round = |v: f64| {
+        let count = (v / (multiple * power)).round() * multiple + 0.0;
+        format!("{count}e{exponent}").parse().unwrap_or(f64::NAN)
+    };
     let rounded = [round(lo), round(hi)];
     if rounded.iter().all(|v| v.is_finite()) { rounded } else { [lo, hi] }
 }

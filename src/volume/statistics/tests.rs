@@ -88,6 +88,8 @@ fn the_sweep_does_not_depend_on_the_unit() {
         let s = VolumeStatistics::of(&ball(unit));
         let [lo, hi] = s.sweep.unwrap_or_else(|| panic!("no sweep in units of {unit}"));
         assert!((lo / unit - one[0]).abs() < 1e-9 && (hi / unit - one[1]).abs() < 1e-9, "{unit}: {lo} {hi}, {one:?}");
+        let text = s.sweep.unwrap().map(|v| format!("{v:e}"));
+        assert!(text.iter().all(|t| t.len() < 10), "ends are short decimals: {text:?}");
     }
 }
 
