@@ -7,6 +7,7 @@ use crate::volume::Lattice;
 use glam::DVec3;
 use rayon::prelude::*;
 use std::borrow::Cow;
+use std::ops::Range;
 
 /// What a grid point holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -41,31 +42,37 @@ pub fn masks(field: &Field, lattice: &Lattice) -> Vec<Mask> {
     out.par_chunks_mut(SLICES * area).enumerate().for_each(|(chunk, out)| {
         let first = chunk * SLICES;
         let last = first + out.len() / area - 1;
-        let planes: Vec<Vec<[f32; 2]>> = (first.saturating_sub(1)..=(last + 1).min(dims[2] - 1))
-            .map(|z| extrema(&values[z * area..(z + 1) * area], dims[0]))
+        let planes: Vec<Extrema> = (first.saturating_sub(1)..=(last + 1).min(dims[2] - 1))
+            .map(|z| Extrema::around(&values[z * area..(z + 1) * area], dims[0]))
             .collect();
         let below = first.min(1);
         let mut row = GradientRow::default();
+        let mut around = Extrema::nothing(dims[0]);
         for (r, out) in out.chunks_exact_mut(dims[0]).enumerate() {
             let (j, z) = (r % dims[1], r / dims[1]);
             let values = &values[first * area + r * dims[0]..][..dims[0]];
             let within = |h: f32| (0.0..=1.0).contains(&h);
-            let own = values.iter().any(|h| within(*h));
-            let gradients = if own { rows.gradients(j, first + z, &mut row) } else { &[] };
-            let start = (first + r / dims[1]) * area + j * dims[0];
-            let (z, across) = (z + below, j * dims[0]);
-            for (i, (mask, &h)) in out.iter_mut().zip(values).enumerate() {
-                let around = planes[z.saturating_sub(1)..(z + 2).min(planes.len())].iter();
-                let [lo, hi] = around.fold(NOTHING, |m, p| wider(m, p[across + i]));
-                *mask = if within(h) && has_direction(gradients[i]) {
-                    Mask::Valid
-                } else if lo <= 1.0 && hi >= 0.0 && lo < hi {
-                    Mask::Filled
-                } else {
-                    Mask::Empty
-                };
-                if gaps && *mask != Mask::Empty && !field.is_in_whole_cell(start + i) {
-                    *mask = Mask::Empty;
+            let start = (first + z) * area + j * dims[0];
+            around.clear();
+            for plane in &planes[(z + below).saturating_sub(1)..(z + below + 2).min(planes.len())] {
+                around.widen(0, plane, j * dims[0]..(j + 1) * dims[0]);
+            }
+            for ((mask, &lo), &hi) in out.iter_mut().zip(&around.lo).zip(&around.hi) {
+                *mask = if (lo <= 1.0) & (hi >= 0.0) & (lo < hi) { Mask::Filled } else { Mask::Empty };
+            }
+            if values.iter().any(|h| within(*h)) {
+                let gradients = rows.gradients(j, first + z, &mut row);
+                for ((mask, &h), &gradient) in out.iter_mut().zip(values).zip(gradients) {
+                    if within(h) && has_direction(gradient) {
+                        *mask = Mask::Valid;
+                    }
+                }
+            }
+            if gaps {
+                for (i, mask) in out.iter_mut().enumerate().filter(|(_, mask)| **mask != Mask::Empty) {
+                    if !field.is_in_whole_cell(start + i) {
+                        *mask = Mask::Empty;
+                    }
                 }
             }
         }
@@ -140,30 +147,45 @@ pub fn unknown_share(field: &Field, lattice: &Lattice) -> f64 {
 
 /// Slices of constant z that are looked at together.
 const SLICES: usize = 8;
-/// The range of no values.
-const NOTHING: [f32; 2] = [f32::INFINITY, f32::NEG_INFINITY];
 
-/// The range of two; NaN is none.
-#[inline]
-fn wider(a: [f32; 2], b: [f32; 2]) -> [f32; 2] {
-    [a[0].min(b[0]), a[1].max(b[1])]
+/// Ranges of values; NaN is none.
+#[derive(Clone)]
+struct Extrema {
+    lo: Vec<f32>,
+    hi: Vec<f32>,
 }
 
-/// The range of values within a step of each point of a plane in rows of `nx`, first along rows, then across.
-fn extrema(plane: &[f32], nx: usize) -> Vec<[f32; 2]> {
-    let mut along = Vec::with_capacity(plane.len());
-    for row in plane.chunks(nx) {
-        along.extend((0..nx).map(|x| {
-            let around = &row[x.saturating_sub(1)..(x + 2).min(nx)];
-            around.iter().fold(NOTHING, |m, &h| wider(m, [h; 2]))
-        }));
+impl Extrema {
+    /// `n` ranges of no values.
+    fn nothing(n: usize) -> Self {
+        Self { lo: vec![f32::INFINITY; n], hi: vec![f32::NEG_INFINITY; n] }
     }
-    let rows = plane.len() / nx;
-    let across = |i: usize| {
-        let (y, x) = (i / nx, i % nx);
-        (y.saturating_sub(1)..(y + 2).min(rows)).fold(NOTHING, |m, y| wider(m, along[y * nx + x]))
-    };
-    (0..plane.len()).map(across).collect()
+
+    fn clear(&mut self) {
+        self.lo.fill(f32::INFINITY);
+        self.hi.fill(f32::NEG_INFINITY);
+    }
+
+    /// Takes the ranges in `from` of others in where those from `at` on are.
+    fn widen(&mut self, at: usize, others: &Self, from: Range<usize>) {
+        let to = at..at + from.len();
+        self.lo[to.clone()].iter_mut().zip(&others.lo[from.clone()]).for_each(|(a, &b)| *a = a.min(b));
+        self.hi[to].iter_mut().zip(&others.hi[from]).for_each(|(a, &b)| *a = a.max(b));
+    }
+
+    /// The ranges of values within a step of each point of a plane in rows of `nx`, first along rows, then across.
+    fn around(plane: &[f32], nx: usize) -> Self {
+        let own = Self { lo: plane.to_vec(), hi: plane.to_vec() };
+        let mut along = own.clone();
+        for row in (0..plane.len()).step_by(nx) {
+            along.widen(row + 1, &own, row..row + nx - 1);
+            along.widen(row, &own, row + 1..row + nx);
+        }
+        let mut across = along.clone();
+        across.widen(nx, &along, 0..plane.len() - nx);
+        across.widen(0, &along, nx..plane.len());
+        across
+    }
 }
 
 /// Points of the graph that stand for lattice point `o`: itself if a level set of the sweep passes through it, else up

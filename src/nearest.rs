@@ -115,7 +115,7 @@ impl PointGrid {
             }
             (sorted, ends)
         };
-        let runs: Vec<_> = points.par_chunks(RUN).enumerate().map(run).collect();
+        let runs: Vec<_> = points.par_chunks(RUN).enumerate().with_max_len(1).map(run).collect();
         let of = |slab: usize| {
             runs.iter().map(move |(sorted, ends)| {
                 let start = if slab == 0 { 0 } else { ends[slab - 1] };
@@ -130,7 +130,7 @@ impl PointGrid {
             slabs.push((before, starts, here.0.expect("as many places"), here.1.expect("as many numbers")));
             before += count;
         }
-        slabs.into_par_iter().enumerate().for_each(|(slab, (before, ends, places, numbers))| {
+        slabs.into_par_iter().enumerate().with_max_len(1).for_each(|(slab, (before, ends, places, numbers))| {
             let first = (slab * per_slab) as u32;
             let mut next = vec![0u32; ends.len() + 1];
             of(slab).flatten().for_each(|(c, _)| next[(c - first) as usize + 1] += 1);
@@ -145,6 +145,8 @@ impl PointGrid {
                 *slot += 1;
             }
         });
+        // Giving memory back takes its time, too.
+        runs.into_par_iter().for_each(drop);
     }
 
     /// Original numbers in slot order: sort the payload by it, and slots index the payload.
@@ -166,7 +168,7 @@ impl PointGrid {
     #[allow(clippy::cast_possible_truncation, reason = "floats saturate")]
     fn cell(&self, p: Vec3) -> [i32; 3] {
         let q = (p - self.origin) * self.inverse_size;
-        std::array::from_fn(|a| (q[a].floor() as i32).clamp(0, self.dims[a] as i32 - 1))
+        std::array::from_fn(|a| (q[a] as i32).clamp(0, self.dims[a] as i32 - 1))
     }
 
     #[inline]
