@@ -38,40 +38,37 @@ pub fn masks(field: &Field, lattice: &Lattice) -> Vec<Mask> {
     // Values of other lattices are finite in whole cells only.
     let gaps = lattice == field.lattice() && field.has_gaps();
     let area = dims[0] * dims[1];
+    let within = |h: f32| (0.0..=1.0).contains(&h);
     let mut out = vec![Mask::Empty; lattice.len()];
-    out.par_chunks_mut(SLICES * area).enumerate().for_each(|(chunk, out)| {
+    out.par_chunks_mut(SLICES * area).enumerate().for_each_init(Work::default, |work, (chunk, out)| {
         let first = chunk * SLICES;
-        let last = first + out.len() / area - 1;
-        let planes: Vec<Extrema> = (first.saturating_sub(1)..=(last + 1).min(dims[2] - 1))
-            .map(|z| Extrema::around(&values[z * area..(z + 1) * area], dims[0]))
-            .collect();
-        let below = first.min(1);
-        let mut row = GradientRow::default();
-        let mut around = Extrema::nothing(dims[0]);
-        for (r, out) in out.chunks_exact_mut(dims[0]).enumerate() {
-            let (j, z) = (r % dims[1], r / dims[1]);
-            let values = &values[first * area + r * dims[0]..][..dims[0]];
-            let within = |h: f32| (0.0..=1.0).contains(&h);
-            let start = (first + z) * area + j * dims[0];
-            around.clear();
-            for plane in &planes[(z + below).saturating_sub(1)..(z + below + 2).min(planes.len())] {
-                around.widen(0, plane, j * dims[0]..(j + 1) * dims[0]);
+        let plane = |z: usize| &values[z * area..(z + 1) * area];
+        (first.saturating_sub(1)..=first).for_each(|z| work.look(z, plane(z), dims[0]));
+        for (z, out) in (first..).zip(out.chunks_exact_mut(area)) {
+            if z + 1 < dims[2] {
+                work.look(z + 1, plane(z + 1), dims[0]);
             }
-            for ((mask, &lo), &hi) in out.iter_mut().zip(&around.lo).zip(&around.hi) {
-                *mask = if (lo <= 1.0) & (hi >= 0.0) & (lo < hi) { Mask::Filled } else { Mask::Empty };
-            }
-            if values.iter().any(|h| within(*h)) {
-                let gradients = rows.gradients(j, first + z, &mut row);
-                for ((mask, &h), &gradient) in out.iter_mut().zip(values).zip(gradients) {
-                    if within(h) && has_direction(gradient) {
-                        *mask = Mask::Valid;
+            for (j, out) in out.chunks_exact_mut(dims[0]).enumerate() {
+                let across = j * dims[0]..(j + 1) * dims[0];
+                let around = work.around(z.saturating_sub(1)..(z + 2).min(dims[2]), across.clone());
+                for ((mask, &lo), &hi) in out.iter_mut().zip(&around.lo).zip(&around.hi) {
+                    *mask = if (lo <= 1.0) & (hi >= 0.0) & (lo < hi) { Mask::Filled } else { Mask::Empty };
+                }
+                let values = &plane(z)[across.clone()];
+                if values.iter().any(|h| within(*h)) {
+                    let gradients = rows.gradients(j, z, &mut work.gradients);
+                    for ((mask, &h), &gradient) in out.iter_mut().zip(values).zip(gradients) {
+                        if within(h) && has_direction(gradient) {
+                            *mask = Mask::Valid;
+                        }
                     }
                 }
-            }
-            if gaps {
-                for (i, mask) in out.iter_mut().enumerate().filter(|(_, mask)| **mask != Mask::Empty) {
-                    if !field.is_in_whole_cell(start + i) {
-                        *mask = Mask::Empty;
+                if gaps {
+                    let start = z * area + across.start;
+                    for (i, mask) in out.iter_mut().enumerate().filter(|(_, mask)| **mask != Mask::Empty) {
+                        if !field.is_in_whole_cell(start + i) {
+                            *mask = Mask::Empty;
+                        }
                     }
                 }
             }
@@ -149,42 +146,63 @@ pub fn unknown_share(field: &Field, lattice: &Lattice) -> f64 {
 const SLICES: usize = 8;
 
 /// Ranges of values; NaN is none.
-#[derive(Clone)]
+#[derive(Default)]
 struct Extrema {
     lo: Vec<f32>,
     hi: Vec<f32>,
 }
 
 impl Extrema {
-    /// `n` ranges of no values.
-    fn nothing(n: usize) -> Self {
-        Self { lo: vec![f32::INFINITY; n], hi: vec![f32::NEG_INFINITY; n] }
-    }
-
-    fn clear(&mut self) {
-        self.lo.fill(f32::INFINITY);
-        self.hi.fill(f32::NEG_INFINITY);
-    }
-
-    /// Takes the ranges in `from` of others in where those from `at` on are.
-    fn widen(&mut self, at: usize, others: &Self, from: Range<usize>) {
-        let to = at..at + from.len();
-        self.lo[to.clone()].iter_mut().zip(&others.lo[from.clone()]).for_each(|(a, &b)| *a = a.min(b));
-        self.hi[to].iter_mut().zip(&others.hi[from]).for_each(|(a, &b)| *a = a.max(b));
-    }
-
-    /// The ranges of values within a step of each point of a plane in rows of `nx`, first along rows, then across.
-    fn around(plane: &[f32], nx: usize) -> Self {
-        let own = Self { lo: plane.to_vec(), hi: plane.to_vec() };
-        let mut along = own.clone();
-        for row in (0..plane.len()).step_by(nx) {
-            along.widen(row + 1, &own, row..row + nx - 1);
-            along.widen(row, &own, row + 1..row + nx);
+    /// Those from least to greatest values.
+    fn set(&mut self, lo: &[f32], hi: &[f32]) {
+        for (own, new) in [(&mut self.lo, lo), (&mut self.hi, hi)] {
+            own.clear();
+            own.extend_from_slice(new);
         }
-        let mut across = along.clone();
-        across.widen(nx, &along, 0..plane.len() - nx);
-        across.widen(0, &along, nx..plane.len());
-        across
+    }
+
+    /// Takes others into those from `at` on.
+    fn widen(&mut self, at: usize, lo: &[f32], hi: &[f32]) {
+        self.lo[at..].iter_mut().zip(lo).for_each(|(a, &b)| *a = a.min(b));
+        self.hi[at..].iter_mut().zip(hi).for_each(|(a, &b)| *a = a.max(b));
+    }
+}
+
+/// Planes of a chunk at work.
+#[derive(Default)]
+struct Work {
+    /// The ranges within a step of the points of three planes; plane z is at z mod 3.
+    planes: [Extrema; 3],
+    along: Extrema,
+    around: Extrema,
+    gradients: GradientRow,
+}
+
+impl Work {
+    /// Takes in plane `z`, in rows of `nx`: ranges along rows, then across.
+    fn look(&mut self, z: usize, plane: &[f32], nx: usize) {
+        let (along, across) = (&mut self.along, &mut self.planes[z % 3]);
+        along.set(plane, plane);
+        for row in (0..plane.len()).step_by(nx) {
+            let (before, after) = (&plane[row..row + nx - 1], &plane[row + 1..row + nx]);
+            along.widen(row + 1, before, before);
+            along.widen(row, after, after);
+        }
+        across.set(&along.lo, &along.hi);
+        let last = plane.len() - nx;
+        across.widen(nx, &along.lo[..last], &along.hi[..last]);
+        across.widen(0, &along.lo[nx..], &along.hi[nx..]);
+    }
+
+    /// The ranges over planes of a row.
+    fn around(&mut self, planes: Range<usize>, row: Range<usize>) -> &Extrema {
+        let first = &self.planes[planes.start % 3];
+        self.around.set(&first.lo[row.clone()], &first.hi[row.clone()]);
+        for z in planes.skip(1) {
+            let Extrema { lo, hi } = &self.planes[z % 3];
+            self.around.widen(0, &lo[row.clone()], &hi[row.clone()]);
+        }
+        &self.around
     }
 }
 

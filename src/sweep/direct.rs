@@ -21,6 +21,9 @@ use crate::scene::Scene;
 use glam::DVec3;
 use rayon::prelude::*;
 
+/// Rows of nodes that a thread takes at a time, at least.
+const ROWS: usize = 8;
+
 /// How far segments to flats may step: from the lower side what is below the sweep hides nothing, however far below.
 /// `None` where flats are seen from inside solids, too.
 pub(super) fn clearance(scene: &Scene, geometry: &Geometry, sides: &[Side]) -> Option<Clearance> {
@@ -57,9 +60,10 @@ pub(super) fn direct(
         let light = &scene.polygons()[number as usize];
         let points = part.on(light, number);
         let blockers = Blockers::new(scene, number, &corners);
-        // Σ V g and Σ g of every node and side, whatever factor all g of one have.
+        // Σ V g and Σ g of every node and side, whatever factor all g of one have. Where nothing is lit no memory is
+        // touched.
         let per = sides.len();
-        let mut sums: Vec<[f32; 2]> = (0..per * n).into_par_iter().with_min_len(1 << 14).map(|_| [0.0; 2]).collect();
+        let mut sums = vec![[0f32; 2]; per * n];
         let place = [Side::Lower, Side::Higher].map(|s| sides.iter().position(|x| *x == s).unwrap_or(0));
         let mut fans = Fans::default();
         for &world in &points {
@@ -106,25 +110,33 @@ pub(super) fn direct(
         }
         drop(fans);
         if !open.whole() {
-            sums.par_iter_mut().enumerate().with_min_len(1 << 12).filter(|(_, sum)| sum[0] > 0.0).for_each(
-                |(at, sum)| {
-                    sum[0] *= open.correction(sides[at % per], geometry.h[at / per]) as f32;
-                },
-            );
+            sums.par_chunks_mut(per * nx).enumerate().with_min_len(ROWS).for_each(|(row, sums)| {
+                geometry.lit_nodes(row, |i| {
+                    for (side, sum) in sides.iter().zip(&mut sums[i * per..]) {
+                        if sum[0] > 0.0 {
+                            sum[0] *= open.correction(*side, geometry.h[row * nx + i]) as f32;
+                        }
+                    }
+                });
+            });
         }
         near::look((scene, geometry, isa), (number, &blockers), sides, part, &mut sums);
         for (s, (side, planes)) in sides.iter().zip(&mut planes).enumerate() {
             let [r, g, b] = planes;
-            (r, g, b).into_par_iter().with_min_len(1 << 10).enumerate().for_each(|(at, (r, g, b))| {
-                let [seen, all] = sums[at * per + s];
-                if seen > 0.0 {
-                    let normal = geometry.normal(at).expect("only nodes with a normal were lit");
-                    let normal = if *side == Side::Lower { normal } else { -normal };
-                    let [i, j, k] = lattice.ijk(at).map(|x| x as f64);
-                    let e = unoccluded(light, lattice.to_world(DVec3::new(i, j, k)), normal);
-                    let e = (light.emission * (e * f64::from(seen / all))).as_vec3();
-                    (*r, *g, *b) = (*r + e.x, *g + e.y, *b + e.z);
-                }
+            let rows = (r.par_chunks_mut(nx), g.par_chunks_mut(nx), b.par_chunks_mut(nx)).into_par_iter();
+            rows.enumerate().with_min_len(ROWS).for_each(|(row, (r, g, b))| {
+                let [y, z] = [row % ny, row / ny].map(|x| x as f64);
+                geometry.lit_nodes(row, |i| {
+                    let at = row * nx + i;
+                    let [seen, all] = sums[at * per + s];
+                    if seen > 0.0 {
+                        let normal = geometry.normal(at).expect("only nodes with a normal were lit");
+                        let normal = if *side == Side::Lower { normal } else { -normal };
+                        let e = unoccluded(light, lattice.to_world(DVec3::new(i as f64, y, z)), normal);
+                        let e = (light.emission * (e * f64::from(seen / all))).as_vec3();
+                        (r[i], g[i], b[i]) = (r[i] + e.x, g[i] + e.y, b[i] + e.z);
+                    }
+                });
             });
         }
     }

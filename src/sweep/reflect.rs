@@ -103,7 +103,10 @@ impl<'a> Mirror<'a> {
         let mut memory = memory.b.into_iter();
         let mut sums = Sums::default();
         let b = (0..sides).map(|s| {
-            let mut b = memory.next().unwrap_or_else(|| vec![[0; 4]; n]);
+            // New memory is black, and stays untouched where nothing is shown.
+            let old = memory.next();
+            let new = old.is_none();
+            let mut b = old.unwrap_or_else(|| vec![[0; 4]; n]);
             let rows = b.par_chunks_mut(nx).enumerate().with_max_len(64).map_init(Rows::default, |rows, (row, b)| {
                 let (j, k) = (row % ny, row / ny);
                 let beside = [
@@ -116,7 +119,9 @@ impl<'a> Mirror<'a> {
                 let shown = &mut rows.shown;
                 self.shown(row, &mut shown[0]);
                 if !shown[0].contains(&1.0) {
-                    b.fill([0; 4]);
+                    if !new {
+                        b.fill([0; 4]);
+                    }
                     return Sums::default();
                 }
                 for (shown, row) in shown.iter_mut().zip(beside).skip(1) {
