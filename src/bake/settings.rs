@@ -120,7 +120,8 @@ pub struct BakeOptions {
     /// Where samples are placed (default: nodes, or uniform if --samples is given)
     #[arg(long)]
     pub strategy: Option<StrategyName>,
-    /// Shadow rays per sample and luminaire: the most; a quarter where all or none reach it (by preset 64 / 256 / 1024)
+    /// Shadow rays per sample and luminaire, at most (by preset 64 / 256 / 1024); fewer where there is little light to
+    /// get, or where 64 and a quarter of them agree
     #[arg(long, value_name = "N")]
     pub shadow_rays: Option<u32>,
     /// Final gather rays per sample (by preset 32 / 64 / 256); 0 takes indirect light straight from the photon map
