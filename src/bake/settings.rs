@@ -379,7 +379,7 @@ impl BakeSettings {
         let preset = o.preset.unwrap_or_default();
         // photons, samples per point, shadow, gather, cache shadow, wall texels, wall isovalues, wall shadow
         let (photons, density, shadow, gather, cache, wall, isovalues, wall_shadow) = match preset {
-            Preset::Preview => (1 << 19, 0.25, 64, 32, 2, 32, 16, 16),
+            Preset::Preview => (1 << 19, 0.25, 64, 32, 4, 32, 16, 16),
             Preset::Standard => (1 << 22, 1.0, 256, 64, 4, 64, 32, 32),
             Preset::Reference => (1 << 24, 4.0, 1024, 256, 16, 128, 64, 128),
         };
