@@ -95,7 +95,6 @@ pub fn direct_irradiance<T: Tracer>(
     let lattice = scene.lattice();
     let x = lattice.to_world(receiver.position.as_dvec3());
     let mut out = Estimate::default();
-    let most = shadow_rays;
     for &l in scene.luminaires() {
         if receiver.departure == Departure::Polygon(l) {
             continue;
@@ -106,12 +105,12 @@ pub fn direct_irradiance<T: Tracer>(
             continue;
         }
         let Some(aim) = Aim::best(light, x, receiver.normal, open) else { continue };
-        let shadow_rays = budget(scene, luminance(light.emission) * open, most);
-        let pilot = (shadow_rays / 4).max(LEAST_UNANIMOUS);
+        let budget = budget(scene, luminance(light.emission) * open, shadow_rays);
+        let pilot = (budget / 4).max(LEAST_UNANIMOUS);
         let set =
             Sobol::set(seed, stage, index.wrapping_mul(scene.luminaires().len() as u64).wrapping_add(u64::from(l)));
         let (mut sum, mut seen, mut squares, mut seen_squares) = (0.0, 0.0, 0.0, 0.0);
-        for i in 0..shadow_rays {
+        for i in 0..budget {
             if i == pilot && (seen == 0.0 || seen == sum) {
                 break;
             }
@@ -185,7 +184,7 @@ mod tests {
     }
 
     /// Slivers of light and of shadow, in the mean over receivers' point sets, however many rays: what ended where the
-    /// first rays agreed lost a quarter of the first.
+    /// first rays agreed lost half of the narrowest.
     #[test]
     fn slivers_of_light_and_shadow_are_found_in_the_mean() {
         let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::splat(0.125)).unwrap();

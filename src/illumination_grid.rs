@@ -131,7 +131,7 @@ pub fn shepard(
     let light = |&n: &u32| (samples[n as usize].radiance, samples[n as usize].variance);
     let sorted: Vec<(Vec3, f32)> = grid.numbers().par_iter().map(light).collect();
     let result = from_nearest(lattice, masks, (&grid, neighbours), tick, |_, _, found| blend(found, &sorted));
-    // That of 10⁷ samples takes a tenth of all this.
+    // To give the memory of 10⁷ samples back takes one thread a tenth of all this.
     rayon::join(|| drop(grid), || drop(sorted));
     result
 }

@@ -153,7 +153,7 @@ struct Extrema {
 }
 
 impl Extrema {
-    /// Those from least to greatest values.
+    /// Becomes the ranges from `lo` to `hi`.
     fn set(&mut self, lo: &[f32], hi: &[f32]) {
         for (own, new) in [(&mut self.lo, lo), (&mut self.hi, hi)] {
             own.clear();

@@ -145,7 +145,7 @@ impl PointGrid {
                 *slot += 1;
             }
         });
-        // Giving memory back takes its time, too.
+        // By all threads, as it was taken.
         runs.into_par_iter().for_each(drop);
     }
 
@@ -168,6 +168,7 @@ impl PointGrid {
     #[allow(clippy::cast_possible_truncation, reason = "floats saturate")]
     fn cell(&self, p: Vec3) -> [i32; 3] {
         let q = (p - self.origin) * self.inverse_size;
+        // What truncation takes for 0 instead of -1 is clamped to that.
         std::array::from_fn(|a| (q[a] as i32).clamp(0, self.dims[a] as i32 - 1))
     }
 

@@ -111,8 +111,14 @@ impl Study {
     /// # Errors
     /// `Invalid` if some are not, if two scenes that differ have one name, if neither engine takes what `base` sets, or
     /// if that is one of the options that the study `varies` itself.
-    fn jobs(&self, table: &Table, subjects: &[Subject], base: &BakeOptions, varies: &[&str]) -> Result<Vec<String>> {
-        if let Some(option) = base.set().iter().find(|o| varies.contains(&o.as_str())) {
+    fn jobs(
+        &self,
+        table: &Table,
+        subjects: &[Subject],
+        base: &BakeOptions,
+        varies: &[impl AsRef<str>],
+    ) -> Result<Vec<String>> {
+        if let Some(option) = base.set().iter().find(|o| varies.iter().any(|v| v.as_ref() == *o)) {
             return Err(Error::Invalid(format!("--{option}: this study gives it values of its own; leave it out")));
         }
         let settings = [Engine::Photon, Engine::Sweep].map(|engine| BakeSettings::with_engine(base, engine));

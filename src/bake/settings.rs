@@ -121,7 +121,7 @@ pub struct BakeOptions {
     #[arg(long)]
     pub strategy: Option<StrategyName>,
     /// Shadow rays per sample and luminaire, at most (by preset 64 / 256 / 1024); fewer where there is little light to
-    /// get, or where 64 and a quarter of them agree
+    /// get, or once a quarter of them, but at least 64, agree
     #[arg(long, value_name = "N")]
     pub shadow_rays: Option<u32>,
     /// Final gather rays per sample (by preset 32 / 64 / 256); 0 takes indirect light straight from the photon map

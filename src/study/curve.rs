@@ -21,9 +21,6 @@ const COLUMNS: [&str; 13] = [
     "job",
 ];
 
-/// What the ways to bake set.
-const VARIED: [&str; 7] = ["engine", "photons", "samples", "strategy", "gather", "directions", "light-points"];
-
 /// One way to bake.
 struct Candidate {
     /// Engine and strategy, as the plot's series.
@@ -77,7 +74,8 @@ fn candidates(quick: bool) -> Vec<Candidate> {
 /// As bakes, references and tables; `Invalid` if no such isovalue has a surface.
 pub fn curve(study: &Study, subjects: &[Subject], base: &BakeOptions, limit: Option<f64>) -> Result<()> {
     let mut table = Table::open(study.folder.join("curve.csv"), &COLUMNS, 7)?;
-    let jobs = study.jobs(&table, subjects, base, &VARIED)?;
+    let varied: Vec<String> = candidates(study.quick).iter().flat_map(|c| c.options.set()).collect();
+    let jobs = study.jobs(&table, subjects, base, &varied)?;
     let fractions: &[f64] = if study.quick { &[0.475] } else { &[0.18, 0.344, 0.475, 0.617, 0.836] };
     let compared = |s: &Subject| s.with_surfaces(&fractions.iter().map(|&f| s.at(f)).collect::<Vec<f64>>());
     let compared: Vec<Vec<f64>> = subjects.iter().map(compared).collect::<Result<_>>()?;
