@@ -116,7 +116,6 @@ impl BakeSummary {
 
     /// Lines of a key and what it says, in columns as those of a volume's statistics.
     pub fn to_text(&self) -> String {
-        let [lo, hi] = self.isovalues;
         let sides = if self.both_sides { "both sides".into() } else { format!("the {} side", self.outside) };
         let ends = if self.capped { "capped" } else { "open" };
         let said = |pointer: &str| match self.report.pointer(pointer) {
@@ -132,7 +131,7 @@ impl BakeSummary {
             "{:<18}isovalues {} on {sides}, {ends}, {} polygons\n\
              {:<18}preset {preset}, engine {engine}, grid {grid}, seed {seed}: {seconds} s on {} threads\n",
             "illumination",
-            span((lo, hi)),
+            span(self.isovalues.into()),
             self.polygons,
             "baked with",
             said("/threads"),
