@@ -18,6 +18,7 @@ mod clearance;
 mod direct;
 mod directions;
 mod ends;
+mod faces;
 mod fans;
 mod flats;
 mod gaps;

@@ -143,7 +143,7 @@ fn the_ceiling_is_bright_up_to_the_luminaire() {
 }
 
 /// Where level sets meet walls at all angles, light on the face itself is that of the edge between the two, not of a
-/// texel's mean.
+/// texel's mean. Without what nodes touch they were 1.6 %, RMS 9.1 % off.
 #[test]
 fn light_on_a_wall_is_that_of_the_edge() {
     let scene = waves();
@@ -156,7 +156,7 @@ fn light_on_a_wall_is_that_of_the_edge() {
         on && light.distance(scene.lattice().to_world(p)) > 3.0 * voxel
     });
     println!("{errors:?}");
-    assert!(errors.points > 200 && errors.mean.abs() < 0.02 && errors.rms < 0.1);
+    assert!(errors.points > 200 && errors.mean.abs() < 0.014 && errors.rms < 0.086);
 }
 
 /// Between a luminaire and the ceiling that it covers it is dark.

@@ -230,6 +230,13 @@ impl Flats {
         }
     }
 
+    /// Where in [`Flats::packed`] the B over isovalues starts of the four texels around a point of a flat that
+    /// reflects, and what each weighs.
+    pub(super) fn texels(&self, flat: u32, uv: [f32; 2]) -> Option<[(usize, f32); 4]> {
+        let texture = self.textures[flat as usize].as_ref()?;
+        Some(around(texture.dims, uv).map(|(texel, weight)| (texture.start + texel * self.isovalues, weight)))
+    }
+
     /// Where in [`Flats::packed`] the B of a stop over isovalues starts, as [`Flats::places`] has it; black of nothing.
     pub(super) fn place(&self, stop: Option<Stop>, random: f32) -> u32 {
         let flat = stop.and_then(|s| Some((s.flat?, s.uv)));

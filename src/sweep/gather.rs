@@ -3,6 +3,7 @@
 use super::arrive;
 use super::directions::Shear;
 use super::ends::{Ends, Standing};
+use super::faces::{RowEnds, Sides, Touched, Touching, inwards, note, on_side};
 use super::flats::{Arrivals, Flats, Incoming, capped};
 use super::gaps::Around;
 use super::grid::{Geometry, Source};
@@ -24,8 +25,9 @@ use std::sync::{Mutex, MutexGuard};
 pub(super) struct Pass<'a> {
     pub scene: &'a Scene,
     pub geometry: &'a Geometry<'a>,
-    /// Where polygons stand.
+    /// Where polygons stand, and what Ω's faces touch.
     pub standing: &'a [Standing],
+    pub touching: Touching,
     /// The side that owns lines without samples.
     pub primary: Side,
     /// The instruction set of the hot loops.
@@ -47,22 +49,12 @@ type Row<'a> = [&'a mut [f32]; 3];
 /// Rows of nodes in memory, each of which one row of lines of a family adds to.
 type Rows<'a> = Vec<Mutex<Row<'a>>>;
 
-/// By how many lines the cell of lines around node `j` of `n` is to be moved into Ω: on Ω's faces the light is linear
-/// beyond the last two lines. 0 if there is only one.
-fn inwards(j: usize, n: usize) -> isize {
-    match j {
-        _ if n == 2 => 0,
-        0 => 1,
-        j if j == n - 1 => -1,
-        _ => 0,
-    }
-}
-
 /// What a thread needs beside its rows.
 pub(super) struct Workspace {
     pack: Pack,
     light: [RowLight; 2],
     gaps: [RowGaps; 2],
+    ends: [RowEnds; 2],
     /// Slice and place along v of the rows of nodes beside a row of lines.
     nodes: Vec<[usize; 2]>,
 }
@@ -77,10 +69,17 @@ struct Family<'a> {
     normals: &'a [u32],
     ends: &'a Ends,
     flats: &'a Flats,
+    touched: &'a Touched,
     walls: arrive::Walls<'a>,
     way: Way,
     /// The direction times what |ω·N| weighs.
     omega: [f32; 3],
+}
+
+impl Family<'_> {
+    fn light(&self) -> Light<'_> {
+        Light { b: self.source.b, flats: &self.flats.packed, isovalues: self.flats.isovalues }
+    }
 }
 
 impl Pass<'_> {
@@ -99,6 +98,7 @@ impl Pass<'_> {
         tick: &mut dyn FnMut() -> bool,
     ) -> (Planes, bool) {
         let mut e = self.spare.black(b[0].len());
+        let touched = self.touching.now(self.geometry, flats);
         let split = lines.partition_point(|s| !s.layout.transposed);
         let mut complete = true;
         // Walls receive what one family brought while the next is under way.
@@ -112,7 +112,7 @@ impl Pass<'_> {
             for shear in some {
                 complete = complete && tick();
                 if complete {
-                    let walls = (flats, &mut *incoming, arrivals);
+                    let walls = ((flats, &touched), &mut *incoming, arrivals);
                     arrivals = self.family((side, shear, lines.len()), normals, (b, scale), &rows, walls);
                 }
             }
@@ -160,7 +160,7 @@ impl Pass<'_> {
         normals: &[u32],
         ([b, back], scale): ([&[Half4]; 2], f32),
         rows: &Rows,
-        (flats, incoming, before): (&Flats, &mut Incoming, Vec<Arrivals>),
+        ((flats, touched), incoming, before): ((&Flats, &Touched), &mut Incoming, Vec<Arrivals>),
     ) -> Vec<Arrivals> {
         let sign = if side == Side::Lower { 1.0 } else { -1.0 };
         let plan = Plan::new(*shear, sign);
@@ -174,6 +174,7 @@ impl Pass<'_> {
             normals,
             ends: &ends,
             flats,
+            touched,
             way: Way { strict: side == Side::Higher, sign, capped: capped(self.scene) },
             omega: (shear.omega * share).as_vec3().to_array(),
             walls,
@@ -224,11 +225,13 @@ impl Pass<'_> {
             pack: Pack::with_rows(0),
             light: Default::default(),
             gaps: Default::default(),
+            ends: Default::default(),
             nodes: Vec::new(),
         };
         let mut work = spare.unwrap_or_else(empty);
         work.pack.fit(plan.shear.layout.dims[2]);
         work.light.iter_mut().flatten().for_each(|l| l.resize(size, 0.0));
+        work.ends.iter_mut().flatten().for_each(|ends| ends.resize(plan.width, 0));
         let packs = if family.source.gaps { size / LANES } else { 0 };
         work.gaps.iter_mut().for_each(|g| g.resize(packs, 0));
         let mut walked = None;
@@ -245,11 +248,12 @@ impl Pass<'_> {
             let (this, before) = (n % 2, 1 - n % 2);
             let light = [&work.light[this], &work.light[before]];
             let gaps = [&work.gaps[this], &work.gaps[before]];
+            let ends = [&work.ends[this], &work.ends[before]];
             let mut coming = nodes.first().map(|&at| self.ask(family, rows, at));
             for (i, &at) in nodes.iter().enumerate() {
                 let next = nodes.get(i + 1).map(|&at| self.ask(family, rows, at));
                 let row = std::mem::replace(&mut coming, next);
-                self.accumulate(family, (light, gaps), &mut row.expect("asked for before"), at);
+                self.accumulate(family, (light, gaps, ends), &mut row.expect("asked for before"), at);
             }
             work.nodes = nodes;
             walked = Some(q);
@@ -279,8 +283,8 @@ impl Pass<'_> {
                 if family.way.capped && family.way.strict {
                     pack.lasts = [[0; LANES]; 2];
                 }
-                let flats = family.flats;
-                let light = Light { b: family.source.b, flats: &flats.packed, isovalues: flats.isovalues };
+                note(pack, &mut work.ends[which], start);
+                let light = family.light();
                 let place = (plan.width, start);
                 self.isa.scan(pack, family.way, light, &mut work.light[which], place);
                 if family.source.gaps {
@@ -316,7 +320,7 @@ impl Pass<'_> {
     fn accumulate(
         &self,
         family: &Family,
-        (light, gaps): ([&RowLight; 2], [&RowGaps; 2]),
+        (light, gaps, ends): ([&RowLight; 2], [&RowGaps; 2], [&RowEnds; 2]),
         row: &mut Row,
         [k, j]: [usize; 2],
     ) {
@@ -336,6 +340,18 @@ impl Pass<'_> {
         let rims = self.geometry.rims(layout);
         let lit = self.geometry.lit_blocks(layout);
         let [e0, e1, e2] = row;
+        let sides = Sides {
+            layout: *layout,
+            row: [j, k],
+            slope: plan.shear.slope,
+            light,
+            ends,
+            line0,
+            weights: [fu, fv],
+            stands: family.light(),
+            touched: family.touched,
+        };
+        let h = &self.geometry.h(layout)[at..][..nu];
         let mut bits = lit.rows[at / nu];
         while bits != 0 {
             // Runs of lit blocks.
@@ -343,17 +359,28 @@ impl Pass<'_> {
             let run = (!(bits >> a)).trailing_zeros() as usize;
             bits = if a + run >= 64 { 0 } else { bits >> (a + run) << (a + run) };
             let (a, b) = (a * lit.size, ((a + run) * lit.size).min(nu));
-            let mut vectors = |a: usize, b: usize| {
-                let e = [&mut e0[..], &mut e1[..], &mut e2[..]];
-                self.isa.accumulate(e, n, family.omega, light, line0, [fu, fv], (a, b));
+            let mut some = |a: usize, b: usize| {
+                let whole = on_side(j, nv);
+                for i in (a..b).filter(|i| whole || on_side(*i, nu)) {
+                    let [x, y, z] = decode(n[i]);
+                    let cos = family.omega[0] * x + family.omega[1] * y + family.omega[2] * z;
+                    let light = sides.radiance(i, h[i], (cos > 0.0) != family.way.strict);
+                    (e0[i], e1[i], e2[i]) =
+                        (e0[i] + cos.abs() * light[0], e1[i] + cos.abs() * light[1], e2[i] + cos.abs() * light[2]);
+                }
+                let (a, b) = (a.max(1), b.min(nu - 1));
+                if !whole && a < b {
+                    let e = [&mut e0[..], &mut e1[..], &mut e2[..]];
+                    self.isa.accumulate(e, n, family.omega, light, line0, [fu, fv], (a, b));
+                }
             };
             let mut from = a;
             for &i in rims.map_or(&[][..], |rims| rims.within(at / nu, a, b)) {
                 let i = i as usize;
-                vectors(from, i);
+                some(from, i);
                 from = i + 1;
             }
-            vectors(from, b);
+            some(from, b);
         }
         for &i in rims.map_or(&[][..], |rims| rims.within(at / nu, 0, nu)) {
             let i = i as usize;
@@ -380,7 +407,8 @@ fn cosine(omega: [f32; 3], normal: u32) -> f32 {
     (omega[0] * x + omega[1] * y + omega[2] * z).abs()
 }
 
-/// Nodes a..b of a row. `line0` is the line (in `light`) just beyond node 0, −1 of which is missing.
+/// Nodes a..b of a row, none of them on a side. `line0` is the line (in `light`) just beyond node 0, −1 of which is
+/// missing.
 #[inline(always)]
 pub(super) fn accumulate_row(
     e: [&mut [f32]; 3],
@@ -391,26 +419,6 @@ pub(super) fn accumulate_row(
     [fu, fv]: [f32; 2],
     (a, b): (usize, usize),
 ) {
-    let nu = n.len();
-    // Ω's faces: the light goes on as between the last two columns of lines; of a single one it is the same everywhere.
-    let faces = if nu > 2 {
-        [(0, line0, line0 + 1, -fu), (nu - 1, line0 + nu - 2, line0 + nu - 3, fu - 1.0)]
-    } else {
-        [(0, line0, line0, 0.0), (1, line0, line0, 0.0)]
-    };
-    for (i, last, inner, f) in faces {
-        if a <= i && i < b {
-            let cos = cosine(omega, n[i]);
-            for c in 0..3 {
-                let [near, far] = [0, 1].map(|r| (1.0 - f) * light[r][c][last] + f * light[r][c][inner]);
-                e[c][i] += cos * ((1.0 - fv) * near + fv * far);
-            }
-        }
-    }
-    let (a, b) = (a.max(1), b.min(nu - 1));
-    if a >= b {
-        return;
-    }
     let w = [(1.0 - fv) * (1.0 - fu), (1.0 - fv) * fu, fv * (1.0 - fu), fv * fu];
     let len = b - a;
     let n = &n[a..b];

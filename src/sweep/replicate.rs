@@ -7,6 +7,7 @@
 //! off then is of second order: (1 − T₁)⁻¹ (T − T₁) (x₁ − x).
 
 use super::directions::{self, Shear};
+use super::faces::Touching;
 use super::flats::Flats;
 use super::gather::Pass;
 use super::planes::{HalfPlanes, NodeLight, Planes};
@@ -170,6 +171,7 @@ impl Run<'_> {
             scene: self.scene,
             geometry: self.geometry,
             standing: self.slits.standing(),
+            touching: Touching::new(self.scene, self.geometry, flats),
             primary: self.sides[0],
             isa: self.isa,
             spare: self.spare,

@@ -120,11 +120,20 @@ fn swept_occlusion_agrees_with_exact_rays() {
     }
 }
 
-/// Level sets that run into all of Ω's faces: what nodes on a face see of them, half a voxel from the nearest lines.
+/// Level sets that run into all of Ω's faces: what nodes on a face see of them, half a voxel from the nearest lines,
+/// and nothing beyond the face. While the lines' light went on linearly in all directions, the RMS was 1.4 to 1.7 times
+/// that within, and 2.6 with a bias of 0.014 on the upper and lower face of voxels three times as high as wide.
 #[test]
 fn nodes_on_faces_see_as_much_as_exact_rays() {
-    let lattice = Lattice::aligned([41; 3], DVec3::ZERO, DVec3::splat(1.0 / 40.0)).unwrap();
+    for height in [1.0, 3.0] {
+        faces_see_as_much_as_exact_rays(height);
+    }
+}
+
+fn faces_see_as_much_as_exact_rays(height: f64) {
+    let lattice = Lattice::aligned([41; 3], DVec3::ZERO, DVec3::new(1.0, 1.0, height) / 40.0).unwrap();
     let gyroid = |x: DVec3| {
+        let x = x / DVec3::new(1.0, 1.0, height);
         let [(sx, cx), (sy, cy), (sz, cz)] = (x * 9.0 + 0.4).to_array().map(f64::sin_cos);
         sx * cy + sy * cz + sz * cx
     };
@@ -145,8 +154,8 @@ fn nodes_on_faces_see_as_much_as_exact_rays() {
     for (axis, end) in (0..3).flat_map(|axis| [(axis, 0), (axis, 40)]) {
         let face: Vec<usize> = all.iter().copied().filter(|&o| scene.lattice().ijk(o)[axis] == end).collect();
         let (rms, bias) = off(&face);
-        println!("axis {axis} at {end}: RMS {rms:.4}, bias {bias:.4}, within {within:.4}");
-        assert!(rms < 2.0 * within && bias.abs() < 0.01, "axis {axis} at {end}: RMS {rms}, bias {bias}");
+        println!("height {height}, axis {axis} at {end}: RMS {rms:.4}, bias {bias:.4}, within {within:.4}");
+        assert!(rms < 1.45 * within && bias.abs() < 0.004, "axis {axis} at {end}: RMS {rms}, bias {bias}");
     }
 }
 

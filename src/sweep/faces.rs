@@ -1,0 +1,200 @@
+//! Nodes on Ω's sides along u and v, beside which lines are on one side only.
+
+use super::directions::Layout;
+use super::flats::Flats;
+use super::grid::Geometry;
+use super::pack::{LANES, Pack};
+use super::scan::Light;
+use crate::polygon::Polygon;
+use crate::scene::Scene;
+use glam::DVec3;
+use rayon::prelude::*;
+
+/// What a row of lines ends on: per direction (+, −) the place of each line's end in [`super::flats::Flats::packed`].
+pub(super) type RowEnds = [Vec<u32>; 2];
+
+/// The end of a line that a luminaire cuts in Ω.
+const CUT: u32 = u32::MAX;
+
+/// Notes what the lines of a pack end on, the first of which is line `start` of its row.
+pub(super) fn note(pack: &Pack, ends: &mut RowEnds, start: usize) {
+    for (ends, lasts) in ends.iter_mut().zip(&pack.lasts) {
+        let ends = &mut ends[start..start + LANES];
+        ends.copy_from_slice(lasts);
+        pack.cuts.iter().for_each(|cut| ends[cut.lane] = CUT);
+    }
+}
+
+/// By how many lines the cell of lines around node `j` of `n` is to be moved into Ω: on Ω's faces the light is linear
+/// beyond the last two lines. 0 if there is only one.
+pub(super) fn inwards(j: usize, n: usize) -> isize {
+    match j {
+        _ if n == 2 => 0,
+        0 => 1,
+        j if j == n - 1 => -1,
+        _ => 0,
+    }
+}
+
+/// Whether node `j` of `n` is on a side.
+pub(super) fn on_side(j: usize, n: usize) -> bool {
+    j == 0 || j == n - 1
+}
+
+/// Whether lines leave Ω by the side that node `j` of `n` is on towards +τ (true) or −τ.
+fn leaves(j: usize, n: usize, slope: f64) -> Option<bool> {
+    match j {
+        _ if slope == 0.0 => None,
+        0 => Some(slope < 0.0),
+        j if j == n - 1 => Some(slope > 0.0),
+        _ => None,
+    }
+}
+
+/// A point this near to a wall, in voxels, lies on it.
+const ON: f64 = 1e-3;
+
+/// A wall and where on it.
+type Spot = (u32, [f32; 2]);
+
+/// What lit nodes on Ω's faces touch: per face, which is 2 · axis, + 1 for the far one, and node of it a wall that
+/// reflects; nothing of faces that no wall touches.
+pub(super) struct Touching {
+    dims: [usize; 3],
+    walls: [Vec<Option<Spot>>; 6],
+}
+
+/// Radiance of what the nodes on Ω's faces touch, in the order of [`Touching`]; NaN of nothing.
+pub(super) struct Touched {
+    dims: [usize; 3],
+    radiance: [Vec<[f32; 3]>; 6],
+}
+
+/// Where node `ijk` is in a face of `axis`.
+fn place(dims: [usize; 3], axis: usize, ijk: [usize; 3]) -> usize {
+    let [b, c] = [usize::from(axis == 0), if axis == 2 { 1 } else { 2 }];
+    ijk[b] + ijk[c] * dims[b]
+}
+
+/// The number of node `at` of a face.
+fn node(dims: [usize; 3], face: usize, at: usize) -> [usize; 3] {
+    let axis = face / 2;
+    let [b, c] = [usize::from(axis == 0), if axis == 2 { 1 } else { 2 }];
+    let mut ijk = [0; 3];
+    (ijk[axis], ijk[b], ijk[c]) = (face % 2 * (dims[axis] - 1), at % dims[b], at / dims[b]);
+    ijk
+}
+
+impl Touching {
+    #[allow(clippy::cast_possible_truncation, reason = "fewer than 2¹⁶ polygons, texture coordinates")]
+    pub(super) fn new(scene: &Scene, geometry: &Geometry, flats: &Flats) -> Self {
+        let (lattice, dims) = (scene.lattice(), geometry.dims);
+        let near = ON * lattice.spacing().min_element();
+        let walls = std::array::from_fn(|face| {
+            let on_face = |x: &DVec3| {
+                let x = lattice.to_index(*x)[face / 2];
+                (x - (face % 2 * (dims[face / 2] - 1)) as f64).abs() < ON
+            };
+            let inwards = |p: &Polygon| (lattice.to_world(0.5 * lattice.far()) - p.vertices()[0]).dot(p.normal()) > 0.0;
+            let touch = |p: &Polygon| p.vertices().iter().all(on_face) && inwards(p);
+            let all = scene.polygons().iter().enumerate();
+            let walls: Vec<_> = all.filter(|(i, p)| flats.textures[*i].is_some() && touch(p)).collect();
+            if walls.is_empty() {
+                return Vec::new();
+            }
+            let nodes = dims[0] * dims[1] * dims[2] / dims[face / 2];
+            let wall = |at: usize| {
+                let [i, j, k] = node(dims, face, at);
+                let lit = geometry.lit(i + dims[0] * (j + dims[1] * k));
+                let x = lattice.to_world(DVec3::new(i as f64, j as f64, k as f64));
+                // Behind a luminaire that covers the wall it is not the wall that is seen.
+                let &(number, wall) = walls.iter().find(|(_, p)| lit && p.is_nearer(x, near) && !scene.covers(x))?;
+                Some((number as u32, wall.texture(x).map(|x| x.clamp(0.0, 1.0) as f32)))
+            };
+            (0..nodes).into_par_iter().map(wall).collect()
+        });
+        Self { dims, walls }
+    }
+
+    /// What is there now, times the scale that [`Flats::packed`] has.
+    pub(super) fn now(&self, geometry: &Geometry, flats: &Flats) -> Touched {
+        let dims = self.dims;
+        let stands = Light { b: &[], flats: &flats.packed, isovalues: flats.isovalues };
+        let radiance = std::array::from_fn(|face| {
+            let shown = |(at, wall): (usize, &Option<Spot>)| {
+                let [i, j, k] = node(dims, face, at);
+                let c = geometry.h[i + dims[0] * (j + dims[1] * k)];
+                let texels = wall.and_then(|(flat, uv)| flats.texels(flat, uv));
+                texels.map_or([f32::NAN; 3], |texels| {
+                    let shows = texels.map(|(start, weight)| stands.end(start, c).map(|b| weight * b));
+                    shows.into_iter().fold([0.0; 3], |sum, b| std::array::from_fn(|c| sum[c] + b[c]))
+                })
+            };
+            self.walls[face].par_iter().enumerate().map(shown).collect()
+        });
+        Touched { dims, radiance }
+    }
+}
+
+impl Touched {
+    /// Radiance of the wall that node `ijk` touches with the side of `axis`.
+    #[inline]
+    fn at(&self, axis: usize, ijk: [usize; 3]) -> Option<[f32; 3]> {
+        let face = 2 * axis + usize::from(ijk[axis] > 0);
+        let radiance = *self.radiance[face].get(place(self.dims, axis, ijk))?;
+        (!radiance[0].is_nan()).then_some(radiance)
+    }
+}
+
+/// What two rows of lines bring to nodes on sides, of a row of nodes in a slice.
+pub(super) struct Sides<'a> {
+    pub layout: Layout,
+    /// Which row along v it is, in which slice.
+    pub row: [usize; 2],
+    /// The lines' steps along u and v.
+    pub slope: [f64; 2],
+    /// This row of lines and the one before: \[channel\]\[line\], and what they end on.
+    pub light: [[&'a [f32]; 3]; 2],
+    pub ends: [&'a RowEnds; 2],
+    /// The line just beyond node 0, −1 of which is missing, and weights, as [`super::gather::accumulate_row`] has them.
+    pub line0: usize,
+    pub weights: [f32; 2],
+    pub stands: Light<'a>,
+    pub touched: &'a Touched,
+}
+
+impl Sides<'_> {
+    /// Radiance that comes to node `i` on isovalue `c` from +τ (`forward`) or −τ. What is beyond the side that the node
+    /// is on is a wall that stands there, or what the nearest line ends on; for the rest, the light that lines bring
+    /// goes on linearly.
+    pub(super) fn radiance(&self, i: usize, c: f32, forward: bool) -> [f32; 3] {
+        let [nu, nv, _] = self.layout.dims;
+        let [j, k] = self.row;
+        let [fu, fv] = self.weights;
+        let line = self.line0 + i;
+        let (near, far, f) = match i {
+            _ if nu == 2 => (self.line0, self.line0, 0.0),
+            0 => (line, line + 1, -fu),
+            i if i == nu - 1 => (line - 1, line - 2, fu - 1.0),
+            _ => (line, line - 1, fu),
+        };
+        let sides = [leaves(i, nu, self.slope[0]), leaves(j, nv, self.slope[1])];
+        if let Some(side) = sides.iter().position(|side| *side == Some(forward)) {
+            let axes = self.layout.axes;
+            let mut ijk = [0; 3];
+            (ijk[axes[0]], ijk[axes[1]], ijk[axes[2]]) = (i, j, k);
+            if let Some(radiance) = self.touched.at(axes[side], ijk) {
+                return radiance;
+            }
+            let nearest = if f > 0.5 { far } else { near };
+            let end = self.ends[usize::from(fv > 0.5)][usize::from(!forward)][nearest];
+            if end != CUT {
+                return self.stands.end(end as usize, c);
+            }
+        }
+        std::array::from_fn(|c| {
+            let [this, before] = self.light.map(|light| (1.0 - f) * light[c][near] + f * light[c][far]);
+            (1.0 - fv) * this + fv * before
+        })
+    }
+}
