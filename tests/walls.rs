@@ -143,7 +143,8 @@ fn the_ceiling_is_bright_up_to_the_luminaire() {
 }
 
 /// Where level sets meet walls at all angles, light on the face itself is that of the edge between the two, not of a
-/// texel's mean. Without what nodes touch they were 1.6 %, RMS 9.1 % off.
+/// texel's mean: by photons, which saw that, it was 5.3 %, RMS 15.6 % off, by sweeps without what nodes touch 1.6 and
+/// 9.1 %.
 #[test]
 fn light_on_a_wall_is_that_of_the_edge() {
     let scene = waves();
@@ -151,12 +152,16 @@ fn light_on_a_wall_is_that_of_the_edge() {
     let light = &scene.polygons()[0];
     let voxel = scene.lattice().spacing().x;
     // The front of the default box is open.
-    let errors = errors(&scene, Engine::Sweep, 7, 1024, |p| {
-        let on = p.x == 0.0 || p.x == far.x || p.y == far.y || p.z == 0.0 || p.z == far.z;
-        on && light.distance(scene.lattice().to_world(p)) > 3.0 * voxel
-    });
-    println!("{errors:?}");
-    assert!(errors.points > 200 && errors.mean.abs() < 0.014 && errors.rms < 0.086);
+    for engine in [Engine::Sweep, Engine::Photon] {
+        let errors = errors(&scene, engine, 7, 1024, |p| {
+            let on = p.x == 0.0 || p.x == far.x || p.y == far.y || p.z == 0.0 || p.z == far.z;
+            on && light.distance(scene.lattice().to_world(p)) > 3.0 * voxel
+        });
+        println!("{engine:?}: {errors:?}");
+        // Gathers of 64 rays by photons are noisy.
+        let most = if engine == Engine::Sweep { 0.086 } else { 0.1 };
+        assert!(errors.points > 200 && errors.mean.abs() < 0.014 && errors.rms < most, "{engine:?}");
+    }
 }
 
 /// Between a luminaire and the ceiling that it covers it is dark.

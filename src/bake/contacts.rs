@@ -6,15 +6,18 @@
 //! of either irradiance comes from the other surface, so that E = D + F ρ_w E_w and E_w = D_w + F ρ E, D being what the
 //! wedge brings: two equations for E and E_w. \[Lambert1760\]
 
+use super::BakeSettings;
 use super::grid_points::{Counts, STAND_INS};
 use crate::direct::{Receiver, direct_irradiance, luminance};
 use crate::flattened::{Departure, Side, Target};
 use crate::gather::gathered_irradiance;
-use crate::mask::local_position;
+use crate::illumination_grid::IlluminationGrid;
+use crate::mask::{Mask, local_position};
 use crate::radiance_cache::RadianceCache;
 use crate::rng::Stage;
 use crate::scene::{Boundary, Scene};
 use crate::tracer::Tracer;
+use crate::volume::Lattice;
 use glam::DVec3;
 use rayon::prelude::*;
 use std::f64::consts::PI;
@@ -29,24 +32,36 @@ const MOST_KEPT: f64 = 0.99;
 /// Lattice points on walls that reflect.
 pub(super) struct Contacts<'a> {
     scene: &'a Scene,
+    lattice: &'a Lattice,
     /// Points in rising order, and the walls each lies on.
     points: Vec<(usize, [Option<u32>; MOST])>,
 }
 
+/// The shares of the engine's gather and shadow rays that a wall takes at a contact: only a part of what arrives there
+/// is seen again.
+const SHARES: [u32; 2] = [2, 4];
+
 /// How light at contacts is gathered.
 pub(super) struct Wedge<'a, T> {
-    pub tracer: &'a T,
-    pub cache: &'a RadianceCache,
-    pub gather_rays: u32,
-    pub shadow_rays: u32,
-    pub seed: u64,
+    tracer: &'a T,
+    cache: &'a RadianceCache,
+    gather_rays: u32,
+    shadow_rays: u32,
+    seed: u64,
+}
+
+impl<'a, T> Wedge<'a, T> {
+    pub(super) fn new(tracer: &'a T, cache: &'a RadianceCache, settings: &BakeSettings) -> Self {
+        let [gather_rays, shadow_rays] =
+            [settings.gather_rays / SHARES[0], settings.shadow_rays / SHARES[1]].map(|rays| rays.max(2));
+        Self { tracer, cache, gather_rays, shadow_rays, seed: settings.seed }
+    }
 }
 
 impl<'a> Contacts<'a> {
-    /// The points of the scene's lattice that `holds` picks and that lie on walls. None if Ω's faces are capped.
+    /// The points of `lattice` that `holds` picks and that lie on walls. None if Ω's faces are capped.
     #[allow(clippy::cast_possible_truncation, reason = "fewer than 2¹⁶ polygons")]
-    pub(super) fn new(scene: &'a Scene, holds: impl Fn(usize) -> bool + Sync) -> Self {
-        let lattice = scene.lattice();
+    pub(super) fn new(scene: &'a Scene, lattice: &'a Lattice, holds: impl Fn(usize) -> bool + Sync) -> Self {
         let near = ON * lattice.spacing().min_element();
         let dims = lattice.dims();
         let centre = lattice.to_world(0.5 * lattice.far());
@@ -57,7 +72,7 @@ impl<'a> Contacts<'a> {
             })
             .collect();
         let touching = |o: usize| {
-            let x = lattice.to_world(local_position(&scene.field, lattice, o));
+            let x = scene.lattice().to_world(local_position(&scene.field, lattice, o));
             let touches = |w: &u32| {
                 let wall = &scene.polygons()[*w as usize];
                 wall.is_nearer(x, near) && (centre - x).dot(wall.normal()) > 0.0
@@ -76,11 +91,15 @@ impl<'a> Contacts<'a> {
         };
         let points = (0..rows).into_par_iter().with_min_len(16).flat_map_iter(on_faces);
         let points = points.filter(|&o| holds(o)).filter_map(touching).collect();
-        Self { scene, points }
+        Self { scene, lattice, points }
     }
 
     pub(super) fn len(&self) -> usize {
         self.points.len()
+    }
+
+    pub(super) fn holds(&self, o: usize) -> bool {
+        self.points.binary_search_by_key(&o, |p| p.0).is_ok()
     }
 
     /// Solves for the light of `side` at all points. `white` holds what a white surface would reflect at every node of
@@ -94,29 +113,68 @@ impl<'a> Contacts<'a> {
         (white, std_error): (&mut [[f32; 3]], &mut [f32]),
         tick: &(dyn Fn(u64) -> bool + Sync),
     ) -> Counts {
-        let points = self.points.par_iter().with_max_len(64);
-        let solved: Vec<Option<(DVec3, f64, Counts)>> = points
-            .map(|&(o, walls)| {
-                if !tick(1) {
-                    return None;
-                }
-                let (mut counts, mut variance) = (Counts::default(), 0.0);
-                let mut light = DVec3::from_array(white[o].map(f64::from));
-                for (n, wall) in walls.into_iter().flatten().enumerate() {
-                    let (met, added) = self.meet((o, side), (n, wall), wedge, light, &mut counts)?;
-                    (light, variance) = (met, variance + added);
-                }
-                Some((light, variance, counts))
-            })
-            .collect();
+        let light = |o: usize| Some(DVec3::from_array(white[o].map(f64::from)));
         let mut total = Counts::default();
-        for (&(o, _), solved) in self.points.iter().zip(solved) {
-            let Some((light, variance, counts)) = solved else { continue };
+        for (o, light, variance, counts) in self.solved(side, wedge, light, tick) {
             white[o] = light.as_vec3().to_array();
             std_error.get_mut(o).into_iter().for_each(|e| *e = f64::from(*e).hypot(variance.sqrt()) as f32);
             total += counts;
         }
         total
+    }
+
+    /// As [`Contacts::solve`], for those points of `grid` that `holds` picks and that hold light, on surfaces that
+    /// reflect it.
+    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+    pub(super) fn solve_in<T: Tracer>(
+        &self,
+        grid: &mut IlluminationGrid,
+        holds: impl Fn(usize) -> bool + Sync,
+        side: Side,
+        wedge: &Wedge<T>,
+        tick: &(dyn Fn(u64) -> bool + Sync),
+    ) -> Counts {
+        let surface = &self.scene.surface;
+        let albedo = |o: usize| {
+            let p = local_position(&self.scene.field, self.lattice, o);
+            surface.albedo.at(self.scene.field.value(p))
+        };
+        let light = |o: usize| {
+            let albedo = albedo(o);
+            let reflected = DVec3::from_array(grid.radiance[o].map(f64::from)) - surface.emission;
+            let lit = grid.mask[o] != Mask::Empty && holds(o) && albedo.min_element() > 0.0;
+            lit.then(|| reflected.max(DVec3::ZERO) / albedo)
+        };
+        let mut total = Counts::default();
+        for (o, light, variance, counts) in self.solved(side, wedge, light, tick) {
+            grid.radiance[o] = (albedo(o) * light + surface.emission).as_vec3().to_array();
+            grid.std_error[o] = f64::from(grid.std_error[o]).hypot(variance.sqrt()) as f32;
+            total += counts;
+        }
+        total
+    }
+
+    /// Points for which `white` says what a white surface would reflect, what it does, and the variance that is new.
+    fn solved<T: Tracer>(
+        &self,
+        side: Side,
+        wedge: &Wedge<T>,
+        white: impl Fn(usize) -> Option<DVec3> + Sync,
+        tick: &(dyn Fn(u64) -> bool + Sync),
+    ) -> Vec<(usize, DVec3, f64, Counts)> {
+        let solve = |&(o, walls): &(usize, [Option<u32>; MOST])| {
+            if !tick(1) {
+                return None;
+            }
+            let (mut counts, mut variance) = (Counts::default(), 0.0);
+            let mut light = white(o)?;
+            for (n, wall) in walls.into_iter().flatten().enumerate() {
+                let (met, added) = self.meet((o, side), (n, wall), wedge, light, &mut counts)?;
+                (light, variance) = (met, variance + added);
+            }
+            Some((o, light, variance, counts))
+        };
+        self.points.par_iter().with_max_len(64).filter_map(solve).collect()
     }
 
     /// What a white surface would reflect at point `o` on `wall`, the `n`th of its walls, if it would reflect `white`
@@ -134,7 +192,7 @@ impl<'a> Contacts<'a> {
     ) -> Option<(DVec3, f64)> {
         let scene = self.scene;
         let Wedge { tracer, cache, gather_rays, shadow_rays, seed } = *wedge;
-        let x = local_position(&scene.field, scene.lattice(), o);
+        let x = local_position(&scene.field, self.lattice, o);
         let isovalue = scene.field.is_whole_around(x).then(|| scene.field.value(x) as f32)?;
         let polygon = &scene.polygons()[wall as usize];
         // The share of either hemisphere that the other surface fills. \[Lambert1760\]
@@ -154,8 +212,10 @@ impl<'a> Contacts<'a> {
         let target = (Target::Polygon(wall), scene.leaves_within(receiver.departure));
         let shown = cache.lookup(scene, target, x, isovalue, &mut counts.misses);
         let level_set = scene.surface.albedo.at(f64::from(isovalue));
-        // D_w/π, without what the level set has lit the wall by so far.
-        let opening = ((direct.mean + gathered.mean) / PI - share * level_set * white).max(DVec3::ZERO);
+        // D_w/π, without what the level set reflects onto the wall by what the cache says.
+        let touched = (Target::Surface(side), scene.leaves_within(receiver.departure));
+        let reflects = cache.lookup(scene, touched, x, isovalue, &mut counts.misses) - scene.surface.emission;
+        let opening = ((direct.mean + gathered.mean) / PI - share * reflects).max(DVec3::ZERO);
         // Of white surfaces that touch face to face nothing would ever be lost.
         let lost = 1.0 - (share * share * polygon.albedo * level_set).min(DVec3::splat(MOST_KEPT));
         let met = (white + share * (polygon.albedo * opening - shown)) / lost;

@@ -65,6 +65,13 @@ pub(super) struct PointLight {
     halves: Option<Vec<Packed>>,
 }
 
+impl PointLight {
+    /// Radiance as far as it is known.
+    pub(super) fn grid(&mut self) -> &mut IlluminationGrid {
+        &mut self.grid
+    }
+}
+
 /// Two RGB irradiances in 14 bytes, to 1/65534 of the largest of their numbers: far below their noise.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Packed {
@@ -133,7 +140,7 @@ impl<'a> GridPoints<'a> {
     /// The isovalue of a point, or the nearest of the sweep.
     #[inline]
     #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
-    fn isovalue(&self, o: usize) -> f32 {
+    pub(super) fn isovalue(&self, o: usize) -> f32 {
         let h = if self.lattice == self.field.lattice() {
             self.field.samples()[o]
         } else {
@@ -142,13 +149,14 @@ impl<'a> GridPoints<'a> {
         h.clamp(0.0, 1.0)
     }
 
-    /// Samples the points of a band.
+    /// Samples the points of a band. What is gathered at those that are `apart` will not be smoothed.
     #[allow(clippy::cast_possible_truncation, reason = "positions are f32")]
     pub(super) fn sample<T: Tracer>(
         &self,
         sampler: &Sampler<'_, T>,
         band: Band,
         light: &mut PointLight,
+        apart: &(dyn Fn(usize) -> bool + Sync),
         saved: checkpoint::Stage<'_>,
         tick: &(dyn Fn(u64) -> bool + Sync),
     ) -> Counts {
@@ -180,6 +188,7 @@ impl<'a> GridPoints<'a> {
                 let Some(s) = s else { continue };
                 radiance[o - start] = s.radiance.to_array();
                 mask[o - start] = self.masks[o];
+                let smoothing = smoothing && !apart(o);
                 std_error[o - start] = match smoothing {
                     true => s.variance - s.indirect_variance,
                     false => s.variance.sqrt(),

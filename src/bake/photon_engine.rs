@@ -1,6 +1,7 @@
 //! BB09's engine: photons, a radiance cache, samples by exact rays, interpolation.
 
 use super::bands::{Band, Levels};
+use super::contacts::{Contacts, Wedge};
 use super::grid_points::{Beside, BesideLight, Counts, GridPoints, PointLight};
 use super::{BakeSettings, Interpolation, Lit, PhotonCounts, stages};
 use crate::checkpoint::{self, Checkpoint};
@@ -143,9 +144,10 @@ struct FieldLight<'a> {
 }
 
 /// Where a field is sampled.
+#[allow(clippy::large_enum_variant, reason = "one of a field")]
 enum Places<'a> {
-    /// At its grid's points and beside them.
-    Grid(GridPoints<'a>, Beside<'a>),
+    /// At its grid's points and beside them; which of them lie on walls.
+    Grid(GridPoints<'a>, Beside<'a>, Contacts<'a>),
     /// Anywhere.
     Scattered(Vec<Vec3>),
 }
@@ -167,11 +169,14 @@ impl<'a> FieldLight<'a> {
                 let points = GridPoints::new(&scene.field, lattice, masks, settings.gather_rays > 0);
                 let fitted = |o: usize| masks[o] == Mask::Filled && !points.contains(o);
                 let beside = Beside::new(&scene.field, lattice, fitted, settings.seed);
-                Places::Grid(points, beside)
+                // Only a cache knows what walls show there.
+                let gathers = settings.gather_rays > 0;
+                let contacts = Contacts::new(scene, lattice, |o| gathers && masks[o] == Mask::Valid);
+                Places::Grid(points, beside, contacts)
             }
         };
         let sides = scene.surface.stored_sides().into_iter().map(|side| match &places {
-            Places::Grid(points, beside) => SideLight {
+            Places::Grid(points, beside, _) => SideLight {
                 side,
                 points: Some((points.dark(settings.smooths()), beside.dark())),
                 scattered: Vec::new(),
@@ -185,7 +190,7 @@ impl<'a> FieldLight<'a> {
     /// Samples of all sides.
     fn work(&self) -> u64 {
         let each = match &self.places {
-            Places::Grid(points, beside) => points.len() + beside.len(),
+            Places::Grid(points, beside, contacts) => points.len() + beside.len() + contacts.len(),
             Places::Scattered(at) => at.len(),
         };
         (each * self.sides.len()) as u64
@@ -218,8 +223,12 @@ impl<'a> FieldLight<'a> {
             let sampler = Sampler { scene, tracer, indirect: &indirect, side: *side, shadow_rays, seed };
             let saved = |kind: u32| stages(checkpoint, STAGES * number + kind)[side.index()];
             match (&self.places, points) {
-                (Places::Grid(grid, beside), Some((at_points, at_beside))) => {
-                    counts += grid.sample(&sampler, band, at_points, saved(2), tick);
+                (Places::Grid(grid, beside, contacts), Some((at_points, at_beside))) => {
+                    let apart = |o: usize| contacts.holds(o);
+                    counts += grid.sample(&sampler, band, at_points, &apart, saved(2), tick);
+                    let wedge = Wedge::new(tracer, cache, settings);
+                    let own = |o: usize| band.holds(grid.isovalue(o));
+                    counts += contacts.solve_in(at_points.grid(), own, *side, &wedge, tick);
                     counts += beside.sample(&sampler, band, at_beside, saved(4), tick);
                 }
                 (Places::Scattered(at), _) => {
@@ -242,7 +251,7 @@ impl<'a> FieldLight<'a> {
         let Self { job: Job { scene, lattice, masks, .. }, places, sides } = self;
         let each = |SideLight { side, points, scattered }: SideLight| {
             let grid = match (&places, points) {
-                (Places::Grid(grid, beside), Some((at_points, mut at_beside))) => {
+                (Places::Grid(grid, beside, _), Some((at_points, mut at_beside))) => {
                     if settings.smooths() {
                         beside.smooth(scene, side, settings.tau, &mut at_beside, tick);
                     }

@@ -31,9 +31,6 @@ const STEPS: f64 = 1000.0;
 /// fitted to samples of its own and its neighbours'.
 const SHARES: [u32; 2] = [4, 8];
 
-/// Those that a wall takes at a contact: only a part of what arrives there is seen again.
-const CONTACT_SHARES: [u32; 2] = [2, 4];
-
 /// Points nearer to a luminaire than this many voxels are sampled by exact rays: on its front light falls off within a
 /// voxel, and what lies behind it is lit by lines that a sweep mixes a voxel further.
 const NEAR: f64 = 1.5;
@@ -79,7 +76,7 @@ pub(super) fn light(
     let fitted = |o: usize| masks[o] == Mask::Filled && !own[o];
     let beside = Beside::new(&scene.field, lattice, fitted, settings.seed);
     let near = beside_luminaires(scene, masks);
-    let contacts = Contacts::new(scene, |o| masks[o] == Mask::Valid && own[o]);
+    let contacts = Contacts::new(scene, scene.lattice(), |o| masks[o] == Mask::Valid && own[o]);
     // What the sweep knows is what rays from these points gather.
     let gathered = |side| swept.iter().find(|s| s.side == side && beside.len() + near.len() + contacts.len() > 0);
     let nodes = [Side::Lower, Side::Higher].map(|side| Some(widened(lattice, masks, &gathered(side)?.irradiance)));
@@ -104,13 +101,7 @@ pub(super) fn light(
         let place = |n: usize| ((STAND_INS * near[n]) as u64, local_position(&scene.field, lattice, near[n]).as_vec3());
         let sampled = sample_places(&sampler, near.len(), &place, Stage::UNSAVED, 0, &|n| stage.tick(n));
         lit.count(Counts::from(&sampled));
-        let wedge = Wedge {
-            tracer: &tracer,
-            cache: &cache,
-            gather_rays: rays(CONTACT_SHARES[0]),
-            shadow_rays: shadow(CONTACT_SHARES[1]),
-            seed,
-        };
+        let wedge = Wedge::new(&tracer, &cache, settings);
         lit.count(contacts.solve(s.side, &wedge, (&mut s.irradiance, &mut s.std_error), &|n| stage.tick(n)));
         stage.end()?;
         let mask = |o: usize| if own[o] { masks[o] } else { Mask::Empty };

@@ -116,7 +116,8 @@ fn a_cavity_reflects_by_the_albedo_of_its_own_isovalue() {
 }
 
 /// Another colour at another isovalue changes no bit: of no photon path between stops that stay, and of no grid point
-/// further from the change than the estimates reach (τ, and a cell).
+/// further from the change than the estimates reach (τ, and a cell). Points on walls gather what the photon map says of
+/// the level set at the very place: bins around it reach over half of the sweep with so few photons.
 #[test]
 fn colours_of_other_isovalues_change_nothing() {
     let with = |last: DVec3| {
@@ -142,7 +143,8 @@ fn colours_of_other_isovalues_change_nothing() {
     for ((o, _, h, ..), _) in valid(&bake_a, &a).into_iter().zip(valid(&bake_b, &b)) {
         let equal = bake_a.sides[0].1.radiance[o] == bake_b.sides[0].1.radiance[o];
         // A cell spans up to 0.2 of the sweep here; walls have texels and a kernel in c.
-        if h < 0.2 {
+        let on_wall = a.lattice().ijk(o).iter().any(|i| [0, 20].contains(i));
+        if h < 0.2 && !on_wall {
             assert!(equal, "node {o} at {h}");
             same += 1;
         } else if !equal {
