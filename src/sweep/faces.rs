@@ -3,6 +3,7 @@
 use super::directions::Layout;
 use super::flats::Flats;
 use super::grid::Geometry;
+use super::half::{Half4, colour, encode};
 use super::pack::{LANES, Pack};
 use super::scan::Light;
 use crate::polygon::Polygon;
@@ -54,20 +55,20 @@ fn leaves(j: usize, n: usize, slope: f64) -> Option<bool> {
 /// A point this near to a wall, in voxels, lies on it.
 const ON: f64 = 1e-3;
 
-/// A wall and where on it.
-type Spot = (u32, [f32; 2]);
+/// No wall.
+const NONE: u16 = u16::MAX;
 
-/// What lit nodes on Ω's faces touch: per face, which is 2 · axis, + 1 for the far one, and node of it a wall that
-/// reflects; nothing of faces that no wall touches.
-pub(super) struct Touching {
-    dims: [usize; 3],
-    walls: [Vec<Option<Spot>>; 6],
+/// What lit nodes on Ω's faces touch: per face, which is 2 · axis, + 1 for the far one, and node of it the number of a
+/// wall that reflects, or [`NONE`]; nothing of faces that no wall touches.
+pub(super) struct Touching<'a> {
+    scene: &'a Scene,
+    walls: [Vec<u16>; 6],
 }
 
-/// Radiance of what the nodes on Ω's faces touch, in the order of [`Touching`]; NaN of nothing.
-pub(super) struct Touched {
-    dims: [usize; 3],
-    radiance: [Vec<[f32; 3]>; 6],
+/// Radiance of the walls that nodes on Ω's faces touch.
+pub(super) struct Touched<'a> {
+    touching: &'a Touching<'a>,
+    radiance: [Vec<Half4>; 6],
 }
 
 /// Where node `ijk` is in a face of `axis`.
@@ -85,9 +86,9 @@ fn node(dims: [usize; 3], face: usize, at: usize) -> [usize; 3] {
     ijk
 }
 
-impl Touching {
-    #[allow(clippy::cast_possible_truncation, reason = "fewer than 2¹⁶ polygons, texture coordinates")]
-    pub(super) fn new(scene: &Scene, geometry: &Geometry, flats: &Flats) -> Self {
+impl<'a> Touching<'a> {
+    #[allow(clippy::cast_possible_truncation, reason = "fewer than 2¹⁶ polygons")]
+    pub(super) fn new(scene: &'a Scene, geometry: &Geometry, flats: &Flats) -> Self {
         let (lattice, dims) = (scene.lattice(), geometry.dims);
         let near = ON * lattice.spacing().min_element();
         let walls = std::array::from_fn(|face| {
@@ -108,41 +109,44 @@ impl Touching {
                 let lit = geometry.lit(i + dims[0] * (j + dims[1] * k));
                 let x = lattice.to_world(DVec3::new(i as f64, j as f64, k as f64));
                 // Behind a luminaire that covers the wall it is not the wall that is seen.
-                let &(number, wall) = walls.iter().find(|(_, p)| lit && p.is_nearer(x, near) && !scene.covers(x))?;
-                Some((number as u32, wall.texture(x).map(|x| x.clamp(0.0, 1.0) as f32)))
+                let wall = walls.iter().find(|(_, p)| lit && p.is_nearer(x, near) && !scene.covers(x));
+                wall.map_or(NONE, |(number, _)| *number as u16)
             };
             (0..nodes).into_par_iter().map(wall).collect()
         });
-        Self { dims, walls }
+        Self { scene, walls }
     }
 
     /// What is there now, times the scale that [`Flats::packed`] has.
-    pub(super) fn now(&self, geometry: &Geometry, flats: &Flats) -> Touched {
-        let dims = self.dims;
+    #[allow(clippy::cast_possible_truncation, reason = "texture coordinates")]
+    pub(super) fn now(&self, geometry: &Geometry, flats: &Flats) -> Touched<'_> {
+        let (lattice, dims) = (self.scene.lattice(), geometry.dims);
         let stands = Light { b: &[], flats: &flats.packed, isovalues: flats.isovalues };
         let radiance = std::array::from_fn(|face| {
-            let shown = |(at, wall): (usize, &Option<Spot>)| {
+            let shown = |(at, &number): (usize, &u16)| {
+                let Some(wall) = self.scene.polygons().get(usize::from(number)) else { return Half4::default() };
                 let [i, j, k] = node(dims, face, at);
                 let c = geometry.h[i + dims[0] * (j + dims[1] * k)];
-                let texels = wall.and_then(|(flat, uv)| flats.texels(flat, uv));
-                texels.map_or([f32::NAN; 3], |texels| {
-                    let shows = texels.map(|(start, weight)| stands.end(start, c).map(|b| weight * b));
-                    shows.into_iter().fold([0.0; 3], |sum, b| std::array::from_fn(|c| sum[c] + b[c]))
-                })
+                let uv = wall.texture(lattice.to_world(DVec3::new(i as f64, j as f64, k as f64)));
+                let texels = flats.texels(u32::from(number), uv.map(|x| x.clamp(0.0, 1.0) as f32));
+                let shows = texels.into_iter().flatten().map(|(start, w)| stands.end(start, c).map(|b| w * b));
+                let [r, g, b] = shows.fold([0.0; 3], |sum, b| std::array::from_fn(|c| sum[c] + b[c]));
+                [encode(r), encode(g), encode(b), 0]
             };
             self.walls[face].par_iter().enumerate().map(shown).collect()
         });
-        Touched { dims, radiance }
+        Touched { touching: self, radiance }
     }
 }
 
-impl Touched {
+impl Touched<'_> {
     /// Radiance of the wall that node `ijk` touches with the side of `axis`.
     #[inline]
     fn at(&self, axis: usize, ijk: [usize; 3]) -> Option<[f32; 3]> {
         let face = 2 * axis + usize::from(ijk[axis] > 0);
-        let radiance = *self.radiance[face].get(place(self.dims, axis, ijk))?;
-        (!radiance[0].is_nan()).then_some(radiance)
+        let at = place(self.touching.scene.lattice().dims(), axis, ijk);
+        let wall = *self.touching.walls[face].get(at)?;
+        (wall != NONE).then(|| colour(self.radiance[face][at]))
     }
 }
 
@@ -160,7 +164,7 @@ pub(super) struct Sides<'a> {
     pub line0: usize,
     pub weights: [f32; 2],
     pub stands: Light<'a>,
-    pub touched: &'a Touched,
+    pub touched: &'a Touched<'a>,
 }
 
 impl Sides<'_> {

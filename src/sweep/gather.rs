@@ -27,7 +27,7 @@ pub(super) struct Pass<'a> {
     pub geometry: &'a Geometry<'a>,
     /// Where polygons stand, and what Ω's faces touch.
     pub standing: &'a [Standing],
-    pub touching: Touching,
+    pub touching: Touching<'a>,
     /// The side that owns lines without samples.
     pub primary: Side,
     /// The instruction set of the hot loops.
@@ -69,7 +69,7 @@ struct Family<'a> {
     normals: &'a [u32],
     ends: &'a Ends,
     flats: &'a Flats,
-    touched: &'a Touched,
+    touched: &'a Touched<'a>,
     walls: arrive::Walls<'a>,
     way: Way,
     /// The direction times what |ω·N| weighs.
