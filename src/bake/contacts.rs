@@ -98,6 +98,7 @@ impl<'a> Contacts<'a> {
         self.points.len()
     }
 
+    /// Whether point `o` is one.
     pub(super) fn holds(&self, o: usize) -> bool {
         self.points.binary_search_by_key(&o, |p| p.0).is_ok()
     }
@@ -123,8 +124,8 @@ impl<'a> Contacts<'a> {
         total
     }
 
-    /// As [`Contacts::solve`], for those points of `grid` that `holds` picks and that hold light, on surfaces that
-    /// reflect it.
+    /// As [`Contacts::solve`], for those points of `grid` that `holds` picks and that hold light; of channels that they
+    /// do not reflect nothing is known, nor needed.
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     pub(super) fn solve_in<T: Tracer>(
         &self,
@@ -141,9 +142,9 @@ impl<'a> Contacts<'a> {
         };
         let light = |o: usize| {
             let albedo = albedo(o);
-            let reflected = DVec3::from_array(grid.radiance[o].map(f64::from)) - surface.emission;
-            let lit = grid.mask[o] != Mask::Empty && holds(o) && albedo.min_element() > 0.0;
-            lit.then(|| reflected.max(DVec3::ZERO) / albedo)
+            let reflected = (DVec3::from_array(grid.radiance[o].map(f64::from)) - surface.emission).max(DVec3::ZERO);
+            let lit = grid.mask[o] != Mask::Empty && holds(o);
+            lit.then(|| DVec3::select(albedo.cmpgt(DVec3::ZERO), reflected / albedo, DVec3::ZERO))
         };
         let mut total = Counts::default();
         for (o, light, variance, counts) in self.solved(side, wedge, light, tick) {
