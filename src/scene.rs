@@ -7,7 +7,7 @@ mod mtl;
 mod obj;
 
 pub use companion::{Companion, Member, Policy};
-pub(crate) use cover::{SLIT, voxel_along};
+pub(crate) use cover::{ON, SLIT, voxel_along};
 pub use obj::{Placement, read_context, read_obj};
 
 use crate::emission;

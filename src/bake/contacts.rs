@@ -15,15 +15,13 @@ use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, local_position};
 use crate::radiance_cache::RadianceCache;
 use crate::rng::Stage;
-use crate::scene::{Boundary, Scene};
+use crate::scene::{Boundary, ON, Scene};
 use crate::tracer::Tracer;
 use crate::volume::Lattice;
 use glam::DVec3;
 use rayon::prelude::*;
 use std::f64::consts::PI;
 
-/// A point this near to a wall, in voxels, lies on it.
-const ON: f64 = 1e-3;
 /// Walls that a point can lie on.
 const MOST: usize = 3;
 /// The share of light between two surfaces that they keep, at most.

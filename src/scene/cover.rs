@@ -8,6 +8,8 @@ use glam::DVec3;
 
 /// A slit is less than this share of a voxel wide.
 pub(crate) const SLIT: f64 = 0.25;
+/// A point this near to a wall, in voxels, lies on it.
+pub(crate) const ON: f64 = 1e-3;
 
 /// The lattice's axis that is nearest to the normal of a polygon, and how far apart its slices are along that.
 pub(crate) fn voxel_along(lattice: &Lattice, polygon: &Polygon) -> (usize, f64) {

@@ -7,7 +7,7 @@ use super::half::{Half4, colour, encode};
 use super::pack::{LANES, Pack};
 use super::scan::Light;
 use crate::polygon::Polygon;
-use crate::scene::Scene;
+use crate::scene::{ON, Scene};
 use glam::DVec3;
 use rayon::prelude::*;
 
@@ -52,9 +52,6 @@ fn leaves(j: usize, n: usize, slope: f64) -> Option<bool> {
     }
 }
 
-/// A point this near to a wall, in voxels, lies on it.
-const ON: f64 = 1e-3;
-
 /// No wall.
 const NONE: u16 = u16::MAX;
 
@@ -71,16 +68,21 @@ pub(super) struct Touched<'a> {
     radiance: [Vec<Half4>; 6],
 }
 
+/// The axes of a face across `axis`.
+fn across(axis: usize) -> [usize; 2] {
+    [usize::from(axis == 0), if axis == 2 { 1 } else { 2 }]
+}
+
 /// Where node `ijk` is in a face of `axis`.
 fn place(dims: [usize; 3], axis: usize, ijk: [usize; 3]) -> usize {
-    let [b, c] = [usize::from(axis == 0), if axis == 2 { 1 } else { 2 }];
+    let [b, c] = across(axis);
     ijk[b] + ijk[c] * dims[b]
 }
 
 /// The number of node `at` of a face.
 fn node(dims: [usize; 3], face: usize, at: usize) -> [usize; 3] {
     let axis = face / 2;
-    let [b, c] = [usize::from(axis == 0), if axis == 2 { 1 } else { 2 }];
+    let [b, c] = across(axis);
     let mut ijk = [0; 3];
     (ijk[axis], ijk[b], ijk[c]) = (face % 2 * (dims[axis] - 1), at % dims[b], at / dims[b]);
     ijk

@@ -117,7 +117,7 @@ fn a_cavity_reflects_by_the_albedo_of_its_own_isovalue() {
 
 /// Another colour at another isovalue changes no bit: of no photon path between stops that stay, and of no grid point
 /// further from the change than the estimates reach (τ, and a cell). Points on walls gather what the photon map says of
-/// the level set at the very place: bins around it reach over half of the sweep with so few photons.
+/// the level set at the very place, with a millionth of what the cell's other corners hold: they keep all but a little.
 #[test]
 fn colours_of_other_isovalues_change_nothing() {
     let with = |last: DVec3| {
@@ -137,15 +137,18 @@ fn colours_of_other_isovalues_change_nothing() {
     let ((total_a, photons_a), (total_b, photons_b)) = (below(&a), below(&b));
     assert!(photons_a == photons_b && photons_a.len() > 10_000, "{} photons", photons_a.len());
     assert_ne!(total_a, total_b, "above, roulette decides otherwise");
-    let settings = BakeSettings { photons: 1 << 15, gather_rays: 16, wall_resolution: 8, ..at_nodes(1) };
+    let settings = BakeSettings { photons: 1 << 18, gather_rays: 16, wall_resolution: 8, ..at_nodes(1) };
     let (bake_a, bake_b) = (run(&a, &settings), run(&b, &settings));
     let (mut same, mut changed) = (0, 0);
     for ((o, _, h, ..), _) in valid(&bake_a, &a).into_iter().zip(valid(&bake_b, &b)) {
         let equal = bake_a.sides[0].1.radiance[o] == bake_b.sides[0].1.radiance[o];
         // A cell spans up to 0.2 of the sweep here; walls have texels and a kernel in c.
         let on_wall = a.lattice().ijk(o).iter().any(|i| [0, 20].contains(i));
-        if h < 0.2 && !on_wall {
-            assert!(equal, "node {o} at {h}");
+        if h < 0.2 {
+            let [x, y] = [&bake_a, &bake_b].map(|bake| bake.sides[0].1.radiance[o]);
+            let most = 0.01 * x.iter().sum::<f32>();
+            let near = x.iter().zip(&y).all(|(x, y)| (x - y).abs() <= most);
+            assert!(equal || on_wall && near, "node {o} at {h}: {x:?} {y:?}");
             same += 1;
         } else if !equal {
             changed += 1;
