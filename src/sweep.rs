@@ -31,6 +31,7 @@ mod open_share;
 mod pack;
 mod planes;
 mod points;
+mod receivers;
 mod reflect;
 mod replicate;
 mod runs;

@@ -25,6 +25,12 @@ impl Blockers {
         Self { polygons: polygons.collect() }
     }
 
+    /// Whether nothing does.
+    #[inline]
+    pub(super) fn none(&self) -> bool {
+        self.polygons.is_empty()
+    }
+
     pub(super) fn block(&self, light: u32, receiver: Option<u32>, y: DVec3, x: DVec3) -> bool {
         self.polygons.iter().any(|(i, p)| {
             receiver != Some(*i)

@@ -11,6 +11,7 @@ use super::open_share::OpenShare;
 use super::pack::LANES;
 use super::planes::{Planes, Spare};
 use super::points::Points;
+use super::receivers::Emitter;
 use super::segments::Segments;
 use crate::flat;
 use crate::flattened::Side;
@@ -81,30 +82,22 @@ pub(super) fn direct(
             };
             fans.march((geometry, isa, sides), y, start);
             // Fourth powers of the world's lengths do not fit f32; the unit falls out.
-            let axes = lattice.axes() / unit;
-            let step = axes.x_axis.as_vec3();
-            let facing = light.normal().as_vec3();
+            let emitter = Emitter {
+                fans: &fans,
+                number,
+                blockers: &blockers,
+                facing: light.normal().as_vec3().to_array(),
+                step: (lattice.axes().x_axis / unit).as_vec3().to_array(),
+                wanted,
+                place,
+            };
             sums.par_chunks_mut(per * nx).enumerate().with_max_len(32).for_each(|(row, sums)| {
                 let (j, k) = (row % ny, row / ny);
                 let begin = DVec3::new(0.0, j as f64, k as f64);
-                let start = ((world - lattice.to_world(begin)) / unit).as_vec3();
-                geometry.lit_nodes(row, |i| {
-                    // Its length falls out of Σ V g / Σ g.
-                    let normal = geometry.along_normal(row * nx + i);
-                    let to = start - i as f32 * step;
-                    let (r2, cos_x, cos_y) = (to.length_squared(), to.dot(normal), -to.dot(facing));
-                    // A side that nobody asks for counts as facing away.
-                    if !(cos_y > 0.0) || cos_x * wanted[usize::from(cos_x < 0.0)] == 0.0 {
-                        return;
-                    }
-                    let g = cos_x.abs() * cos_y / (r2 * r2);
-                    let x = [i as f64, begin.y, begin.z];
-                    let Some(v) = fans.visibility(x) else { return };
-                    let s = usize::from(cos_x < 0.0);
-                    let open = !blockers.block(number, None, y, DVec3::from_array(x));
-                    let [seen, all] = &mut sums[i * per + place[s]];
-                    *seen += if open { g * v[s] } else { 0.0 };
-                    *all += g;
+                let to = ((world - lattice.to_world(begin)) / unit).as_vec3().to_array();
+                geometry.lit_vectors(row, |a, b| {
+                    let normals = &geometry.normals[row * nx + a..row * nx + b];
+                    isa.receive(&emitter, [a, j, k], to, normals, &mut sums[per * a..per * b]);
                 });
             });
         }

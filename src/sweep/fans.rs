@@ -14,22 +14,22 @@ pub(super) const SAMPLED: u8 = 1;
 pub(super) const LOWER: u8 = 2;
 pub(super) const HIGHER: u8 = 4;
 /// One of a turn, in the bits above: what is left of turns before is like no sample.
-const TURN: u8 = 8;
+pub(super) const TURN: u8 = 8;
 
 /// The lines from a point through the unit lattice of the farthest slice of one of the six pyramids around it.
-struct Fan {
-    layout: Layout,
+pub(super) struct Fan {
+    pub layout: Layout,
     /// The source in (u, v, slice).
-    source: [f64; 3],
+    pub source: [f64; 3],
     /// Slices from the source to the lattice's plane, with sign.
-    depth: f64,
+    pub depth: f64,
     /// First slice and their number, away from the source.
-    slices: (usize, usize),
+    pub slices: (usize, usize),
     /// First line and their number along u and v, numbered by where they meet the lattice's plane.
-    first: [isize; 2],
-    count: [usize; 2],
+    pub first: [isize; 2],
+    pub count: [usize; 2],
     /// Where what they see begins.
-    begin: usize,
+    pub begin: usize,
 }
 
 impl Fan {
@@ -64,7 +64,7 @@ impl Fan {
     }
 
     /// Bytes of a row of lines.
-    fn row(&self) -> usize {
+    pub(super) fn row(&self) -> usize {
         self.count[0] * self.slices.1
     }
 
@@ -193,49 +193,21 @@ impl Fan {
             take(n, near + f * (far - near));
         }
     }
-
-    /// The share of the four lines around local `x` that see the source at their own isovalue there: lower, higher
-    /// side. On Ω's sides it goes on linearly from the two lines within, also below 0 and above 1.
-    #[inline]
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the fan")]
-    fn visibility(&self, seen: &[u8], turn: u8, x: [f64; 3]) -> Option<[f32; 2]> {
-        let [u, v, a] = self.layout.axes;
-        let inverse = self.depth / (x[a] - self.source[2]);
-        let p = self.source[0] + (x[u] - self.source[0]) * inverse - self.first[0] as f64;
-        let q = self.source[1] + (x[v] - self.source[1]) * inverse - self.first[1] as f64;
-        let step = (x[a] as usize).abs_diff(self.slices.0);
-        let (i, f) = within(p, self.count[0], (x[u], self.layout.dims[0]));
-        let (j, g) = within(q, self.count[1], (x[v], self.layout.dims[1]));
-        let at = |dj: usize| &seen[self.begin + ((j + dj) * self.slices.1 + step) * self.count[0] + i..][..2];
-        let (near, far) = (at(0), at(1));
-        let lines = [near[0], near[1], far[0], far[1]].map(|seen| if seen & !(TURN - 1) == turn { seen } else { 0 });
-        // Of lines some of which are missing those that are there, by distance.
-        let all = lines.iter().all(|seen| seen & SAMPLED != 0);
-        let (f, g) = if all { (f, g) } else { (f.clamp(0.0, 1.0), g.clamp(0.0, 1.0)) };
-        let weights = [(1.0 - f) * (1.0 - g), f * (1.0 - g), (1.0 - f) * g, f * g];
-        let mut sum = [0f32; 3];
-        for (seen, w) in lines.into_iter().zip(weights) {
-            for (s, bit) in sum.iter_mut().zip([SAMPLED, LOWER, HIGHER]) {
-                *s += if seen & bit != 0 { w } else { 0.0 };
-            }
-        }
-        (sum[0] > 0.0).then(|| [sum[1] / sum[0], sum[2] / sum[0]])
-    }
 }
 
 /// The six fans of a point, and what their lines see.
 #[derive(Default)]
 pub(super) struct Fans {
-    source: DVec3,
+    pub source: DVec3,
     /// The last node of the lattice.
-    far: [f64; 3],
+    pub far: [f64; 3],
     /// What is seen of the source before anything of Ω is passed: lower, higher side.
-    entering: [f32; 2],
-    fans: [Option<Fan>; 6],
+    pub entering: [f32; 2],
+    pub fans: [Option<Fan>; 6],
     /// What their lines see, [fan][row][slice][line], and what is left of other points' fans.
-    seen: Vec<u8>,
+    pub seen: Vec<u8>,
     /// A multiple of [`TURN`].
-    turn: u8,
+    pub turn: u8,
 }
 
 impl Fans {
@@ -279,37 +251,6 @@ impl Fans {
             },
         );
     }
-
-    /// The share of the four lines around local `x` that see the source at their own isovalue there: lower, higher
-    /// side; on Ω's faces, where they are on one side, it may be below 0 or above 1. `None` where no line passes.
-    #[inline(always)]
-    pub(super) fn visibility(&self, x: [f64; 3]) -> Option<[f32; 2]> {
-        let y = self.source;
-        // On a face that looks at the source the segment between them meets Ω in `x` alone.
-        if (0..3).any(|a| y[a] < 0.0 && x[a] == 0.0 || y[a] > self.far[a] && x[a] == self.far[a]) {
-            return Some(self.entering);
-        }
-        let [a, b, c] = [(x[0] - y.x).abs(), (x[1] - y.y).abs(), (x[2] - y.z).abs()];
-        let axis = if c >= a && c >= b { 2 } else { usize::from(b >= a) };
-        let f = axis + if x[axis] > y[axis] { 3 } else { 0 };
-        self.fans[f].as_ref()?.visibility(&self.seen, self.turn, x)
-    }
-}
-
-/// Of the lines at 0 … `count` − 1 the cell for `p`, and where p lies in it: around p, or next to it within Ω if node
-/// `i` of `n` there is the first or last.
-#[inline]
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the fan")]
-fn within(p: f64, count: usize, (i, n): (f64, usize)) -> (usize, f32) {
-    let line = if i == 0.0 {
-        p.ceil()
-    } else if i == (n - 1) as f64 {
-        p.floor() - 1.0
-    } else {
-        p
-    };
-    let line = (line.max(0.0) as usize).min(count - 2);
-    (line, (p - line as f64) as f32)
 }
 
 /// The row between two, `f` from the first.
@@ -355,15 +296,16 @@ pub(super) fn sample(row: &[f32], [u0, du]: [f32; 2], n: usize) -> f32 {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
     use crate::field::{Field, Sweep};
     use crate::rng::{Rng, Stage};
+    use crate::sweep::pack::LANES;
     use crate::volume::{Lattice, Samples, Volume};
 
     /// Noise, of which x ≤ `most` is in the sweep: elsewhere lines are not marched along, and what others saw stays.
     /// Sample `missing` is no number.
-    fn noise(dims: [usize; 3], most: usize, missing: Option<usize>) -> Field {
+    pub(in crate::sweep) fn noise(dims: [usize; 3], most: usize, missing: Option<usize>) -> Field {
         let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::ONE).unwrap();
         let mut rng = Rng::stream(3, Stage::Test, 0);
         let low = |at: usize| if at % dims[0] > most { -7.0 } else { 0.0 };
@@ -371,6 +313,13 @@ mod tests {
         missing.iter().for_each(|&at| samples[at] = f32::NAN);
         Field::new(&Volume::new("noise", lattice, Samples::F32(samples)).unwrap(), Sweep::new(0.0, 1.0).unwrap())
             .unwrap()
+    }
+
+    /// What node x sees, beside others of its row.
+    pub(in crate::sweep) fn visibility(fans: &Fans, [i, j, k]: [usize; 3]) -> Option<[f32; 2]> {
+        let seen = fans.visibility([i / LANES * LANES, j, k], &[true; LANES]);
+        let lane = i % LANES;
+        seen.known[lane].then(|| seen.shares.map(|shares| shares[lane]))
     }
 
     /// From sources beyond Ω's sides, edges and corners: a line's sample is lit if it exceeds h where the line enters
@@ -459,10 +408,10 @@ mod tests {
                 fans
             });
             for at in (0..geometry.h.len()).filter(|&at| geometry.lit(at)) {
-                let x = field.lattice().ijk(at).map(|i| i as f64);
-                let [near, far, farther] = fans.each_ref().map(|fans| fans.visibility(x));
+                let x = field.lattice().ijk(at);
+                let [near, far, farther] = fans.each_ref().map(|fans| visibility(fans, x));
                 // Beside the sample that is no number lines know nothing.
-                let beside = x.iter().all(|x| *x < 3.0);
+                let beside = x.iter().all(|x| *x < 3);
                 assert!(beside || near.is_some() && far.is_some(), "{to} {x:?}");
                 // As good as parallel.
                 let alike = |a: Option<[f32; 2]>, b: Option<[f32; 2]>| {
@@ -490,17 +439,18 @@ mod tests {
                 y.z = 14.0 + rng.unit();
             }
             let mut new = Fans::default();
-            fans.march((&geometry, isa, &sides), y, [0.3; 2]);
-            new.march((&geometry, isa, &sides), y, [0.3; 2]);
-            for at in (0..geometry.h.len()).filter(|&at| geometry.lit(at)) {
-                let x = field.lattice().ijk(at).map(|i| i as f64);
-                let seen = fans.visibility(x);
-                assert_eq!(seen, new.visibility(x), "point {n}, {x:?}");
+            // Both sides march along all lines, one along those in the sweep.
+            let sides = &sides[..1 + n % 2];
+            fans.march((&geometry, isa, sides), y, [0.3; 2]);
+            new.march((&geometry, isa, sides), y, [0.3; 2]);
+            for x in (0..geometry.h.len()).map(|at| field.lattice().ijk(at)) {
+                let seen = visibility(&fans, x);
+                assert_eq!(seen, visibility(&new, x), "point {n}, {x:?}");
                 partial += usize::from(seen.is_some_and(|s| s[0] > 0.0 && s[0] < 1.0));
             }
             // Until the next has the same turn.
-            for _ in 0..if n % 2 == 0 { u8::MAX / TURN - 1 } else { 0 } {
-                fans.march((&small, isa, &sides), DVec3::splat(1.3), [0.3; 2]);
+            for _ in 0..if n % 2 == 1 { u8::MAX / TURN - 1 } else { 0 } {
+                fans.march((&small, isa, sides), DVec3::splat(1.3), [0.3; 2]);
             }
         }
         assert!(partial > 1000, "{partial}");

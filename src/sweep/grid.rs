@@ -5,6 +5,7 @@ use super::directions::Layout;
 use super::gaps::Rims;
 use super::half::{Half4, decode, encode};
 use super::normals;
+use super::pack::LANES;
 use super::planes::{Planes, Spare, transpose, transposed};
 use crate::field::{Field, FieldRows, GradientRow};
 use crate::flattened::Side;
@@ -288,6 +289,14 @@ impl<'a> Geometry<'a> {
         for (a, b) in blocks.each(row, nx) {
             let nodes = self.normals[row * nx + a..row * nx + b].iter().zip(a..b);
             nodes.filter(|(normal, _)| **normal != 0).for_each(|(_, i)| visit(i));
+        }
+    }
+
+    /// Calls `visit` with ranges of nodes of a row along x that hold all that are lit, at most [`LANES`] at a time.
+    #[inline(always)]
+    pub(super) fn lit_vectors(&self, row: usize, mut visit: impl FnMut(usize, usize)) {
+        for (a, b) in self.lit_blocks[0].each(row, self.dims[0]) {
+            (a..b).step_by(LANES).for_each(|a| visit(a, (a + LANES).min(b)));
         }
     }
 

@@ -19,6 +19,7 @@ use super::gather::{COSINES, accumulate_row, sum_cosines};
 use super::grid::Source;
 use super::half::Half4;
 use super::pack::{Pack, Plan};
+use super::receivers::Emitter;
 use super::reflect::{Job, Rows, reflect_row};
 use super::scan::{Light, Way};
 use super::segments::Segments;
@@ -84,6 +85,9 @@ impl Isa {
     dispatch!(accumulate, accumulate_row, (
         e: [&mut [f32]; 3], n: &[u32], omega: [f32; 3], light: [[&[f32]; 3]; 2], line0: usize,
         f: [f32; 2], range: (usize, usize)
+    ));
+    dispatch!(receive, Emitter::receive, (
+        emitter: &Emitter, ijk: [usize; 3], to: [f32; 3], normals: &[u32], sums: &mut [[f32; 2]]
     ));
     dispatch!(reflect, reflect_row, (
         job: &Job, s: usize, beside: [Option<usize>; 5], rows: &mut Rows, b: &mut [Half4]
