@@ -182,6 +182,7 @@ impl<'a> Walls<'a> {
     }
 
     /// Reports of lines (first + lane, q), whose samples are in `pack`, with B of this side and the other.
+    #[inline(always)]
     pub(super) fn through(&self, pack: &Pack, b: [&[Half4]; 2], first: isize, q: isize, out: &mut Arrivals) {
         if !self.near.row(q) {
             return;
@@ -225,21 +226,21 @@ impl<'a> Walls<'a> {
                 continue;
             }
             let reach = next.map_or(if forward { f64::INFINITY } else { f64::NEG_INFINITY }, |s| s.tau);
-            out.push((flat, wall.uv), weight, nc, |values| {
-                fill_column(self.flats, next, values);
-                match samples {
-                    Some((pack, b, lane, span)) if self.meets(wall.tau, reach, span) => {
-                        let way = (wall.tau, reach);
-                        if pack.gapped >> lane & 1 == 1 {
-                            self.staircase_with_gaps((pack, b), lane, span, way, (pf, qf), values)
-                        } else {
-                            self.staircase((pack, b[0]), lane, span, way, (pf, qf), values)
-                        }
+            let values = out.room(nc);
+            fill_column(self.flats, next, values);
+            let range = match samples {
+                Some((pack, b, lane, span)) if self.meets(wall.tau, reach, span) => {
+                    let way = (wall.tau, reach);
+                    if pack.gapped >> lane & 1 == 1 {
+                        self.staircase_with_gaps((pack, b), lane, span, way, (pf, qf), values)
+                    } else {
+                        self.staircase((pack, b[0]), lane, span, way, (pf, qf), values)
                     }
-                    _ if self.primary => (0, nc),
-                    _ => (0, 0),
                 }
-            });
+                _ if self.primary => (0, nc),
+                _ => (0, 0),
+            };
+            out.push((flat, wall.uv), weight, nc, range);
         }
     }
 
@@ -249,6 +250,7 @@ impl<'a> Walls<'a> {
 
     /// Replaces in `values` (what the far end shows) the isovalues that meet a level set first, seen from τ = `from`.
     /// Returns the isovalues that lie on this side there.
+    #[inline(always)]
     fn staircase(
         &self,
         (pack, b): (&Pack, &[Half4]),
@@ -420,10 +422,8 @@ impl<'a> Walls<'a> {
             if covered > 0 {
                 let next = self.ends.stop(pq.0, pq.1, span[end], end == 1, None);
                 let cap = self.cap_stop(span[end], pq);
-                out.push((cap.flat.expect("a cap"), cap.uv), self.near.weight, nc, |values| {
-                    fill_column(self.flats, next, values);
-                    (0, covered)
-                });
+                fill_column(self.flats, next, out.room(nc));
+                out.push((cap.flat.expect("a cap"), cap.uv), self.near.weight, nc, (0, covered));
             }
         }
     }

@@ -5,6 +5,7 @@
 use super::gather::local_bounds;
 use super::half::{Half4, encode};
 use crate::flat::{self, Flat, FlatTexture};
+use crate::isa::Isa;
 use crate::scene::{Boundary, Scene};
 use rayon::prelude::*;
 use std::f32::consts::PI;
@@ -100,8 +101,15 @@ pub(super) struct Arrivals {
 }
 
 impl Arrivals {
-    /// Adds what `radiance` writes into three channels of isovalues, which stands for `weight` = dω × area across, for
-    /// the range of isovalues that it returns.
+    /// Room for three channels of isovalues, which [`Self::push`] keeps.
+    #[inline(always)]
+    pub(super) fn room(&mut self, isovalues: usize) -> &mut [f32] {
+        let start = self.values.len();
+        self.values.resize(start + 3 * isovalues, 0.0);
+        &mut self.values[start..]
+    }
+
+    /// Adds what was written to the last room, which stands for `weight` = dω × area across, for a range of isovalues.
     #[inline(always)]
     #[allow(clippy::cast_possible_truncation, reason = "isovalue texels")]
     pub(super) fn push(
@@ -109,11 +117,9 @@ impl Arrivals {
         (flat, uv): (u32, [f32; 2]),
         weight: f32,
         isovalues: usize,
-        radiance: impl FnOnce(&mut [f32]) -> (usize, usize),
+        (from, to): (usize, usize),
     ) {
-        let start = self.values.len();
-        self.values.resize(start + 3 * isovalues, 0.0);
-        let (from, to) = radiance(&mut self.values[start..]);
+        let start = self.values.len() - 3 * isovalues;
         if from < to {
             self.list.push(Arrival { flat, uv, weight, range: (from as u32, to as u32), start });
         } else {
@@ -389,7 +395,7 @@ impl Flats {
 }
 
 /// What one flat receives in a pass.
-struct Sink {
+pub(super) struct Sink {
     dims: [usize; 3],
     indirect: Vec<f32>,
     weight: Vec<f32>,
@@ -402,25 +408,32 @@ pub(super) struct Incoming {
 
 impl Incoming {
     /// Adds what lines brought, in their order.
-    pub(super) fn receive(&mut self, arrivals: &[Arrivals]) {
+    pub(super) fn receive(&mut self, isa: Isa, arrivals: &[Arrivals]) {
         self.sinks.par_iter_mut().enumerate().for_each(|(number, sink)| {
-            let Some(t) = sink else { return };
-            let nc = t.dims[2];
-            for all in arrivals {
-                for a in all.list.iter().filter(|a| a.flat as usize == number) {
-                    let (first, last) = (a.range.0 as usize, a.range.1 as usize);
-                    for (texel, w) in around(t.dims, a.uv) {
-                        let w = w * a.weight;
-                        t.weight[texel * nc..][first..last].iter_mut().for_each(|x| *x += w);
-                        for c in 0..3 {
-                            let from = &all.values[a.start + c * nc..][first..last];
-                            let to = &mut t.indirect[(3 * texel + c) * nc..][first..last];
-                            to.iter_mut().zip(from).for_each(|(x, v)| *x += w * v);
-                        }
-                    }
-                }
+            if let Some(sink) = sink {
+                arrivals.iter().for_each(|all| isa.receive_arrivals(sink, number, all));
             }
         });
+    }
+}
+
+impl Sink {
+    /// Adds what lines brought to flat `number`.
+    #[inline(always)]
+    pub(super) fn receive(&mut self, number: usize, all: &Arrivals) {
+        let nc = self.dims[2];
+        for a in all.list.iter().filter(|a| a.flat as usize == number) {
+            let (first, last) = (a.range.0 as usize, a.range.1 as usize);
+            for (texel, w) in around(self.dims, a.uv) {
+                let w = w * a.weight;
+                self.weight[texel * nc..][first..last].iter_mut().for_each(|x| *x += w);
+                for c in 0..3 {
+                    let from = &all.values[a.start + c * nc..][first..last];
+                    let to = &mut self.indirect[(3 * texel + c) * nc..][first..last];
+                    to.iter_mut().zip(from).for_each(|(x, v)| *x += w * v);
+                }
+            }
+        }
     }
 }
 

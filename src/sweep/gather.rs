@@ -122,7 +122,7 @@ impl Pass<'_> {
                 e = self.geometry.untransposed(e, self.spare);
             }
         }
-        incoming.receive(&arrivals);
+        incoming.receive(self.isa, &arrivals);
         self.normalise(lines, &mut e);
         (e, complete)
     }
@@ -190,7 +190,7 @@ impl Pass<'_> {
             let share = |own| self.rows_of_lines(&family, (&lines, &arrivals), rows, (&runs, own));
             (0..threads).into_par_iter().with_max_len(1).for_each(share);
         };
-        rayon::join(shares, || incoming.receive(&before));
+        rayon::join(shares, || incoming.receive(self.isa, &before));
         arrivals.into_iter().map(|a| a.into_inner().expect("no thread panics")).collect()
     }
 
@@ -293,7 +293,7 @@ impl Pass<'_> {
                 }
             }
             if let Some(arrivals) = &mut arrivals {
-                family.walls.through(pack, [family.source.b, family.back], p, q, arrivals);
+                self.isa.report(&family.walls, pack, [family.source.b, family.back], p, q, arrivals);
             }
         }
         if let Some(arrivals) = arrivals {
@@ -360,16 +360,21 @@ impl Pass<'_> {
             bits = if a + run >= 64 { 0 } else { bits >> (a + run) << (a + run) };
             let (a, b) = (a * lit.size, ((a + run) * lit.size).min(nu));
             let mut some = |a: usize, b: usize| {
-                let whole = on_side(j, nv);
-                for i in (a..b).filter(|i| whole || on_side(*i, nu)) {
+                let mut single = |i: usize| {
                     let [x, y, z] = decode(n[i]);
                     let cos = family.omega[0] * x + family.omega[1] * y + family.omega[2] * z;
                     let light = sides.radiance(i, h[i], (cos > 0.0) != family.way.strict);
                     (e0[i], e1[i], e2[i]) =
                         (e0[i] + cos.abs() * light[0], e1[i] + cos.abs() * light[1], e2[i] + cos.abs() * light[2]);
+                };
+                if on_side(j, nv) {
+                    (a..b).for_each(single);
+                    return;
                 }
+                let ends = [0, nu - 1].into_iter().filter(|i| (a..b).contains(i));
+                ends.for_each(&mut single);
                 let (a, b) = (a.max(1), b.min(nu - 1));
-                if !whole && a < b {
+                if a < b {
                     let e = [&mut e0[..], &mut e1[..], &mut e2[..]];
                     self.isa.accumulate(e, n, family.omega, light, line0, [fu, fv], (a, b));
                 }

@@ -11,10 +11,11 @@ mod avx512;
 #[cfg(test)]
 mod tests;
 
+use super::arrive::Walls;
 use super::clearance::Clearance;
 use super::ends::Ends;
 use super::fans::march_row;
-use super::flats::Flats;
+use super::flats::{Arrivals, Flats, Sink};
 use super::gather::{COSINES, accumulate_row, sum_cosines};
 use super::grid::Source;
 use super::half::Half4;
@@ -86,6 +87,10 @@ impl Isa {
         e: [&mut [f32]; 3], n: &[u32], omega: [f32; 3], light: [[&[f32]; 3]; 2], line0: usize,
         f: [f32; 2], range: (usize, usize)
     ));
+    dispatch!(report, Walls::through, (
+        walls: &Walls, pack: &Pack, b: [&[Half4]; 2], first: isize, q: isize, out: &mut Arrivals
+    ));
+    dispatch!(receive_arrivals, Sink::receive, (sink: &mut Sink, number: usize, all: &Arrivals));
     dispatch!(receive, Emitter::receive, (
         emitter: &Emitter, ijk: [usize; 3], to: [f32; 3], normals: &[u32], sums: &mut [[f32; 2]]
     ));
