@@ -37,6 +37,25 @@ pub(super) fn inwards(j: usize, n: usize) -> isize {
     }
 }
 
+/// The two lines along u around node `i` of `nu`, and the weights of the second and of the row before, as
+/// [`super::gather::accumulate_row`] has them: on a side the first is nearer, and light `goes_on` linearly from both or
+/// stays what it is there. `line0` is the line just beyond node 0, −1 of which is missing.
+#[inline(always)]
+pub(super) fn around(
+    (i, nu): (usize, usize),
+    line0: usize,
+    [fu, fv]: [f32; 2],
+    goes_on: bool,
+) -> ([usize; 2], [f32; 2]) {
+    let (lines, f) = match i {
+        _ if nu == 2 => ([line0, line0], 0.0),
+        0 => ([line0, line0 + 1], -fu),
+        i if i == nu - 1 => ([line0 + nu - 2, line0 + nu - 3], fu - 1.0),
+        i => ([line0 + i, line0 + i - 1], fu),
+    };
+    (lines, if goes_on { [f, fv] } else { [f, fv].map(|f| f.clamp(0.0, 1.0)) })
+}
+
 /// Whether node `j` of `n` is on a side.
 pub(super) fn on_side(j: usize, n: usize) -> bool {
     j == 0 || j == n - 1
@@ -165,6 +184,8 @@ pub(super) struct Sides<'a> {
     /// The line just beyond node 0, −1 of which is missing, and weights, as [`super::gather::accumulate_row`] has them.
     pub line0: usize,
     pub weights: [f32; 2],
+    /// As [`around`].
+    pub goes_on: bool,
     pub stands: Light<'a>,
     pub touched: &'a Touched<'a>,
 }
@@ -172,18 +193,11 @@ pub(super) struct Sides<'a> {
 impl Sides<'_> {
     /// Radiance that comes to node `i` on isovalue `c` from +τ (`forward`) or −τ. What is beyond the side that the node
     /// is on is a wall that stands there, or what the nearest line ends on; for the rest, the light that lines bring
-    /// goes on linearly.
+    /// goes on linearly, or is that of the nearest ones.
     pub(super) fn radiance(&self, i: usize, c: f32, forward: bool) -> [f32; 3] {
         let [nu, nv, _] = self.layout.dims;
         let [j, k] = self.row;
-        let [fu, fv] = self.weights;
-        let line = self.line0 + i;
-        let (near, far, f) = match i {
-            _ if nu == 2 => (self.line0, self.line0, 0.0),
-            0 => (line, line + 1, -fu),
-            i if i == nu - 1 => (line - 1, line - 2, fu - 1.0),
-            _ => (line, line - 1, fu),
-        };
+        let ([near, far], [f, fv]) = around((i, nu), self.line0, self.weights, self.goes_on);
         let sides = [leaves(i, nu, self.slope[0]), leaves(j, nv, self.slope[1])];
         if let Some(side) = sides.iter().position(|side| *side == Some(forward)) {
             let axes = self.layout.axes;

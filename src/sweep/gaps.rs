@@ -2,6 +2,7 @@
 //! of Ω, and level sets end at their rims. A ray that comes out of a gap may do so inside the solid of its isovalue,
 //! which it then sees from within.
 
+use super::faces::around;
 use super::fans::{HIGHER, LOWER, sample};
 use super::grid::ring;
 use super::half::{Half4, colour};
@@ -98,15 +99,10 @@ pub(super) struct Around {
 }
 
 impl Around {
-    /// Those of node `i` of `nu`, weighed as [`super::gather::accumulate_row`] does, which has the same arguments.
-    pub(super) fn new((i, nu): (usize, usize), line0: usize, [fu, fv]: [f32; 2]) -> Self {
-        let (near, far, f) = match i {
-            _ if nu == 2 => (line0, line0, 0.0),
-            0 => (line0, line0 + 1, -fu),
-            i if i == nu - 1 => (line0 + nu - 2, line0 + nu - 3, fu - 1.0),
-            i => (line0 + i, line0 + i - 1, fu),
-        };
-        Self { lines: [near, far], weights: [1.0 - fv, fv].map(|row| [row * (1.0 - f), row * f]) }
+    /// Those of node `i` of `nu`, as [`around`] has them.
+    pub(super) fn new(i: (usize, usize), line0: usize, weights: [f32; 2], goes_on: bool) -> Self {
+        let (lines, [f, fv]) = around(i, line0, weights, goes_on);
+        Self { lines, weights: [1.0 - fv, fv].map(|row| [row * (1.0 - f), row * f]) }
     }
 
     /// The mean of `light`, of the lines that have a sample if some have none: those stand for the others.
@@ -560,7 +556,7 @@ mod tests {
         let light = [&light[0][..], &light[1][..]];
         let (whole, f) = ([0; 3], [0.25, 0.75]);
         for i in 0..20 {
-            let around = Around::new((i, 20), 9, f);
+            let around = Around::new((i, 20), 9, f, true);
             // Line 9 + i lies by 0.25 before node i, and so does row 0 by 0.75 behind the other.
             let expected = 5.0 - (9.0 + i as f32 - 0.25) + 7.5;
             assert!((around.mean(light, [&whole, &whole]) - expected).abs() < 1e-5, "{i}");

@@ -72,6 +72,8 @@ struct Family<'a> {
     touched: &'a Touched<'a>,
     walls: arrive::Walls<'a>,
     way: Way,
+    /// As [`Sides::goes_on`].
+    goes_on: bool,
     /// The direction times what |ω·N| weighs.
     omega: [f32; 3],
 }
@@ -84,13 +86,13 @@ impl Family<'_> {
 
 impl Pass<'_> {
     /// Irradiance of every node of `side` from the radiance `b` of the nodes' sides (times `scale`), this one's first,
-    /// and the flats, along all `lines` and both their directions. Flats receive too. `tick` is asked before every
-    /// family; false stops with what is done.
+    /// and the flats, along all `lines` and both their directions; beyond the last lines it `goes_on` or not. Flats
+    /// receive too. `tick` is asked before every family; false stops with what is done.
     #[allow(clippy::too_many_arguments, reason = "one caller")]
     pub(super) fn gather(
         &self,
         side: Side,
-        lines: &[Shear],
+        (lines, goes_on): (&[Shear], bool),
         b: [&[Half4]; 2],
         scale: f32,
         flats: &Flats,
@@ -113,7 +115,7 @@ impl Pass<'_> {
                 complete = complete && tick();
                 if complete {
                     let walls = ((flats, &touched), &mut *incoming, arrivals);
-                    arrivals = self.family((side, shear, lines.len()), normals, (b, scale), &rows, walls);
+                    arrivals = self.family((side, shear, lines.len(), goes_on), normals, (b, scale), &rows, walls);
                 }
             }
             drop(rows);
@@ -156,7 +158,7 @@ impl Pass<'_> {
     /// does.
     fn family(
         &self,
-        (side, shear, lines): (Side, &Shear, usize),
+        (side, shear, lines, goes_on): (Side, &Shear, usize, bool),
         normals: &[u32],
         ([b, back], scale): ([&[Half4]; 2], f32),
         rows: &Rows,
@@ -176,6 +178,7 @@ impl Pass<'_> {
             flats,
             touched,
             way: Way { strict: side == Side::Higher, sign, capped: capped(self.scene) },
+            goes_on,
             omega: (shear.omega * share).as_vec3().to_array(),
             walls,
         };
@@ -348,6 +351,7 @@ impl Pass<'_> {
             ends,
             line0,
             weights: [fu, fv],
+            goes_on: family.goes_on,
             stands: family.light(),
             touched: family.touched,
         };
@@ -390,7 +394,7 @@ impl Pass<'_> {
         for &i in rims.map_or(&[][..], |rims| rims.within(at / nu, 0, nu)) {
             let i = i as usize;
             let cos = cosine(family.omega, n[i]);
-            let lines = Around::new((i, nu), line0, [fu, fv]);
+            let lines = Around::new((i, nu), line0, [fu, fv], family.goes_on);
             for (c, e) in [&mut e0[..], &mut e1[..], &mut e2[..]].into_iter().enumerate() {
                 e[i] += cos * lines.mean([light[0][c], light[1][c]], gaps);
             }

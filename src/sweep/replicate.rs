@@ -200,7 +200,12 @@ impl Run<'_> {
             };
             let mut by_few = None;
             let mut complete = true;
-            for lines in [few, lines].iter().filter(|lines| !lines.is_empty()) {
+            // What goes on linearly may grow from bounce to bounce where light is rough, and what is nearest cannot:
+            // until light has settled, that does.
+            for (lines, goes_on) in [(&few, false), (&lines, kind != Kind::Coarse)] {
+                if lines.is_empty() {
+                    continue;
+                }
                 if !indirect.is_empty() {
                     let nodes: Vec<_> = indirect.iter().map(|e| HalfPlanes::new(e, 1.0, None)).collect();
                     by_few = Some((nodes, flats.indirect()));
@@ -210,7 +215,8 @@ impl Run<'_> {
                 for (n, &side) in self.sides.iter().enumerate() {
                     // Each and, where there are two, the other.
                     let b = [n, 1 - n].map(|n| now.light.b.get(n).map_or(&[][..], |b| &b[..]));
-                    let (e, all) = pass.gather(side, lines, b, now.light.unit, flats, &mut incoming, &mut ask);
+                    let (e, all) =
+                        pass.gather(side, (lines, goes_on), b, now.light.unit, flats, &mut incoming, &mut ask);
                     complete &= all;
                     indirect.push(e);
                 }

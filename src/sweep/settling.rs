@@ -117,8 +117,8 @@ impl Settling {
         self.omega[3] = self.omega[2];
         for c in 0..3 {
             let indirect = (sums.light[c] - self.first[c]).max(f64::MIN_POSITIVE);
-            self.share[c] = sums.change[c] / indirect;
-            self.drift[c] = sums.drift[c].abs() / indirect;
+            let share = |x: f64| if sums.light[c].is_finite() { x / indirect } else { f64::INFINITY };
+            (self.share[c], self.drift[c]) = (share(sums.change[c]), share(sums.drift[c].abs()));
             let [old, _, new] = self.changes.map(|change| change[c]);
             let known = old > 0.0 || self.radius[c] > 0.0;
             if self.passes < KNOWN || !(known && new > 0.0) {
@@ -164,7 +164,9 @@ impl Settling {
     #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, reason = "few passes")]
     pub(super) fn missing(&self, more: usize) -> Option<f64> {
         let after = (1 + self.since + more) as i32;
-        let left = |share: f64, r: f64| share * r.powi(after) / (1.0 - r);
+        // Light that has grown beyond all numbers, of which no share is left, does not settle.
+        let left =
+            |share: f64, r: f64| if share.is_finite() { share * r.powi(after) / (1.0 - r) } else { f64::INFINITY };
         let of = |c: usize| left(self.drift[c], self.radius[c]).max(left(self.share[c], self.radius[c].min(OTHERS)));
         (self.passes >= KNOWN).then(|| (0..3).map(of).fold(0.0, f64::max))
     }
@@ -178,6 +180,23 @@ mod tests {
     const N: usize = 64;
     /// Modulus of the operators.
     const R: f64 = 0.7;
+
+    /// Each bounce brighter than the one before, until sums are no numbers any more, or changes are none, or both.
+    #[test]
+    fn light_that_grows_never_settles() {
+        for (rate, over) in [(1.5f64, 1e35), (1.5, f64::INFINITY), (1.5, f64::NAN), (1e30, f64::NAN)] {
+            let mut settling = Settling::new([1.0; 3]);
+            for n in 0..400 {
+                let light = rate.powi(n);
+                let most = f64::from(f32::MAX);
+                let sum = if light > most { f64::INFINITY } else { light };
+                let change = if light > most { over } else { light * (1.0 - 1.0 / rate) };
+                settling.push(Sums { light: [sum; 3], change: [change; 3], drift: [change; 3] });
+                let missing = settling.missing(2);
+                assert!(missing.is_none_or(|missing| missing > 1.0), "{n}: {missing:?}");
+            }
+        }
+    }
 
     /// The light of one node, before any of it spreads.
     fn direct() -> Vec<f64> {

@@ -77,7 +77,7 @@ impl State {
             // From the light of replicates before.
             None if passes.late > 0 => 0.0,
             // Of all there will be, not of what there is.
-            missing => missing.map_or(f64::NAN, |m| m / (1.0 + m)),
+            missing => missing.map_or(f64::NAN, |m| 1.0 - 1.0 / (1.0 + m)),
         };
         // f64::max passes over NaN.
         if missing.is_nan() || missing > self.residual {

@@ -3,12 +3,14 @@
 use super::{bumps, emissive_box, nodes, rms, run};
 use glam::DVec3;
 use isolume::embree::{Device, GraphTracer};
+use isolume::field::{Field, Sweep};
 use isolume::flattened::Side;
 use isolume::polygon::Polygon;
 use isolume::reference::{PathTracer, receiver};
+use isolume::rng::{Rng, Stage};
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
 use isolume::sweep::SweepSettings;
-use isolume::volume::Lattice;
+use isolume::volume::{Lattice, Samples, Volume};
 use rayon::prelude::*;
 use std::f64::consts::PI;
 
@@ -158,6 +160,34 @@ fn bright_rooms_have_all_their_bounces() {
             SweepSettings { directions: 32, light_points: 4, replicates: 1, max_bounces, ..SweepSettings::default() };
         let got = run(&scene, SweepSettings { target: 1e-6, ..settings });
         assert_eq!(got.bounces, max_bounces);
+    }
+}
+
+/// Noise that Ω's faces cut all over, along few directions: light is between that of surfaces that see nothing and of
+/// those that see nothing else, or hardly more. What goes on linearly from the lines beside faces grew from bounce to
+/// bounce, up to 10¹².
+#[test]
+fn rough_light_settles() {
+    for (dims, spacing, seed) in [
+        ([12, 20, 4], [1.0, 10.0, 3.0], 1),
+        ([3, 33, 20], [1.0, 0.5, 1.0], 2),
+        ([2, 9, 16], [1.0; 3], 3),
+        ([3, 3, 3], [3.0, 1.0, 1.0], 4),
+        ([24, 5, 5], [1.0; 3], 5),
+    ] {
+        let mut rng = Rng::stream(seed, Stage::Test, 0);
+        let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::from_array(spacing)).unwrap();
+        let samples = (0..lattice.len()).map(|_| rng.unit() as f32).collect();
+        let volume = Volume::new("noise", lattice, Samples::F32(samples)).unwrap();
+        let f = Field::new(&volume, Sweep::new(0.02, 0.5).unwrap()).unwrap();
+        let surface = Surface { albedo: DVec3::splat(0.75).into(), emission: DVec3::ONE, ..Surface::default() };
+        let scene = Scene::new(f, surface, Boundary::Open, Vec::new()).unwrap();
+        let settings = SweepSettings { directions: 8, light_points: 2, seed, ..SweepSettings::default() };
+        let got = run(&scene, settings);
+        let light = got.sides[0].irradiance.iter().map(|e| 1.0 + f64::from(e[1]) * 0.75 / PI);
+        let greatest = light.fold(0.0, f64::max);
+        println!("{dims:?}: {} bounces, {greatest:.2}, {:.4} may be missing", got.bounces, got.residual);
+        assert!(got.bounces < 30 && greatest < 6.0 && got.residual < SweepSettings::default().target);
     }
 }
 
