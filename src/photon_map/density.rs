@@ -69,6 +69,8 @@ pub(super) struct PhotonDensity<'a> {
     light: Vec<Light>,
     /// World edge of a cube of a cell's volume.
     edge: f64,
+    /// The mean measure of a bin.
+    enough: f32,
 }
 
 /// Radii in bins: the least, which reaches the next bins, the largest.
@@ -80,6 +82,8 @@ const MARGIN: f32 = 1.15;
 /// in runs of so many bins, so that the threads' number does not tell, the first of which has none before it.
 const RUN: usize = 512;
 const FIRST: f32 = 1.75;
+/// What radii grow by where bins are few.
+const WIDER: f32 = 1.5;
 /// Photons of an estimate per photon of a bin, and how many photons bins are meant to hold on average. Fewer would take
 /// longer to fit than to trace.
 const SHARE: f64 = 8.0;
@@ -131,7 +135,8 @@ impl<'a> PhotonDensity<'a> {
         let cells = Cells::new(factor, dims);
         let (starts, bins) = measure::bins(field, &cells, settings.tau);
         let edge = (volume * factor.iter().product::<usize>() as f64).cbrt();
-        let mut density = Self { field, settings, cells, starts, bins, light: Vec::new(), edge };
+        let enough = bins.iter().map(|bin| bin.measure).sum::<f32>() / bins.len().max(1) as f32;
+        let mut density = Self { field, settings, cells, starts, bins, light: Vec::new(), edge, enough };
         let tallies = density.tallies(photons, keep, lattice.unit().powi(-2) as f32);
         let (mut light, isa) = (vec![Light::default(); density.bins.len()], Isa::current());
         let runs = light.par_chunks_mut(RUN).zip(density.bins.par_chunks(RUN));
@@ -259,11 +264,17 @@ impl<'a> PhotonDensity<'a> {
             self.alike(at, known, near);
             photons = count(near);
         }
-        let radius = (known * (wanted / photons.max(1.0)).cbrt()).clamp(LEAST, MOST);
+        let mut radius = (known * (wanted / photons.max(1.0)).cbrt()).clamp(LEAST, MOST);
         if radius > known {
             self.alike(at, radius, near);
         }
         near.retain(|n| n.d2 < radius * radius);
+        // Of a bin that level sets hardly touch a few points do not tell the measure: many photons on little of it may
+        // be as many on more.
+        while radius < MOST && near.iter().map(|n| self.bins[n.number as usize].measure).sum::<f32>() < self.enough {
+            radius = (WIDER * radius).min(MOST);
+            self.alike(at, radius, near);
+        }
         let scale = 1.0 / radius;
         let kernel = |d2: f32| 1.0 - d2 * scale * scale;
         let mut fit = Fit::default();
@@ -335,6 +346,10 @@ impl<'a> PhotonDensity<'a> {
     }
 }
 
+/// Light that is linear over a ball of bins, of which as little as an eighth is there, is at most so many times as
+/// bright as its mean.
+const FAR_ABOVE: f32 = 4.0;
+
 /// Weighted least squares of density against (1, d), d in radii.
 #[derive(Default)]
 struct Fit {
@@ -352,18 +367,19 @@ impl Fit {
     }
 
     /// The value at d = 0, its slope, and what to multiply K P (1, d) with for a place's part of the value; `None`
-    /// without measure. A channel that the slope would drive below 0 falls back to the mean.
+    /// without measure. A channel that the slope would drive below 0 or far above the mean falls back to the mean.
     fn solve(&self) -> Option<(Vec3, [Vec3; 3], Vec4)> {
         let weight = self.measure.weight();
         if weight <= 0.0 {
             return None;
         }
+        let mean = self.power.total() / weight;
         let inverse = self.measure.inverse();
         let of = |g: DVec4| self.power.fitted(g).as_vec3();
         let value = of(inverse.x_axis);
-        let lit = value.cmpge(Vec3::ZERO);
+        let lit = value.cmpge(Vec3::ZERO) & value.cmple(FAR_ABOVE * mean);
         let slope = [inverse.y_axis, inverse.z_axis, inverse.w_axis].map(|g| Vec3::select(lit, of(g), Vec3::ZERO));
-        Some((Vec3::select(lit, value, self.power.total() / weight), slope, inverse.x_axis.as_vec4()))
+        Some((Vec3::select(lit, value, mean), slope, inverse.x_axis.as_vec4()))
     }
 }
 
