@@ -186,6 +186,7 @@ impl Fan {
     #[inline(always)]
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the fan")]
     fn row_of(&self, j: i32, k: f64) -> usize {
+        // A node as good as at the source lies before the first slice.
         let step = (k as usize).abs_diff(self.slices.0).min(self.slices.1 - 1);
         self.begin + (j as usize * self.slices.1 + step) * self.count[0]
     }
