@@ -62,6 +62,7 @@ use reflect::Mirror;
 pub(crate) use replicate::bright;
 use slits::Slits;
 use state::State;
+use totals::Focus;
 
 /// How to sweep.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -259,6 +260,8 @@ pub fn sweep_resumable(
         saved,
         spare: &spare,
     };
+    let dims = scene.lattice().dims();
+    let focus = Focus { dims, lit: |at| geometry.lit(at) };
     let mut stopped = !run.direct(&mut state, &mut flats, tick);
     while state.done < replicates && !stopped {
         let done = state.done as f64;
@@ -266,7 +269,7 @@ pub fn sweep_resumable(
         let (indirect, complete) = run.replicate(&mut state, passes.take(), &mut flats, &progress);
         stopped = !complete;
         if complete {
-            state.add(&indirect, &flats, scene);
+            state.add(&indirect, &flats, (scene, &focus));
             spare.keep(indirect.into_iter().flatten());
         }
     }
@@ -288,7 +291,7 @@ pub fn sweep_resumable(
         })
     });
     let flats = flats.collect();
-    let mut sides = total.finish(&lit, done);
+    let mut sides = total.finish(&Focus { dims, lit: |at| lit[at] }, done);
     let world = |o: usize| scene.lattice().to_world(DVec3::from_array(scene.lattice().ijk(o).map(|i| i as f64)));
     let dark = slits.hidden.iter().map(|hidden| hidden.0).filter(|&o| scene.covers(world(o)));
     for o in dark {

@@ -111,11 +111,37 @@ fn lanes(i: isize, nu: usize) -> (usize, usize) {
     ((-i).clamp(0, LANES as isize) as usize, (nu as isize - 1 - i).clamp(0, LANES as isize) as usize)
 }
 
+/// ε of [`Pack::choose`]: of nodes that are off by less than a tenth of the usual none is much likelier than its
+/// weight.
+const LEVEL: f32 = 0.01;
+
+/// `x`, or `most` if it is greater or no number.
+#[inline(always)]
+fn at_most(most: f32, x: f32) -> f32 {
+    if x < most { x } else { most }
+}
+
 /// Weights of the four samples around a line, at those offsets.
 #[derive(Clone, Copy)]
 struct Taps {
     at: [isize; 4],
     weight: [f32; 4],
+}
+
+impl Taps {
+    /// The samples of sixteen lines, those of lines outside Ω from a neighbouring row; `None` if memory ends amid them.
+    #[inline(always)]
+    fn rows<'a>(&self, h: &'a [f32]) -> Option<[&'a Lanes; 4]> {
+        let [t0, t1, t2, t3] = self.at;
+        let lanes = |t: isize| -> &Lanes { h[t.unsigned_abs()..][..LANES].try_into().expect("sixteen lanes") };
+        (t0 >= 0 && t3.unsigned_abs() + LANES <= h.len()).then(|| [lanes(t0), lanes(t1), lanes(t2), lanes(t3)])
+    }
+
+    /// Copies of them, as far as memory goes.
+    fn copies(&self, h: &[f32]) -> [Lanes; 4] {
+        let last = h.len() as isize - 1;
+        self.at.map(|t| std::array::from_fn(|l| h[(t + l as isize).clamp(0, last).unsigned_abs()]))
+    }
 }
 
 /// Σ weight · x over four rows. (Loops, since closures given to the library are not compiled for the instruction set.)
@@ -148,9 +174,9 @@ pub(super) struct Cut {
 /// line's entry and exit through Ω's sides stand in the rows before its first and after its last slice.
 pub(super) struct Pack {
     pub h: Vec<Lanes>,
-    /// Which node's B stands for that of each sample: per row one of the four around the line, each as likely as
-    /// bilinear interpolation weighs it. Neighbouring nodes differ little and every ray meets others, so that the mean
-    /// is what interpolation gives at a quarter of the work.
+    /// Which node's B stands for that of each sample: one of the four around the line, each the likelier the nearer it
+    /// is, in place and above all in isovalue ([`Pack::choose`]). Neighbouring nodes differ little and every ray meets
+    /// others, so that the mean is what interpolation gives at a quarter of the work.
     pub node: Vec<[u32; LANES]>,
     /// Per direction (+, −), the number 16 · row + lane of the sample that the ray from each sample meets, and h there;
     /// from [`Pack::ends`] on the place of an end in [`Flats::packed`], and ∞.
@@ -271,9 +297,17 @@ impl Pack {
                 at: [at, at + 1, at + sv as isize, at + sv as isize + 1],
                 weight: [(1.0 - fu) * (1.0 - fv), fu * (1.0 - fv), (1.0 - fu) * fv, fu * fv],
             };
-            self.take(&taps, plan.sign, source.h, k + 1, (lo, hi));
             let place = i * node[0] as isize + j * node[1] as isize + (k * node[2]) as isize;
-            self.choose(&taps.weight, place, [node[0], node[1], last], dither(seed, 2 * LANES + k), k + 1);
+            let copies;
+            let rows = if let Some(rows) = taps.rows(source.h) {
+                rows
+            } else {
+                copies = taps.copies(source.h);
+                copies.each_ref()
+            };
+            self.take(&taps.weight, plan.sign, rows, k + 1, (lo, hi));
+            let random = dither(seed, 2 * LANES + k);
+            self.choose(&taps.weight, plan.sign, rows, (place, [node[0], node[1], last]), random, k + 1);
             self.is_awake[k + 1] = true;
             inside &= hi - lo == LANES && self.beside(plan, k, (first, q)) == [(0, LANES); 2];
         }
@@ -344,44 +378,52 @@ impl Pack {
 
     /// Reads one row, lanes `lo..hi` of which lie in Ω.
     #[inline(always)]
-    fn take(&mut self, taps: &Taps, sign: f32, h: &[f32], row: usize, (lo, hi): (usize, usize)) {
+    fn take(&mut self, weight: &[f32; 4], sign: f32, rows: [&Lanes; 4], row: usize, (lo, hi): (usize, usize)) {
         let line = &mut self.h[row];
-        let [w0, w1, w2, w3] = taps.weight;
-        let weight = [w0 * sign, w1 * sign, w2 * sign, w3 * sign];
-        let [t0, t1, t2, t3] = taps.at;
-        // Whole packs wherever memory allows: lanes outside Ω read a neighbouring row and are blanked.
-        if t0 >= 0 && t3.unsigned_abs() + LANES <= h.len() {
-            let lanes =
-                |t: isize| -> &[f32; LANES] { h[t.unsigned_abs()..][..LANES].try_into().expect("sixteen lanes") };
-            mix(weight, [lanes(t0), lanes(t1), lanes(t2), lanes(t3)], line);
-            if hi - lo < LANES {
-                blank(line, lo, hi);
-            }
-        } else {
-            *line = [OUTSIDE; LANES];
-            for l in lo..hi {
-                let at = |t: isize| h[(t + l as isize).unsigned_abs()];
-                line[l] = (weight[0] * at(t0) + weight[1] * at(t1)) + (weight[2] * at(t2) + weight[3] * at(t3));
-            }
+        let [w0, w1, w2, w3] = *weight;
+        mix([w0 * sign, w1 * sign, w2 * sign, w3 * sign], rows, line);
+        if hi - lo < LANES {
+            blank(line, lo, hi);
         }
     }
 
     /// Picks the nodes whose B the samples of a row have, from node `first` on: by the strides along u and v and the
-    /// number of the last node there is.
+    /// number of the last node there is. A node is as likely as w / (d² + ε Σ w d²), w being its bilinear weight and d
+    /// how far its isovalue is from the sample's; so by w where all are as far off. Light mostly changes faster from
+    /// level set to level set than along one, and what a bounce reads from others the next one carries on.
     #[inline(always)]
     #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, reason = "lanes in Ω meet nodes in Ω")]
     #[allow(clippy::cast_sign_loss, reason = "as above")]
-    fn choose(&mut self, weight: &[f32; 4], first: isize, node: [usize; 3], random: f32, row: usize) {
-        let [u, v, last] = node;
-        let last = last as i32;
-        let [w0, w1, w2, _] = *weight;
-        // Which it is nobody can foretell: counted, not searched for.
-        let number = [w0, w0 + w1, w0 + w1 + w2].iter().map(|w| usize::from(random >= *w)).sum::<usize>();
-        let at = (first + (number % 2 * u + number / 2 * v) as isize) as i32;
-        let u = u as i32;
+    fn choose(
+        &mut self,
+        weight: &[f32; 4],
+        sign: f32,
+        [h0, h1, h2, h3]: [&Lanes; 4],
+        (first, [u, v, last]): (isize, [usize; 3]),
+        random: f32,
+        row: usize,
+    ) {
+        let (first, u, v, last) = (first as i32, u as i32, v as i32, last as i32);
+        let [w0, w1, w2, w3] = *weight;
+        let line = &self.h[row];
+        let node = &mut self.node[row];
         for l in 0..LANES {
+            let h = sign * line[l];
+            let squared = |x: f32| at_most(1e30, x * x);
+            let [d0, d1, d2, d3] = [squared(h0[l] - h), squared(h1[l] - h), squared(h2[l] - h), squared(h3[l] - h)];
+            let mean = (w0 * d0 + w1 * d1) + (w2 * d2 + w3 * d3);
+            let scale = 1.0 / (mean + f32::MIN_POSITIVE);
+            // All times the product of the four, so that one division does.
+            let off = |d: f32| at_most(1e9, d * scale) + LEVEL;
+            let [d0, d1, d2, d3] = [off(d0), off(d1), off(d2), off(d3)];
+            let (near, far) = (d0 * d1, d2 * d3);
+            let [p0, p1, p2, p3] = [w0 * (d1 * far), w1 * (d0 * far), w2 * (near * d3), w3 * (near * d2)];
+            let x = random * ((p0 + p1) + (p2 + p3));
+            // Which it is nobody can foretell: counted, not searched for.
+            let number = i32::from(x >= p0) + i32::from(x >= p0 + p1) + i32::from(x >= (p0 + p1) + p2);
+            let at = first + (l as i32 + (number & 1)) * u + (number >> 1) * v;
             // Lanes outside Ω name any node.
-            self.node[row][l] = (at + l as i32 * u).max(0).min(last) as u32;
+            node[l] = at.max(0).min(last) as u32;
         }
     }
 

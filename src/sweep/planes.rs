@@ -94,6 +94,12 @@ impl HalfPlanes {
         decode(self.planes[c][node]) / self.unit
     }
 
+    /// The light of a node.
+    #[inline(always)]
+    pub(super) fn all(&self, node: usize) -> [f32; 3] {
+        std::array::from_fn(|c| self.at(c, node))
+    }
+
     /// `light` less this, in its memory.
     pub(super) fn short_of(self, light: &Planes) -> SignedPlanes {
         let mut planes = self.planes;

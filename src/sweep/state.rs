@@ -6,7 +6,7 @@ use super::half::Half4;
 use super::planes::{HalfPlanes, Planes, SignedPlanes};
 use super::reflect::Reflected;
 use super::settling::Settling;
-use super::totals::{Totals, stride};
+use super::totals::{Focus, Totals, stride};
 use crate::flattened::Side;
 use crate::scene::Scene;
 use ::half::bf16;
@@ -55,8 +55,13 @@ impl State {
     }
 
     /// Adds the indirect light of a replicate and what it left on the flats.
-    pub(super) fn add(&mut self, indirect: &[Planes], flats: &Flats, scene: &Scene) {
-        self.total.add(indirect, scene);
+    pub(super) fn add<L: Fn(usize) -> bool + Sync>(
+        &mut self,
+        indirect: &[Planes],
+        flats: &Flats,
+        (scene, focus): (&Scene, &Focus<L>),
+    ) {
+        self.total.add(indirect, scene, focus);
         let radiance = || flats.textures.iter().map(|t| t.as_ref().map(|t| &t.radiance));
         if self.done == 0 {
             self.flats = radiance().map(Option::<&Vec<f32>>::cloned).collect();

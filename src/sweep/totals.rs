@@ -2,6 +2,7 @@
 
 use super::SweptSide;
 use super::planes::{HalfPlanes, Planes};
+use super::reflect::RECEIVING;
 use crate::flattened::Side;
 use crate::scene::Scene;
 use ::half::bf16;
@@ -13,6 +14,36 @@ use std::f32::consts::PI;
 /// all.
 pub(super) fn stride(nodes: usize) -> usize {
     (nodes >> 16).max(16)
+}
+
+/// What gathered light is without the blur of nodes that take four lines each: along axes on both sides of which nodes
+/// are lit, [`RECEIVING`] of its second differences is taken off.
+pub(super) struct Focus<L> {
+    /// Nodes along x, y and z.
+    pub(super) dims: [usize; 3],
+    /// Whether a node is lit.
+    pub(super) lit: L,
+}
+
+impl<L: Fn(usize) -> bool> Focus<L> {
+    /// Of a lit node and what `light` tells of it and of others.
+    #[inline]
+    fn focused<const N: usize>(&self, node: usize, light: impl Fn(usize) -> [f32; N]) -> [f32; N] {
+        let here = light(node);
+        let mut sharp = here;
+        let mut step = 1;
+        for n in self.dims {
+            let inner = (1..n - 1).contains(&(node / step % n));
+            if inner && (self.lit)(node - step) && (self.lit)(node + step) {
+                let (before, behind) = (light(node - step), light(node + step));
+                for c in 0..N {
+                    sharp[c] -= RECEIVING * ((before[c] - here[c]) + (behind[c] - here[c]));
+                }
+            }
+            step *= n;
+        }
+        sharp
+    }
 }
 
 /// Sums over replicates.
@@ -62,8 +93,8 @@ impl Totals {
         self.lit += 1;
         let before = 1.0 / (self.lit - 1) as f32;
         let lighting = std::mem::take(&mut self.lighting);
-        let mean = |s: usize, c: usize, i: usize| before * lighting[s][c][i];
-        self.deviate(scene, &new, self.lit, mean);
+        let mean = |s: usize, i: usize| [0, 1, 2].map(|c| before * lighting[s][c][i]);
+        self.deviate(scene, &new, self.lit, mean, None::<&Focus<fn(usize) -> bool>>);
         self.lighting = lighting;
         if self.lighting.is_empty() {
             self.lighting = new;
@@ -83,27 +114,29 @@ impl Totals {
     }
 
     /// Takes the indirect irradiance of a replicate, or nothing if there is none.
-    pub(super) fn add(&mut self, new: &[Planes], scene: &Scene) {
+    pub(super) fn add<L: Fn(usize) -> bool + Sync>(&mut self, new: &[Planes], scene: &Scene, focus: &Focus<L>) {
         self.count += 1;
         if new.is_empty() {
             return;
         }
         let before = 1.0 / (self.count - 1) as f32;
         let light = std::mem::take(&mut self.light);
-        self.deviate(scene, new, self.count, |s, c, i| before * light[s].at(c, i));
+        let mean = |s: usize, i: usize| light[s].all(i).map(|x| before * x);
+        self.deviate(scene, new, self.count, mean, Some(focus));
         let mut old = light.into_iter();
         self.light = new.iter().map(|new| HalfPlanes::new(new, 1.0, old.next())).collect();
     }
 
-    /// Adds the deviations of the light of the replicate that is the `count`th of its kind, where `mean` (side,
-    /// channel, node) is that of those before.
+    /// Adds the deviations of the light of the replicate that is the `count`th of its kind, where `mean` (side, node)
+    /// is that of those before; in `focus`, if it will be.
     #[allow(clippy::cast_possible_truncation, reason = "albedo")]
-    fn deviate(
+    fn deviate<L: Fn(usize) -> bool + Sync>(
         &mut self,
         scene: &Scene,
         new: &[Planes],
         count: usize,
-        mean: impl Fn(usize, usize, usize) -> f32 + Sync,
+        mean: impl Fn(usize, usize) -> [f32; 3] + Sync,
+        focus: Option<&Focus<L>>,
     ) {
         if self.spread.is_empty() {
             return;
@@ -113,10 +146,14 @@ impl Totals {
         };
         let (albedo, h) = (&scene.surface.albedo, scene.field.samples());
         let same = (albedo.stops().len() == 1).then(|| luminance(albedo.at(0.0)));
-        let luminance = |i: usize| same.unwrap_or_else(|| luminance(albedo.at(f64::from(h[i]))));
-        let at = |planes: &Planes, i: usize| {
-            let luminance = luminance(i);
-            (0..3).map(|c| luminance[c] * planes[c][i]).sum::<f32>()
+        let luminance = |i: usize, light: [f32; 3]| -> f32 {
+            let luminance = same.unwrap_or_else(|| luminance(albedo.at(f64::from(h[i]))));
+            (0..3).map(|c| luminance[c] * light[c]).sum()
+        };
+        let all = |planes: &Planes, i: usize| [0, 1, 2].map(|c| planes[c][i]);
+        let at = |planes: &Planes, i: usize| match focus.filter(|focus| (focus.lit)(i)) {
+            Some(focus) => luminance(i, focus.focused(i, |i| all(planes, i))),
+            None => luminance(i, all(planes, i)),
         };
         let nodes = (0..self.nodes).step_by(stride(self.nodes));
         let part = new[..self.stored].iter().flat_map(|planes| nodes.clone().map(|i| at(planes, i)));
@@ -131,9 +168,16 @@ impl Totals {
         // (x − mean of those before)² (n − 1)/n.
         let share = (count - 1) as f32 / count as f32;
         for (s, (spread, new)) in self.spread.iter_mut().zip(new).enumerate() {
+            let deviation = |i: usize| {
+                let (new, mean) = (all(new, i), mean(s, i));
+                luminance(i, [0, 1, 2].map(|c| new[c] - mean[c]))
+            };
+            let deviations: Vec<f32> = (0..self.nodes).into_par_iter().with_min_len(1 << 12).map(deviation).collect();
             spread.par_iter_mut().enumerate().with_min_len(1 << 12).for_each(|(i, root)| {
-                let luminance = luminance(i);
-                let d: f32 = (0..3).map(|c| luminance[c] * (new[c][i] - mean(s, c, i))).sum();
+                let d = match focus {
+                    Some(focus) if (focus.lit)(i) => focus.focused(i, |i| [deviations[i]])[0],
+                    _ => deviations[i],
+                };
                 let before = root.to_f32();
                 if d != 0.0 {
                     *root = bf16::from_f32((before * before + share * d * d).sqrt());
@@ -142,23 +186,25 @@ impl Totals {
         }
     }
 
-    /// What `done` replicates gave; of fewer than all the direct light of all that were lit.
+    /// What `done` replicates gave at the nodes that are lit, gathered light in focus; of fewer than all the direct
+    /// light of all that were lit, as it is, since borders of shadows would ring.
     #[allow(clippy::cast_possible_truncation, reason = "a factor of at most 1")]
-    pub(super) fn finish(self, lit: &[bool], done: usize) -> Vec<SweptSide> {
+    pub(super) fn finish<L: Fn(usize) -> bool + Sync>(self, focus: &Focus<L>, done: usize) -> Vec<SweptSide> {
         let scale = 1.0 / done.max(1) as f32;
         let together = together(&self.parts[..done.min(self.parts.len())]) as f32;
         let mut indirect = self.light.into_iter();
         let mut spread = self.spread.into_iter().filter(|_| done > 1);
-        let nodes = || lit.par_iter().enumerate().with_min_len(1 << 12);
+        let nodes = || (0..self.nodes).into_par_iter().with_min_len(1 << 12).map(|i| (i, (focus.lit)(i)));
         let side = |(&side, direct): (&Side, HalfPlanes)| {
             let light = indirect.next();
             let node = |i: usize| -> [f32; 3] {
-                std::array::from_fn(|c| direct.at(c, i) + light.as_ref().map_or(0.0, |light| scale * light.at(c, i)))
+                let gathered = light.as_ref().map_or([0.0; 3], |light| focus.focused(i, |i| light.all(i)));
+                std::array::from_fn(|c| direct.at(c, i) + scale * gathered[c].max(0.0))
             };
-            let irradiance = nodes().map(|(i, lit)| if *lit { node(i) } else { [0.0; 3] }).collect();
+            let irradiance = nodes().map(|(i, lit)| if lit { node(i) } else { [0.0; 3] }).collect();
             let factor = (together * scale / (done.max(2) - 1) as f32).sqrt();
             let error = |roots: Vec<bf16>| -> Vec<f32> {
-                nodes().map(|(i, lit)| if *lit { factor * roots[i].to_f32() } else { 0.0 }).collect()
+                nodes().map(|(i, lit)| if lit { factor * roots[i].to_f32() } else { 0.0 }).collect()
             };
             SweptSide { side, irradiance, std_error: spread.next().map(error).unwrap_or_default() }
         };

@@ -62,7 +62,7 @@ fn settled_light_misses_what_it_says() {
     // levels do.
     let room = |x, most| (DVec3::splat(x), closed_box(f.lattice(), DVec3::splat(x)), most, 0.01);
     let open = (DVec3::splat(0.75), default, [6, 9], 0.05);
-    for (albedo, walls, most, least) in [open, red, room(0.9, [27, 37]), room(0.97, [31, 47])] {
+    for (albedo, walls, most, least) in [open, red, room(0.9, [28, 40]), room(0.97, [32, 50])] {
         let surface = Surface { albedo: albedo.into(), ..Surface::default() };
         let scene = Scene::new(f.clone(), surface, Boundary::Open, walls).unwrap();
         let light = |max_bounces, target| {

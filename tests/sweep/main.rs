@@ -215,6 +215,37 @@ fn coarse_hollows_keep_their_light() {
     }
 }
 
+/// A shell with a dent: above half of its height level sets have a hole that lets light into the cavity, below it they
+/// are closed, and the cavity, four voxels wide, is dark for them. All light there is what lines read of other level
+/// sets, carried on by bounces of 0.9: 48 % of the mean of all nodes when they read any node around and light was
+/// sharpened by a third of its blur, 16 % now.
+#[test]
+fn closed_cavities_stay_dark() {
+    let lattice = Lattice::aligned([25; 3], DVec3::splat(-12.0), DVec3::ONE).unwrap();
+    let shell = |x: DVec3| {
+        let dent = 0.5 * (-((x.z / x.length().max(1e-9) - 1.0) / 0.15).powi(2)).exp();
+        (1.0 - dent) * (-((x.length() - 4.0) / 1.4).powi(2)).exp()
+    };
+    let f = field(lattice, (0.03, 0.97), shell);
+    let walls = cornell_box(f.lattice(), 0.0).unwrap();
+    let scene =
+        Scene::new(f, Surface { albedo: DVec3::splat(0.9).into(), ..Surface::default() }, Boundary::Open, walls)
+            .unwrap();
+    let got = run(&scene, SweepSettings { directions: 64, light_points: 16, ..SweepSettings::default() });
+    let (mut dark, mut all) = ([0.0; 2], [0.0; 2]);
+    for o in nodes(&scene, 0) {
+        let x = scene.lattice().to_world(DVec3::from_array(scene.lattice().ijk(o).map(|i| i as f64)));
+        let light = f64::from(got.sides[0].irradiance[o][1]);
+        all = [all[0] + light, all[1] + 1.0];
+        if x.length() < 4.0 && scene.field.samples()[o] < 0.45 {
+            dark = [dark[0] + light, dark[1] + 1.0];
+        }
+    }
+    let share = dark[0] / dark[1] / (all[0] / all[1]);
+    println!("{} nodes in the cavity have {:.1} % of the mean of {}", dark[1], 100.0 * share, all[1]);
+    assert!(dark[1] > 50.0 && share < 0.2, "{share}");
+}
+
 /// Walls on Ω's faces that all emit.
 fn emissive_box(lattice: &Lattice, albedo: f64, emission: f64) -> Vec<Polygon> {
     let far = lattice.far();
