@@ -247,6 +247,34 @@ mod tests {
     use super::*;
     use crate::rng::{Rng, Stage};
 
+    /// Light that curves loses its share of the curvature, along axes on both sides of which nodes are lit; light that
+    /// rises evenly stays as it is, at ends, too.
+    #[test]
+    fn focus_takes_off_what_four_lines_blur() {
+        let dims = [5, 4, 2];
+        let place = |node: usize| [node % 5, node / 5 % 4, node / 20].map(|x| x as f32);
+        let dark = 2 + 5 * 3;
+        let focus = Focus { dims, lit: |node| node != dark };
+        for node in (0..40).filter(|node| *node != dark) {
+            let [even, curved] = focus.focused(node, |node| {
+                let [x, y, z] = place(node);
+                [1.0 + 2.0 * x - y + 3.0 * z, x * x - 4.0 * y * y + z * z]
+            });
+            let [x, y, z] = place(node);
+            assert!((even - (1.0 + 2.0 * x - y + 3.0 * z)).abs() < 1e-5, "{node}: {even}");
+            // Of the node that is dark those beside it along x and y want a neighbour.
+            let (along_x, along_y) = (z == 1.0 || y != 3.0 || (x - 2.0).abs() != 1.0, [x, y, z] != [2.0, 2.0, 0.0]);
+            let mut expected = x * x - 4.0 * y * y + z * z;
+            if (1.0..=3.0).contains(&x) && along_x {
+                expected -= 2.0 / 18.0;
+            }
+            if (1.0..=2.0).contains(&y) && along_y {
+                expected += 8.0 / 18.0;
+            }
+            assert!((curved - expected).abs() < 1e-4, "{node}: {curved} {expected}");
+        }
+    }
+
     /// Parts whose errors are drawn such that the squared error of `n` of them is `error(n)`.
     fn parts(count: usize, error: impl Fn(usize) -> f64) -> Vec<Vec<f32>> {
         let mut parts = vec![Vec::new(); count];
