@@ -338,7 +338,8 @@ mod tests {
             sum += f64::from(sharp[(node[2] * n + node[1]) * n + node[0]]) - at(x);
         }
         let mean = sum / f64::from(count);
-        assert!(mean.abs() < 0.02, "{mean}");
+        println!("off by {mean:.4}");
+        assert!(mean.abs() < 0.015, "{mean}");
     }
 
     /// What is even stays so, beside nodes that show nothing too.

@@ -172,11 +172,14 @@ impl Totals {
                 let (new, mean) = (all(new, i), mean(s, i));
                 luminance(i, [0, 1, 2].map(|c| new[c] - mean[c]))
             };
-            let deviations: Vec<f32> = (0..self.nodes).into_par_iter().with_min_len(1 << 12).map(deviation).collect();
+            // Known beforehand where a node's is put in focus by those beside it.
+            let nodes = || (0..self.nodes).into_par_iter().with_min_len(1 << 12);
+            let known = focus.map(|focus| (focus, nodes().map(deviation).collect::<Vec<f32>>()));
             spread.par_iter_mut().enumerate().with_min_len(1 << 12).for_each(|(i, root)| {
-                let d = match focus {
-                    Some(focus) if (focus.lit)(i) => focus.focused(i, |i| [deviations[i]])[0],
-                    _ => deviations[i],
+                let d = match &known {
+                    Some((focus, known)) if (focus.lit)(i) => focus.focused(i, |i| [known[i]])[0],
+                    Some((_, known)) => known[i],
+                    None => deviation(i),
                 };
                 let before = root.to_f32();
                 if d != 0.0 {
