@@ -8,7 +8,7 @@ pub use rows::{FieldRows, GradientRow};
 pub use sweep::{Shortest, Sweep, span};
 
 use crate::error::{Error, Result};
-use crate::neighbourhood::neighbourhood;
+use crate::neighbourhood::within;
 use crate::volume::{Lattice, Volume};
 use glam::DVec3;
 use rayon::prelude::*;
@@ -158,10 +158,11 @@ impl Field {
         [s[0], s[1], s[y], s[y + 1], s[z], s[z + 1], s[z + y], s[z + y + 1]]
     }
 
-    /// Least and greatest sample of the cells around node `o`; infinities of the wrong order if none is finite.
-    pub fn range_around(&self, o: usize) -> [f32; 2] {
+    /// Least and greatest sample within so many steps of node `o`, with one of the cells around it; infinities of the
+    /// wrong order if none is finite.
+    pub fn range_around(&self, o: usize, steps: usize) -> [f32; 2] {
         let (mut lo, mut hi) = (f32::INFINITY, f32::NEG_INFINITY);
-        for run in neighbourhood(self.lattice.dims(), o) {
+        for run in within(self.lattice.dims(), o, steps) {
             for &s in &self.samples[run] {
                 (lo, hi) = (lo.min(s), hi.max(s));
             }

@@ -5,6 +5,7 @@
 mod openings;
 mod flats;
 mod pools;
+mod sharpening;
 
 use crate::brdf::reflected;
 use crate::checkpoint;
@@ -24,6 +25,7 @@ use flats::{ByFlat, fill_flat};
 use glam::DVec3;
 use pools::Pools;
 use rayon::prelude::*;
+use sharpening::sharpen;
 use std::ops::RangeInclusive;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -48,10 +50,11 @@ type Nodes = [Option<Vec<[f32; 3]>>; 2];
 
 /// The nodes of one field that are filled.
 struct FieldNodes {
-    /// Those that hold something.
-    filled: NodeSet,
     /// Those that have room: if most are filled, all of them, which makes lookups faster.
     stored: NodeSet,
+    /// As they were filled, for the next band to take over.
+    filled: Nodes,
+    /// What gather rays find: sharpened.
     sides: Nodes,
 }
 
@@ -84,15 +87,17 @@ impl<'a> NodePhotons<'a> {
         self.maps[side.index()].as_ref()
     }
 
-    /// Nodes from which surfaces with isovalues in `band` are interpolated.
-    fn needed(&self, field: &Field, band: &RangeInclusive<f32>) -> NodeSet {
-        let whole = *band.start() <= 0.0 && *band.end() >= 1.0;
+    /// Nodes from which surfaces with isovalues in `band` are interpolated, and those and the ones beside them, against
+    /// which they are sharpened.
+    fn needed(&self, field: &Field, band: &RangeInclusive<f32>) -> [NodeSet; 2] {
         let (lo, hi) = (band.start() - MARGIN, band.end() + MARGIN);
-        let straddled = |o: usize| {
-            let [least, most] = field.range_around(o);
-            least <= hi && most >= lo
-        };
-        NodeSet::new(self.masks.len(), |o| self.masks[o] != Mask::Empty && (whole || straddled(o)))
+        [1, 2].map(|steps| {
+            let straddled = |o: usize| {
+                let [least, most] = field.range_around(o, steps);
+                least <= hi && most >= lo
+            };
+            NodeSet::new(self.masks.len(), |o| self.masks[o] != Mask::Empty && (whole(band) || straddled(o)))
+        })
     }
 
     /// What the nodes of the field's own lattice hold.
@@ -109,6 +114,11 @@ impl<'a> NodePhotons<'a> {
 
 /// Isovalues beyond a band, in units of the sweep, whose cells a hit may be rounded into.
 const MARGIN: f32 = 1e-4;
+
+/// Whether a band is the sweep.
+fn whole(band: &RangeInclusive<f32>) -> bool {
+    *band.start() <= 0.0 && *band.end() >= 1.0
+}
 
 /// Outgoing radiance (reflected and, for emitting level sets, emitted) wherever a gather ray can land.
 pub struct RadianceCache {
@@ -188,21 +198,28 @@ impl RadianceCache {
         tick: &(dyn Fn(u64) -> bool + Sync),
     ) {
         let rays = AtomicU64::new(0);
-        let points = scene.lattice().len();
-        let filled = source.needed(&scene.field, &band);
+        let (points, dims) = (scene.lattice().len(), scene.lattice().dims());
+        let [looked_at, filled] = source.needed(&scene.field, &band);
         // Of a whole sweep most nodes are filled as a rule; a band is to be small.
-        let stored = match band.contains(&0.0) && band.contains(&1.0) && 2 * filled.len() > points {
+        let stored = match whole(&band) && 2 * filled.len() > points {
             true => NodeSet::all(points),
             false => filled.clone(),
         };
         let mut old = self.nodes[scene.number()].take();
+        if let Some(old) = &mut old {
+            old.sides = Nodes::default();
+        }
         let fill = Fill { scene, tracer, settings, filled: &filled, stored: &stored, first, tick, rays: &rays };
+        let mut light = Nodes::default();
         let sides = [Side::Lower, Side::Higher].map(|side| {
-            let before = old.as_mut().and_then(|old| old.sides[side.index()].take());
-            let before = old.as_ref().zip(before.as_deref());
-            Some(fill.side(side, source.map(side)?, before, saved[side.index()]))
+            let before = old.as_mut().and_then(|old| old.filled[side.index()].take());
+            let before = old.as_ref().zip(before.as_deref()).map(|(old, values)| (&old.stored, values));
+            let filled = fill.side(side, source.map(side)?, before, saved[side.index()]);
+            let sharpened = sharpen(&stored, &filled, &looked_at, dims);
+            light[side.index()] = (!whole(&band)).then_some(filled);
+            Some(sharpened)
         });
-        self.nodes[scene.number()] = Some(FieldNodes { filled, stored, sides });
+        self.nodes[scene.number()] = Some(FieldNodes { stored, filled: light, sides });
         self.rays += rays.into_inner();
     }
 
@@ -216,11 +233,13 @@ impl RadianceCache {
         self.nodes.iter_mut().for_each(|n| *n = None);
     }
 
-    /// A cache of light known already: per side (lower, higher) irradiance / π at the nodes of the scene's lattice, NaN
-    /// where unknown, and the flats' radiance.
-    pub fn from_parts(nodes: Nodes, flats: Vec<Option<FlatTexture>>) -> Self {
-        let points = nodes.iter().flatten().map(Vec::len).next();
-        let nodes = points.map(|n| FieldNodes { filled: NodeSet::all(n), stored: NodeSet::all(n), sides: nodes });
+    /// A cache of light known already: per side (lower, higher) irradiance / π at the nodes of the scene's lattice, of
+    /// `dims` nodes along x, y and z, NaN where unknown, and the flats' radiance.
+    pub fn from_parts(nodes: Nodes, dims: [usize; 3], flats: Vec<Option<FlatTexture>>) -> Self {
+        let all = NodeSet::all(dims.iter().product());
+        let known = nodes.iter().any(Option::is_some);
+        let sides = nodes.map(|side| Some(sharpen(&all, &side?, &all, dims)));
+        let nodes = known.then(|| FieldNodes { stored: all, filled: Nodes::default(), sides });
         let within = vec![None; flats.len()];
         Self { nodes: vec![nodes], flats, within, shown: None, rays: 0 }
     }
@@ -239,13 +258,15 @@ impl RadianceCache {
         match target {
             Target::Surface(side) => {
                 let surface = &scene.surface;
-                let white = self.white(scene.number(), &scene.field, side, position, misses);
+                let at = (position, isovalue);
+                let white = self.white(scene.number(), &scene.field, side, at, misses);
                 surface.albedo.at(f64::from(isovalue)) * white + surface.emission
             }
             Target::Companion(n, side) => {
                 let c = &scene.companions()[usize::from(n)];
                 let surface = &c.member.surface;
-                let white = self.white(c.number, &c.member.field, side, c.to_index(position), misses);
+                let at = (c.to_index(position), isovalue);
+                let white = self.white(c.number, &c.member.field, side, at, misses);
                 surface.albedo.at(f64::from(isovalue)) * white + surface.emission
             }
             // Rays go on from there.
@@ -266,23 +287,43 @@ impl RadianceCache {
         within.or(self.flats[number].as_ref()).map_or(DVec3::ZERO, |t| t.lookup([u, v, f64::from(isovalue)]))
     }
 
-    /// What a white surface of field `number` would reflect: trilinear over the filled nodes of the cell.
-    fn white(&self, number: usize, field: &Field, side: Side, position: DVec3, misses: &mut u64) -> DVec3 {
+    /// What a white surface of field `number` would reflect where its level set `isovalue` is at a position: the mean
+    /// of the filled nodes of the cell. Each counts by w / (d² + ε Σ w d²), w being its trilinear weight and d how far
+    /// off its isovalue is; so by w where all are as far off. Light mostly changes faster from level set to level set
+    /// than along one.
+    fn white(
+        &self,
+        number: usize,
+        field: &Field,
+        side: Side,
+        (position, isovalue): (DVec3, f32),
+        misses: &mut u64,
+    ) -> DVec3 {
         let Some(nodes) = self.nodes.get(number).and_then(Option::as_ref) else { return DVec3::ZERO };
         let Some(values) = nodes.sides[side.index()].as_ref() else { return DVec3::ZERO };
         let ([i, j, k], u) = field.locate(position);
-        let (mut sum, mut weight) = (DVec3::ZERO, 0.0);
+        // What each has to say, w and d².
+        let (mut found, mut count) = ([(DVec3::ZERO, 0.0, 0.0); 8], 0);
         for row in 0..4 {
             let [y, z] = [row & 1, row >> 1];
             let across = (if y == 1 { u.y } else { 1.0 - u.y }, if z == 1 { u.z } else { 1.0 - u.z });
-            let slots = nodes.stored.pair(field.lattice().offset(i, j + y, k + z));
-            for (slot, along) in slots.into_iter().zip([1.0 - u.x, u.x]) {
+            let first = field.lattice().offset(i, j + y, k + z);
+            let slots = nodes.stored.pair(first);
+            for ((slot, along), h) in slots.into_iter().zip([1.0 - u.x, u.x]).zip(&field.samples()[first..]) {
                 let Some(value) = slot.map(|slot| values[slot]).filter(|v| !v[0].is_nan()) else { continue };
+                let off = f64::from(h - isovalue);
                 // 1e-6 keeps a hit at a node without surface on the others.
                 let w = along * across.0 * across.1 + 1e-6;
-                sum += w * DVec3::from_array(value.map(f64::from));
-                weight += w;
+                found[count] = (DVec3::from_array(value.map(f64::from)), w, (off * off).min(1e30));
+                count += 1;
             }
+        }
+        let found = &found[..count];
+        let around = LEVEL * found.iter().map(|&(_, w, off)| w * off).sum::<f64>() + 1e-30;
+        let (mut sum, mut weight) = (DVec3::ZERO, 0.0);
+        for &(value, w, off) in found {
+            let w = w / (off + around);
+            (sum, weight) = (sum + w * value, weight + w);
         }
         if weight > 0.0 {
             return sum / weight;
@@ -321,6 +362,9 @@ impl RadianceCache {
     }
 }
 
+/// ε of the weights by which the nodes of a cell count.
+const LEVEL: f64 = 0.1;
+
 /// So many steps beside a cell without filled nodes some are looked for. (A fluid's points just outside the sweep send
 /// a few rays in a hundred beyond 2 steps, one in a hundred beyond 5.)
 const BESIDE: usize = 5;
@@ -346,13 +390,13 @@ impl<T: Tracer> Fill<'_, T> {
         &self,
         side: Side,
         map: &PhotonMap<'_>,
-        before: Option<(&FieldNodes, &[[f32; 3]])>,
+        before: Option<(&NodeSet, &[[f32; 3]])>,
         saved: checkpoint::Stage<'_>,
     ) -> Vec<[f32; 3]> {
         let mut nodes = vec![[f32::NAN; 3]; self.stored.len()];
         let known = |o: usize| {
-            let (old, values) = before.filter(|(old, _)| old.filled.contains(o))?;
-            Some(values[old.stored.slot(o)?])
+            let (old, values) = before?;
+            Some(values[old.slot(o)?])
         };
         let points = self.scene.lattice().len();
         let rows = self.stored.split(&mut nodes, ROW);
@@ -433,6 +477,55 @@ mod tests {
     use crate::scene::{Boundary, Surface};
     use crate::volume::{Lattice, Samples, Volume};
 
+    /// A scene whose level sets are planes, a few in every cell.
+    fn planes() -> Scene {
+        let lattice = Lattice::aligned([9, 9, 9], DVec3::ZERO, DVec3::ONE).unwrap();
+        let at = |o: usize| lattice.ijk(o).map(|i| i as f64);
+        let samples = (0..lattice.len()).map(|o| (at(o)[0] + 0.9 * at(o)[1] + 1.1 * at(o)[2]) as f32).collect();
+        let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
+        let field = Field::new(&volume, Sweep::new(0.0, 24.0).unwrap()).unwrap();
+        Scene::new(field, Surface { albedo: DVec3::ONE.into(), ..Surface::default() }, Boundary::Open, vec![]).unwrap()
+    }
+
+    /// Σ|found − there| and Σ|trilinear − there| over places whose light is a function of the isovalue.
+    fn off(light: impl Fn(f64) -> f64) -> [f64; 2] {
+        let scene = planes();
+        let nodes: Vec<_> = scene.field.samples().iter().map(|h| [light(f64::from(*h)) as f32; 3]).collect();
+        let stored = NodeSet::all(nodes.len());
+        let field = FieldNodes { stored, filled: Nodes::default(), sides: [Some(nodes.clone()), None] };
+        let cache = RadianceCache { nodes: vec![Some(field)], flats: vec![], within: vec![], shown: None, rays: 0 };
+        let mut rng = crate::rng::Rng::stream(5, Stage::Test, 0);
+        let (mut sums, mut misses) = ([0.0; 2], 0);
+        for _ in 0..20_000 {
+            let x = 8.0 * DVec3::new(rng.unit(), rng.unit(), rng.unit());
+            let h = scene.field.value(x);
+            let found = cache.lookup(&scene, (Target::Surface(Side::Lower), false), x, h as f32, &mut misses).x;
+            let ([i, j, k], u) = scene.field.locate(x);
+            let trilinear: f64 = (0..8)
+                .map(|n| {
+                    let at = [n & 1, n >> 1 & 1, n >> 2];
+                    let w: f64 = (0..3).map(|a| if at[a] == 1 { u[a] } else { 1.0 - u[a] }).product();
+                    w * f64::from(nodes[scene.lattice().offset(i + at[0], j + at[1], k + at[2])][0])
+                })
+                .sum();
+            sums[0] += (found - light(h)).abs();
+            sums[1] += (trilinear - light(h)).abs();
+        }
+        assert_eq!(misses, 0);
+        sums
+    }
+
+    /// Where one level set is lit and the next one is not a hit finds the light of its own; what grows evenly is found
+    /// about as closely as by trilinear weights.
+    #[test]
+    fn hits_find_the_light_of_their_own_level_set() {
+        let edge = off(|h| if h < 0.5 { 0.0 } else { 1.0 });
+        let even = off(|h| h.powi(6));
+        println!("off by {edge:.1?} at an edge, {even:.1?} of what grows evenly (without and with trilinear weights)");
+        assert!(edge[0] < 0.6 * edge[1], "{edge:?}");
+        assert!(even[0] < 1.5 * even[1], "{even:?}");
+    }
+
     /// Light at two nodes of a row: beside them their mean, nearest first, and nothing farther off.
     #[test]
     fn cells_beside_filled_nodes_find_the_nearest() {
@@ -445,7 +538,7 @@ mod tests {
         let mut nodes = vec![[f32::NAN; 3]; lattice.len()];
         nodes[lattice.offset(9, 1, 1)] = [1.0; 3];
         nodes[lattice.offset(9, 2, 1)] = [3.0; 3];
-        let cache = RadianceCache::from_parts([Some(nodes), None], Vec::new());
+        let cache = RadianceCache::from_parts([Some(nodes), None], scene.lattice().dims(), Vec::new());
         let look = |x: f64| {
             let mut misses = 0;
             let at = DVec3::new(x, 0.5, 0.5);

@@ -1,9 +1,9 @@
 //! Bands of isovalues, baked one after another so that the radiance cache never covers the whole sweep at once.
 //!
 //! Hyperplanes do not light each other. A ray of isovalue c lands in a cell that straddles c, so samples of a band need
-//! the cache at the nodes of the cells that straddle it. A node's cells span one interval of isovalues: bands in rising
-//! order need it one after another, and each takes over what the one before has. So the work, and the light, are those
-//! of one band.
+//! the cache at the nodes of the cells that straddle it, and at those beside them, against which they are sharpened.
+//! What is within two steps of a node spans one interval of isovalues: bands in rising order need it one after another,
+//! and each takes over what the one before has. So the work, and the light, are those of one band.
 
 use crate::field::Field;
 use crate::mask::Mask;
@@ -41,7 +41,8 @@ const STEPS: usize = 4096;
 pub(super) struct Levels {
     /// Nodes of the sweep by their own isovalue.
     own: Vec<u64>,
-    /// Nodes with surfaces of the sweep around, by the least and by the greatest isovalue of their cells.
+    /// Nodes with surfaces of the sweep around, by the least and by the greatest isovalue within two
+    /// steps.
     least: Vec<u64>,
     most: Vec<u64>,
 }
@@ -57,7 +58,7 @@ impl Levels {
                     if masks[o] == Mask::Empty {
                         continue;
                     }
-                    let [least, most] = field.range_around(o);
+                    let [least, most] = field.range_around(o, 2);
                     counts[STEPS + step(least)] += 1;
                     counts[2 * STEPS + step(most)] += 1;
                     if masks[o] == Mask::Valid {
@@ -146,7 +147,7 @@ mod tests {
             assert!(shares.iter().all(|&s| s > 0 && s <= valid / count + valid / 20), "{shares:?}");
             for b in &bands {
                 let needed = |o: &usize| {
-                    let [least, most] = field.range_around(*o);
+                    let [least, most] = field.range_around(*o, 2);
                     masks[*o] != Mask::Empty && least <= b.to && most >= b.from
                 };
                 let needed = (0..lattice.len()).filter(needed).count() as u64;

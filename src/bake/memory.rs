@@ -309,12 +309,15 @@ impl Parts {
     fn estimate(&self, count: usize) -> MemoryEstimate {
         let bands = self.levels.bands(count);
         let needed: Vec<u64> = bands.iter().map(|&b| self.levels.needed(b)).collect();
-        // Of a whole sweep most nodes are stored as a rule. Where bands meet, a side of either is there.
-        let cache = match needed[..] {
-            [one] => self.cached * 12 * if 2 * one > self.voxels { self.voxels } else { one },
-            _ => needed.windows(2).map(|n| 12 * (self.cached * n[0].max(n[1]) + n[0].min(n[1]))).max().unwrap_or(0),
+        // Of a whole sweep most nodes are stored as a rule, and one side is there twice while it is sharpened. Bands
+        // keep both; where they meet, a side of either is there.
+        let most = |n: &[u64]| 2 * self.cached * n[0].max(n[1]) + n[0].min(n[1]);
+        let stored = match needed[..] {
+            [one] => (self.cached + self.cached.min(1)) * if 2 * one > self.voxels { self.voxels } else { one },
+            _ => needed.windows(2).map(most).max().unwrap_or(0),
         };
-        let sets = 2 * NodeSet::bytes(self.voxels) + NodeSet::bytes(2 * self.points);
+        let cache = 12 * if self.cached > 0 { stored } else { 0 };
+        let sets = 4 * NodeSet::bytes(self.voxels) + NodeSet::bytes(2 * self.points);
         let Self { base, flats, photons, maps, grids, halves, beside, .. } = *self;
         let fitting = beside * (WISH + SORTED) + self.filled * FITTED;
         let light = base + flats + grids + beside * (PLACE + BESIDE);
@@ -341,7 +344,13 @@ impl Parts {
             Engine::Sweep => vec![
                 ("sweep", base + self.swept + flats * 4),
                 // What rays gather, which points are lit, and the sweep's light that waits to be written.
-                ("samples", light + grids / GRID * (CACHED + DONE_SIDE) + self.points + beside * SAMPLE + fitting),
+                (
+                    "samples",
+                    light
+                        + grids / GRID * (CACHED + DONE_SIDE)
+                        + self.points
+                        + (beside * SAMPLE + fitting).max(self.points * CACHED),
+                ),
             ],
         };
         let export = ("export", base + grids + flats + self.export);

@@ -80,7 +80,7 @@ pub(super) fn light(
     // What the sweep knows is what rays from these points gather.
     let gathered = |side| swept.iter().find(|s| s.side == side && beside.len() + near.len() + contacts.len() > 0);
     let nodes = [Side::Lower, Side::Higher].map(|side| Some(widened(lattice, masks, &gathered(side)?.irradiance)));
-    let cache = RadianceCache::from_parts(nodes, flats);
+    let cache = RadianceCache::from_parts(nodes, lattice.dims(), flats);
     let mut sides = Vec::new();
     for mut s in swept {
         let stage = progress.stage("samples", (beside.len() + near.len() + contacts.len()) as u64);

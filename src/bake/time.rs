@@ -295,7 +295,7 @@ fn field_seconds(
     let nodes = if settings.gather_rays > 0 { sides * needed } else { 0.0 };
 
     let begun = Instant::now();
-    let empty = RadianceCache::from_parts([None, None], vec![None; flat::count(scene)]);
+    let empty = RadianceCache::from_parts([None, None], scene.lattice().dims(), vec![None; flat::count(scene)]);
     let indirect = match settings.gather_rays {
         0 => Indirect::Map(&map),
         rays => Indirect::Gather(&empty, rays),

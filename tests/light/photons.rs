@@ -11,7 +11,7 @@ use isolume::photon::{ENERGY_BINS, PhotonSettings, Photons, octant};
 use isolume::photon_map::{EstimateSettings, Estimator, Normalisation, PhotonMap};
 use isolume::radiance_cache::{CacheSettings, RadianceCache};
 use isolume::rng::{Rng, Stage};
-use isolume::scene::{Scene, Surface};
+use isolume::scene::{Scene, Surface, cornell_box};
 use isolume::stats::Moments;
 use std::f64::consts::PI;
 
@@ -274,6 +274,29 @@ fn forward_is_backward() {
         }
     }
     family.accept();
+}
+
+/// A shell with a dent: above half of its height level sets have a hole that lets light into the cavity, below it they
+/// are closed, and the cavity, four voxels wide, is dark for them. All light there is what gather rays find of other
+/// level sets, carried on by bounces of 0.9: 16 % of the mean of all nodes when they took the trilinear mean of nodes
+/// that were not sharpened, 10 % with either, 3 % with both.
+#[test]
+fn closed_cavities_stay_dark() {
+    let lattice = lattice([25; 3], DVec3::splat(-12.0), DVec3::splat(12.0));
+    let shell = |x: DVec3| {
+        let dent = 0.5 * (-((x.z / x.length().max(1e-9) - 1.0) / 0.15).powi(2)).exp();
+        (1.0 - dent) * (-((x.length() - 4.0) / 1.4).powi(2)).exp()
+    };
+    let walls = cornell_box(&lattice, 0.0).unwrap();
+    let scene = scene(field(lattice, 0.03, 0.97, shell), grey(0.9, Side::Lower), walls);
+    let all = valid(&run(&scene, &at_nodes(1)), &scene);
+    let in_cavity = |&&(_, x, h, ..): &&(usize, DVec3, f64, f64, f64)| x.length() < 4.0 && h < 0.45;
+    let mean = |light: Vec<f64>| light.iter().sum::<f64>() / light.len() as f64;
+    let dark: Vec<f64> = all.iter().filter(in_cavity).map(|n| n.3).collect();
+    assert!(dark.len() > 50, "{} nodes", dark.len());
+    let share = mean(dark) / mean(all.iter().map(|n| n.3).collect());
+    println!("{:.1} % of the mean of {} nodes", 100.0 * share, all.len());
+    assert!(share < 0.05, "{share}");
 }
 
 /// A saddle lit from above and from below: photons on either side of it know to which octant it falls.
