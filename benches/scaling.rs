@@ -181,7 +181,7 @@ fn main() {
         (
             "cache",
             Box::new(|| {
-                let mut cache = RadianceCache::from_parts([None, None], Vec::new());
+                let mut cache = RadianceCache::from_parts([None, None], scene.lattice().dims(), Vec::new());
                 filled(&mut cache);
             }),
         ),
