@@ -12,6 +12,7 @@
 //! all nodes share directions and luminaire points, so what noise there is is smooth in space; polygons that stand
 //! inside the volume are refused unless they are luminaires.
 
+mod accumulate;
 mod arrive;
 mod blockers;
 mod clearance;

@@ -37,6 +37,9 @@ impl Band {
 /// Steps of the sweep in which nodes are counted.
 const STEPS: usize = 4096;
 
+/// Steps from a node within which a band that needs it has an isovalue.
+pub(super) const REACH: usize = 2;
+
 /// How many nodes there are at which isovalues.
 pub(super) struct Levels {
     /// Nodes of the sweep by their own isovalue.
@@ -48,8 +51,9 @@ pub(super) struct Levels {
 }
 
 impl Levels {
-    /// Counts the nodes of fields with their masks, all on the fields' own lattices.
-    pub(super) fn new<'a>(fields: impl Iterator<Item = (&'a Field, &'a [Mask])>) -> Self {
+    /// Counts the nodes of fields with their masks, all on the fields' own lattices. `steps`: [`REACH`], or 0 if no
+    /// band needs any.
+    pub(super) fn new<'a>(fields: impl Iterator<Item = (&'a Field, &'a [Mask])>, steps: usize) -> Self {
         let mut levels = Self { own: vec![0; STEPS], least: vec![0; STEPS], most: vec![0; STEPS] };
         for (field, masks) in fields {
             let count = |chunk: usize| {
@@ -58,7 +62,7 @@ impl Levels {
                     if masks[o] == Mask::Empty {
                         continue;
                     }
-                    let [least, most] = field.range_around(o, 2);
+                    let [least, most] = field.range_around(o, steps);
                     counts[STEPS + step(least)] += 1;
                     counts[2 * STEPS + step(most)] += 1;
                     if masks[o] == Mask::Valid {
@@ -132,7 +136,7 @@ mod tests {
         let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
         let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
         let masks = masks(&field, &lattice);
-        let levels = Levels::new([(&field, &masks[..])].into_iter());
+        let levels = Levels::new([(&field, &masks[..])].into_iter(), REACH);
         let valid = masks.iter().filter(|&&m| m == Mask::Valid).count();
         for count in [1, 2, 3, 7, 100] {
             let bands = levels.bands(count);
@@ -147,7 +151,7 @@ mod tests {
             assert!(shares.iter().all(|&s| s > 0 && s <= valid / count + valid / 20), "{shares:?}");
             for b in &bands {
                 let needed = |o: &usize| {
-                    let [least, most] = field.range_around(*o, 2);
+                    let [least, most] = field.range_around(*o, REACH);
                     masks[*o] != Mask::Empty && least <= b.to && most >= b.from
                 };
                 let needed = (0..lattice.len()).filter(needed).count() as u64;

@@ -1,6 +1,6 @@
 //! How much memory a bake takes, before it takes it.
 
-use super::bands::{Band, Levels};
+use super::bands::{Band, Levels, REACH};
 use super::grid_points::{BesideLight, STAND_INS};
 use super::{BakeSettings, Engine, Interpolation, MOST_BANDS, StrategyName};
 use crate::checkpoint;
@@ -254,7 +254,8 @@ impl Parts {
             (filled, stored) = (filled + own_filled, sides.max(stored));
             all_masks.push(masks);
         }
-        let levels = Levels::new(members.iter().zip(&all_masks).map(|(m, masks)| (&*m.field, &masks[..])));
+        let steps = if settings.engine == Engine::Photon { REACH } else { 0 };
+        let levels = Levels::new(members.iter().zip(&all_masks).map(|(m, masks)| (&*m.field, &masks[..])), steps);
         let across = settings.wall_resolution;
         let texels = match settings.engine {
             Engine::Sweep => sweep::texels(scene, across, settings.wall_isovalues),

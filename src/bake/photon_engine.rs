@@ -1,6 +1,6 @@
 //! BB09's engine: photons, a radiance cache, samples by exact rays, interpolation.
 
-use super::bands::{Band, Levels};
+use super::bands::{Band, Levels, REACH};
 use super::contacts::{Contacts, Wedge};
 use super::grid_points::{Beside, BesideLight, Counts, GridPoints, PointLight};
 use super::{BakeSettings, Interpolation, Lit, PhotonCounts, stages};
@@ -82,7 +82,7 @@ pub(super) fn light(
     lit.spend(clock, |s| &mut s.cache);
 
     let clock = Clock::start();
-    let levels = Levels::new(jobs.iter().zip(&sources).map(|(job, source)| (&*job.scene.field, source.masks())));
+    let levels = Levels::new(jobs.iter().zip(&sources).map(|(job, source)| (&*job.scene.field, source.masks())), REACH);
     let bands = levels.bands(settings.bands);
     lit.bands = bands.len();
     let mut fields = jobs.iter().map(|job| FieldLight::new(job, settings)).collect::<Result<Vec<_>>>()?;

@@ -38,7 +38,7 @@ pub(super) fn inwards(j: usize, n: usize) -> isize {
 }
 
 /// The two lines along u around node `i` of `nu`, and the weights of the second and of the row before, as
-/// [`super::gather::accumulate_row`] has them: on a side the first is nearer, and light `goes_on` linearly from both or
+/// [`super::accumulate`] has them: on a side the first is nearer, and light `goes_on` linearly from both or
 /// stays what it is there. `line0` is the line just beyond node 0, −1 of which is missing.
 #[inline(always)]
 pub(super) fn around(
@@ -181,7 +181,7 @@ pub(super) struct Sides<'a> {
     /// This row of lines and the one before: \[channel\]\[line\], and what they end on.
     pub light: [[&'a [f32]; 3]; 2],
     pub ends: [&'a RowEnds; 2],
-    /// The line just beyond node 0, −1 of which is missing, and weights, as [`super::gather::accumulate_row`] has them.
+    /// The line just beyond node 0, −1 of which is missing, and weights, as [`super::accumulate`] has them.
     pub line0: usize,
     pub weights: [f32; 2],
     /// As [`around`].

@@ -1,5 +1,6 @@
 //! One pass of gather sweeps: a bounce for every node and every isovalue at once, walls included.
 
+use super::accumulate::{Lines, cosine};
 use super::arrive;
 use super::directions::Shear;
 use super::ends::{Ends, Standing};
@@ -356,6 +357,7 @@ impl Pass<'_> {
             touched: family.touched,
         };
         let h = &self.geometry.h(layout)[at..][..nu];
+        let lines = Lines { rows: light, first: line0, shift: [fu, fv], omega: family.omega };
         let mut bits = lit.rows[at / nu];
         while bits != 0 {
             // Runs of lit blocks.
@@ -379,8 +381,7 @@ impl Pass<'_> {
                 ends.for_each(&mut single);
                 let (a, b) = (a.max(1), b.min(nu - 1));
                 if a < b {
-                    let e = [&mut e0[..], &mut e1[..], &mut e2[..]];
-                    self.isa.accumulate(e, n, family.omega, light, line0, [fu, fv], (a, b));
+                    self.isa.accumulate(&lines, n, &mut [&mut e0[..], &mut e1[..], &mut e2[..]], (a, b));
                 }
             };
             let mut from = a;
@@ -407,40 +408,6 @@ fn node_rows(e: &mut Planes, nu: usize) -> Rows<'_> {
     let [e0, e1, e2] = e;
     let rows = e0.chunks_exact_mut(nu).zip(e1.chunks_exact_mut(nu)).zip(e2.chunks_exact_mut(nu));
     rows.map(|((e0, e1), e2)| Mutex::new([e0, e1, e2])).collect()
-}
-
-/// |ω·N|, times N's length.
-#[inline(always)]
-fn cosine(omega: [f32; 3], normal: u32) -> f32 {
-    let [x, y, z] = decode(normal);
-    (omega[0] * x + omega[1] * y + omega[2] * z).abs()
-}
-
-/// Nodes a..b of a row, none of them on a side. `line0` is the line (in `light`) just beyond node 0, −1 of which is
-/// missing.
-#[inline(always)]
-pub(super) fn accumulate_row(
-    e: [&mut [f32]; 3],
-    n: &[u32],
-    omega: [f32; 3],
-    light: [[&[f32]; 3]; 2],
-    line0: usize,
-    [fu, fv]: [f32; 2],
-    (a, b): (usize, usize),
-) {
-    let w = [(1.0 - fv) * (1.0 - fu), (1.0 - fv) * fu, fv * (1.0 - fu), fv * fu];
-    let len = b - a;
-    let n = &n[a..b];
-    let [e0, e1, e2] = e;
-    let e = [&mut e0[a..b], &mut e1[a..b], &mut e2[a..b]];
-    let lines = light.map(|row| row.map(|c| (&c[line0 + a..][..len], &c[line0 + a - 1..][..len])));
-    let [near, far] = lines;
-    for i in 0..len {
-        let cos = cosine(omega, n[i]);
-        for c in 0..3 {
-            e[c][i] += cos * ((w[0] * near[c].0[i] + w[1] * near[c].1[i]) + (w[2] * far[c].0[i] + w[3] * far[c].1[i]));
-        }
-    }
 }
 
 /// Nodes whose cosines are summed at a time.

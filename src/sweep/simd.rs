@@ -11,12 +11,13 @@ mod avx512;
 #[cfg(test)]
 mod tests;
 
+use super::accumulate::{Lines, accumulate_row};
 use super::arrive::Walls;
 use super::clearance::Clearance;
 use super::ends::Ends;
 use super::fans::march_row;
 use super::flats::{Arrivals, Flats, Sink};
-use super::gather::{COSINES, accumulate_row, sum_cosines};
+use super::gather::{COSINES, sum_cosines};
 use super::grid::Source;
 use super::half::Half4;
 use super::pack::{Pack, Plan};
@@ -84,8 +85,7 @@ impl Isa {
     ));
     dispatch!(cosines, sum_cosines, (omega: &[[f32; 3]], n: &[u32], sum: &mut [f32; COSINES]));
     dispatch!(accumulate, accumulate_row, (
-        e: [&mut [f32]; 3], n: &[u32], omega: [f32; 3], light: [[&[f32]; 3]; 2], line0: usize,
-        f: [f32; 2], range: (usize, usize)
+        lines: &Lines, normals: &[u32], e: &mut [&mut [f32]; 3], range: (usize, usize)
     ));
     dispatch!(report, Walls::through, (
         walls: &Walls, pack: &Pack, b: [&[Half4]; 2], first: isize, q: isize, out: &mut Arrivals
