@@ -234,7 +234,7 @@ impl RadianceCache {
     }
 
     /// A cache of light known already: per side (lower, higher) irradiance / π at the nodes of the scene's lattice, of
-    /// `dims` nodes along x, y and z, NaN where unknown, and the flats' radiance.
+    /// `dims` nodes along x, y and z (or it panics), NaN where unknown, and the flats' radiance.
     pub fn from_parts(nodes: Nodes, dims: [usize; 3], flats: Vec<Option<FlatTexture>>) -> Self {
         let all = NodeSet::all(dims.iter().product());
         let known = nodes.iter().any(Option::is_some);
@@ -319,6 +319,7 @@ impl RadianceCache {
             }
         }
         let found = &found[..count];
+        // Never 0, since all nodes may be on the hit's level set.
         let around = LEVEL * found.iter().map(|&(_, w, off)| w * off).sum::<f64>() + 1e-30;
         let (mut sum, mut weight) = (DVec3::ZERO, 0.0);
         for &(value, w, off) in found {

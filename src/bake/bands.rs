@@ -44,8 +44,7 @@ pub(super) const REACH: usize = 2;
 pub(super) struct Levels {
     /// Nodes of the sweep by their own isovalue.
     own: Vec<u64>,
-    /// Nodes with surfaces of the sweep around, by the least and by the greatest isovalue within two
-    /// steps.
+    /// Nodes with surfaces of the sweep around, by the least and by the greatest isovalue within [`REACH`].
     least: Vec<u64>,
     most: Vec<u64>,
 }
