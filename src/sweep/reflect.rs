@@ -22,7 +22,7 @@ const READING: f32 = 5.0 / 72.0;
 pub(super) const RECEIVING: f32 = 1.0 / 18.0;
 
 /// So much of its second differences is taken off what nodes reflect. \[Condat05\]
-const SHARPENING: f32 = READING + RECEIVING;
+pub(super) const SHARPENING: f32 = READING + RECEIVING;
 
 /// What nodes reflect.
 #[derive(Debug)]
@@ -65,7 +65,7 @@ impl<'a> Mirror<'a> {
     /// B = Le + ρ/π Σ scale · irradiance of the sides, sharpened, and filled where no surface is; packs the flats too.
     /// `light`: one or two sets of irradiance, each with its scale; `memory`: of the same form, or empty. While light
     /// settles there is also what the pass read, and ω ≥ 1: the result goes ω times as far from `memory`, which was
-    /// there before that. Returns sums of B itself, too.
+    /// there before that. It is sharpened by [`SHARPENING`], or less. Returns sums of B itself, too.
     #[allow(clippy::cast_possible_truncation, reason = "albedo and emission")]
     pub(super) fn reflect(
         &self,
@@ -73,6 +73,7 @@ impl<'a> Mirror<'a> {
         light: &[(NodeLight, f32)],
         memory: Reflected,
         relaxed: Option<(&Reflected, [f32; 3])>,
+        sharpening: f32,
     ) -> (Reflected, Sums) {
         let surface = &self.scene.surface;
         let over_pi =
@@ -106,6 +107,7 @@ impl<'a> Mirror<'a> {
             old: relaxed.map(|(old, _)| (old, unit / old.unit)),
             omega,
             memory: unit / memory.unit,
+            sharpening,
         };
         let mut memory = memory.b.into_iter();
         let mut sums = Sums::default();
@@ -180,6 +182,7 @@ pub(super) struct Job<'a> {
     omega: [f32; 3],
     /// What makes `b` as it was of this unit.
     memory: f32,
+    sharpening: f32,
 }
 
 /// What nodes of a row reflect on side `s`, into `b`. `beside` are the numbers of the row and of those around it, of
@@ -197,7 +200,7 @@ pub(super) fn reflect_row(job: &Job, s: usize, beside: [Option<usize>; 5], rows:
                 job.light.iter().for_each(|(light, scale)| light.add((s, c), *scale, row * nx, to));
             }
         }
-        sharpen(light, shown, laplacian);
+        sharpen(light, shown, laplacian, job.sharpening);
         reflected[c].clear();
         reflected[c].extend_from_slice(&light[0]);
         let (y, is) = (&mut reflected[c][..nx], &shown[0][..nx]);
@@ -272,7 +275,7 @@ fn changed(y: &[f32], shown: &[f32], change: &mut Vec<f32>, x: impl Fn(usize) ->
 
 /// Sharpens the first row of irradiance, against its neighbours that are shown.
 #[inline(always)]
-fn sharpen(light: &mut Cross, shown: &Cross, laplacian: &mut Vec<f32>) {
+fn sharpen(light: &mut Cross, shown: &Cross, laplacian: &mut Vec<f32>, sharpening: f32) {
     let ([here, beside @ ..], [is, is_beside @ ..]) = (light, shown);
     let nx = here.len();
     laplacian.clear();
@@ -287,7 +290,7 @@ fn sharpen(light: &mut Cross, shown: &Cross, laplacian: &mut Vec<f32>) {
             *sum += is * (e - here);
         }
     }
-    here.iter_mut().zip(laplacian).for_each(|(e, l)| *e = (*e - SHARPENING * *l).max(0.0));
+    here.iter_mut().zip(laplacian).for_each(|(e, l)| *e = (*e - sharpening * *l).max(0.0));
 }
 
 #[cfg(test)]
@@ -316,7 +319,7 @@ mod tests {
                 let mut light = [row, row - row.min(1), row + 1, row - row.min(n), row + n]
                     .map(|row| if inside { read(row) } else { Vec::new() });
                 light[0] = read(row);
-                sharpen(&mut light, &shown, &mut Vec::new());
+                sharpen(&mut light, &shown, &mut Vec::new(), SHARPENING);
                 light[0].clone()
             })
             .collect();
@@ -354,7 +357,7 @@ mod tests {
         let is: Vec<f32> = shown.iter().map(|shown| f32::from(u8::from(*shown))).collect();
         for row in 0..4 {
             let mut sharp = rows(&light, row);
-            sharpen(&mut sharp, &rows(&is, row), &mut Vec::new());
+            sharpen(&mut sharp, &rows(&is, row), &mut Vec::new(), SHARPENING);
             for (sharp, _) in sharp[0].iter().zip(&shown[10 * row..]).filter(|x| *x.1) {
                 assert_eq!(*sharp, 0.7);
             }
@@ -391,6 +394,7 @@ mod tests {
                 old: omega.map(|_| (&old, 2.0)),
                 omega: omega.unwrap_or([1.0; 3]),
                 memory: 0.5,
+                sharpening: SHARPENING,
             };
             let run = |isa: Isa| {
                 let mut b = before.clone();

@@ -11,7 +11,7 @@ use super::faces::Touching;
 use super::flats::Flats;
 use super::gather::Pass;
 use super::planes::{HalfPlanes, NodeLight, Planes};
-use super::reflect::Reflected;
+use super::reflect::{Reflected, SHARPENING};
 use super::settling::Settling;
 use super::state::{Passes, State};
 use super::{Run, SweepSettings};
@@ -88,10 +88,10 @@ impl Run<'_> {
             let share = 1.0 / state.done as f32;
             flats.take(&state.flats, share);
             let light = (NodeLight::Half(&state.total.light), share);
-            self.mirror.reflect(flats, &[direct, light], Reflected::default(), None)
+            self.mirror.reflect(flats, &[direct, light], Reflected::default(), None, SHARPENING)
         } else {
             flats.reflect_direct();
-            self.mirror.reflect(flats, &[direct], Reflected::default(), None)
+            self.mirror.reflect(flats, &[direct], Reflected::default(), None, SHARPENING)
         };
         Passes {
             light,
@@ -253,13 +253,16 @@ impl Run<'_> {
             }
             if settles {
                 let memory = std::mem::take(&mut now.before);
-                let (reflected, sums) = self.mirror.reflect(flats, &light, memory, Some((&now.light, omega)));
+                // Where light is rough, along few directions, sharpening may make each bounce brighter than the last.
+                let sharpening = if now.settling.grows() { 0.0 } else { SHARPENING };
+                let relaxed = Some((&now.light, omega));
+                let (reflected, sums) = self.mirror.reflect(flats, &light, memory, relaxed, sharpening);
                 now.before = std::mem::replace(&mut now.light, reflected);
                 now.settling.push(sums);
             } else {
                 now.before = Reflected::default();
                 let memory = std::mem::take(&mut now.light);
-                now.light = self.mirror.reflect(flats, &light, memory, None).0;
+                now.light = self.mirror.reflect(flats, &light, memory, None, SHARPENING).0;
             }
             if let Some((nodes, flats_by_few)) = by_few {
                 // (T − T₁) x₁. [Stetter78]

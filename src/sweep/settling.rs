@@ -102,6 +102,11 @@ impl Settling {
         self.radius.into_iter().fold(0.0, f64::max)
     }
 
+    /// Whether changes have grown: what makes light rougher has to stop.
+    pub(super) fn grows(&self) -> bool {
+        self.least.contains(&0.0)
+    }
+
     /// ω of the pass to come.
     #[allow(clippy::cast_possible_truncation, reason = "a number in [1, 2]")]
     pub(super) fn omega(&self) -> [f32; 3] {
@@ -136,7 +141,8 @@ impl Settling {
             if steady && self.radius[c] >= MOST {
                 self.radius[c] = slow.max(MOST);
             }
-            self.least[c] = self.least[c].min(new);
+            // Once and for all.
+            self.least[c] = if new < APART * self.least[c] { self.least[c].min(new) } else { 0.0 };
             let r2 = self.radius[c].min(RELAXED).powi(2);
             let omega = &mut self.omega[3][c];
             *omega = match *omega {

@@ -165,15 +165,17 @@ fn bright_rooms_have_all_their_bounces() {
 
 /// Noise that Ω's faces cut all over, along few directions: light is between that of surfaces that see nothing and of
 /// those that see nothing else, or hardly more. What goes on linearly from the lines beside faces grew from bounce to
-/// bounce, up to 10²¹.
+/// bounce, up to 10²¹, and what is sharpened until it is noticed to grow: 10⁸ in the last two scenes.
 #[test]
 fn rough_light_settles() {
-    for (dims, spacing, seed) in [
-        ([12, 20, 4], [1.0, 10.0, 3.0], 1),
-        ([3, 33, 20], [1.0, 0.5, 1.0], 2),
-        ([2, 9, 16], [1.0; 3], 3),
-        ([3, 3, 3], [3.0, 1.0, 1.0], 4),
-        ([24, 5, 5], [1.0; 3], 5),
+    for (dims, spacing, seed, most) in [
+        ([12, 20, 4], [1.0, 10.0, 3.0], 1, 30),
+        ([3, 33, 20], [1.0, 0.5, 1.0], 2, 30),
+        ([2, 9, 16], [1.0; 3], 3, 30),
+        ([3, 3, 3], [3.0, 1.0, 1.0], 4, 30),
+        ([24, 5, 5], [1.0; 3], 5, 30),
+        ([33, 20, 20], [1.0, 0.5, 1.0], 10, 120),
+        ([33, 20, 20], [1.0; 3], 12, 120),
     ] {
         let mut rng = Rng::stream(seed, Stage::Test, 0);
         let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::from_array(spacing)).unwrap();
@@ -187,7 +189,7 @@ fn rough_light_settles() {
         let light = got.sides[0].irradiance.iter().map(|e| 1.0 + f64::from(e[1]) * 0.75 / PI);
         let greatest = light.fold(0.0, f64::max);
         println!("{dims:?}: {} bounces, {greatest:.2}, {:.4} may be missing", got.bounces, got.residual);
-        assert!(got.bounces < 30 && greatest < 6.0 && got.residual < SweepSettings::default().target);
+        assert!(got.bounces < most && greatest < 6.0 && got.residual < SweepSettings::default().target);
     }
 }
 
