@@ -65,7 +65,7 @@ impl<'a> Mirror<'a> {
     /// B = Le + ρ/π Σ scale · irradiance of the sides, sharpened, and filled where no surface is; packs the flats too.
     /// `light`: one or two sets of irradiance, each with its scale; `memory`: of the same form, or empty. While light
     /// settles there is also what the pass read, and ω ≥ 1: the result goes ω times as far from `memory`, which was
-    /// there before that. It is sharpened by [`SHARPENING`], or less. Returns sums of B itself, too.
+    /// there before that. `sharpening`: [`SHARPENING`], or less. Returns sums of B itself, too.
     #[allow(clippy::cast_possible_truncation, reason = "albedo and emission")]
     pub(super) fn reflect(
         &self,

@@ -13,7 +13,8 @@ pub(super) struct Settling {
     pub(super) since: usize,
     /// Σ of nodes' light before the first pass.
     first: [f64; 3],
-    /// Σ|y − x| of the last three passes, the newest last; and the least since r is known.
+    /// Σ|y − x| of the last three passes, the newest last; and the least since r is known, or 0 once they have
+    /// grown to [`APART`] times that.
     changes: [[f64; 3]; 3],
     least: [f64; 3],
     /// Σ|y − x| and |Σ(y − x)| of the last pass as shares of indirect light.
@@ -40,7 +41,7 @@ const STEADY: f64 = 0.05;
 const ONE_SIGN: f64 = 0.9;
 /// The greatest r that ω is for: few directions make noise, too, whose eigenvalues are not all real.
 const RELAXED: f64 = 0.95;
-/// Changes this much greater than the least tell that ω drives light apart.
+/// Changes this much greater than the least tell that ω or sharpening drives light apart.
 const APART: f64 = 10.0;
 /// Smaller changes, as a share of light, say nothing more of r once it is known: light is kept to 2⁻¹² of each number.
 const ROUNDING: f64 = 1.0 / 4096.0;
@@ -102,7 +103,7 @@ impl Settling {
         self.radius.into_iter().fold(0.0, f64::max)
     }
 
-    /// Whether changes have grown: what makes light rougher has to stop.
+    /// Whether changes have grown to [`APART`] times the least.
     pub(super) fn grows(&self) -> bool {
         self.least.contains(&0.0)
     }
@@ -141,7 +142,6 @@ impl Settling {
             if steady && self.radius[c] >= MOST {
                 self.radius[c] = slow.max(MOST);
             }
-            // Once and for all.
             self.least[c] = if new < APART * self.least[c] { self.least[c].min(new) } else { 0.0 };
             let r2 = self.radius[c].min(RELAXED).powi(2);
             let omega = &mut self.omega[3][c];
