@@ -18,6 +18,7 @@ pub mod cubic;
 pub mod nearest;
 pub mod node_set;
 mod neighbourhood;
+mod sharpening;
 pub mod linear_fit;
 pub mod progress;
 pub mod checkpoint;

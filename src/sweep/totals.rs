@@ -5,6 +5,7 @@ use super::planes::{HalfPlanes, Planes};
 use super::reflect::RECEIVING;
 use crate::flattened::Side;
 use crate::scene::Scene;
+use crate::sharpening::sharpened;
 use ::half::bf16;
 use glam::DVec3;
 use rayon::prelude::*;
@@ -29,20 +30,9 @@ impl<L: Fn(usize) -> bool> Focus<L> {
     /// Of a lit node and what `light` tells of it and of others.
     #[inline]
     fn focused<const N: usize>(&self, node: usize, light: impl Fn(usize) -> [f32; N]) -> [f32; N] {
-        let here = light(node);
-        let mut sharp = here;
-        let mut step = 1;
-        for n in self.dims {
-            let inner = (1..n - 1).contains(&(node / step % n));
-            if inner && (self.lit)(node - step) && (self.lit)(node + step) {
-                let (before, behind) = (light(node - step), light(node + step));
-                for c in 0..N {
-                    sharp[c] -= RECEIVING * ((before[c] - here[c]) + (behind[c] - here[c]));
-                }
-            }
-            step *= n;
-        }
-        sharp
+        // The node itself is lit.
+        let value = |n: usize| (n == node || (self.lit)(n)).then(|| light(n));
+        sharpened(self.dims, node, RECEIVING, value).expect("the light of a node that is lit")
     }
 }
 
