@@ -9,6 +9,7 @@ use isolume::field::{Field, Sweep};
 use isolume::flattened::{Departure, Side};
 use isolume::gather::gathered_irradiance;
 use isolume::isa::Isa;
+use isolume::isovalue_axis::IsovalueAxis;
 use isolume::nearest::Neighbours;
 use isolume::photon::{PhotonSettings, trace_photons};
 use isolume::photon_map::{EstimateSettings, Estimator, PhotonMap};
@@ -54,7 +55,13 @@ fn main() {
     let scene = bumps();
     let device = Device::new(1).expect("Embree starts");
     let tracer = GraphTracer::new(&device, &scene).expect("a tracer");
-    let emission = |count, seed| PhotonSettings { count, max_bounces: u16::MAX, seed, fixed_isovalue: None };
+    let emission = |count, seed| PhotonSettings {
+        count,
+        max_bounces: u16::MAX,
+        seed,
+        axis: IsovalueAxis::EVEN,
+        fixed_isovalue: None,
+    };
     println!(
         "per CPU second, {} threads, {}, Embree {}; bumps 101³",
         rayon::current_num_threads(),
@@ -86,6 +93,7 @@ fn main() {
         flat_shadow_rays: 64,
         flat_resolution: 64,
         isovalue_resolution: 32,
+        axis: IsovalueAxis::EVEN,
         seed: 3,
     };
     let other = trace_photons(&scene, &tracer, &emission(1 << 22, 2), &|_| true);

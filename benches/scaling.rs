@@ -12,6 +12,7 @@ use isolume::field::{Field, Sweep};
 use isolume::fitted_grid::{PULL, Wish, fit};
 use isolume::flattened::Side;
 use isolume::illumination_grid::shepard;
+use isolume::isovalue_axis::IsovalueAxis;
 use isolume::mask::{Mask, masks};
 use isolume::node_set::NodeSet;
 use isolume::photon::{PhotonSettings, trace_photons};
@@ -99,13 +100,20 @@ fn main() {
     let lattice = scene.lattice();
     let unsaved = checkpoint::Stage::UNSAVED;
 
-    let photon_settings = PhotonSettings { count: 1 << 20, max_bounces: u16::MAX, seed: 1, fixed_isovalue: None };
+    let photon_settings = PhotonSettings {
+        count: 1 << 20,
+        max_bounces: u16::MAX,
+        seed: 1,
+        axis: IsovalueAxis::EVEN,
+        fixed_isovalue: None,
+    };
     let photons = trace_photons(&scene, &tracer, &photon_settings, &|_| true);
     let cache_settings = CacheSettings {
         node_shadow_rays: 4,
         flat_shadow_rays: 32,
         flat_resolution: 64,
         isovalue_resolution: 32,
+        axis: IsovalueAxis::EVEN,
         seed: 1,
     };
     let estimate = EstimateSettings::default();

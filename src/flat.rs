@@ -2,6 +2,7 @@
 //! Ω's faces. Flat numbers are polygon numbers, then six caps (axis + 3 · far end) for each field.
 
 use crate::flattened::{Departure, Side};
+use crate::isovalue_axis::IsovalueAxis;
 use crate::reflectance::Reflectance;
 use crate::scene::{Boundary, Scene};
 use glam::DVec3;
@@ -248,20 +249,23 @@ pub fn face_texture(scene: &Scene, face: u8, p: DVec3) -> [f64; 2] {
 pub struct FlatTexture {
     /// Texels along u, v and the isovalue.
     pub dims: [usize; 3],
+    /// Where the isovalue's texels stand.
+    pub axis: IsovalueAxis,
     /// RGB per texel.
     pub texels: Vec<[f32; 3]>,
 }
 
 impl FlatTexture {
-    /// A black texture.
+    /// A black texture, its isovalue's texels standing evenly.
     pub fn black(dims: [usize; 3]) -> Self {
-        Self { dims, texels: vec![[0.0; 3]; dims.iter().product()] }
+        Self { dims, axis: IsovalueAxis::EVEN, texels: vec![[0.0; 3]; dims.iter().product()] }
     }
 
     /// Texel-centred trilinear lookup at (u, v, c) ∈ [0, 1]³, continued linearly over the outer half texels (a constant
     /// there would darken what a wall sends, since radiance peaks beside its neighbours); never negative.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the texture")]
-    pub fn lookup(&self, uvc: [f64; 3]) -> DVec3 {
+    pub fn lookup(&self, [u, v, c]: [f64; 3]) -> DVec3 {
+        let uvc = [u, v, if self.axis.is_even() { c } else { f64::from(self.axis.place(c as f32)) }];
         let mut base = [0usize; 3];
         let mut frac = [0f64; 3];
         for a in 0..3 {
@@ -292,12 +296,14 @@ impl FlatTexture {
         let [nu, nv, nc] = self.dims;
         let ijk = [index % nu, index / nu % nv, index / (nu * nv)];
         let dims = [nu, nv, nc];
-        std::array::from_fn(|a| (ijk[a] as f64 + 0.5) / dims[a] as f64)
+        let [u, v, c] = std::array::from_fn(|a| (ijk[a] as f64 + 0.5) / dims[a] as f64);
+        [u, v, self.axis.isovalue(c)]
     }
 
     /// The texel that holds (u, v, c).
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the texture")]
-    pub fn texel(&self, uvc: [f32; 3]) -> usize {
+    pub fn texel(&self, [u, v, c]: [f32; 3]) -> usize {
+        let uvc = [u, v, self.axis.place(c)];
         let i: [usize; 3] = std::array::from_fn(|a| ((uvc[a] * self.dims[a] as f32) as usize).min(self.dims[a] - 1));
         (i[2] * self.dims[1] + i[1]) * self.dims[0] + i[0]
     }

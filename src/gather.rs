@@ -204,6 +204,7 @@ mod tests {
     use super::*;
     use crate::checkpoint;
     use crate::field::{Field, Sweep};
+    use crate::isovalue_axis::IsovalueAxis;
     use crate::photon::{FlatPhoton, Photons};
     use crate::photon_map::EstimateSettings;
     use crate::radiance_cache::CacheSettings;
@@ -249,6 +250,7 @@ mod tests {
             flat_shadow_rays: 1,
             flat_resolution: 16,
             isovalue_resolution: 8,
+            axis: IsovalueAxis::EVEN,
             seed: 1,
         };
         let saved = [checkpoint::Stage::UNSAVED; 2];

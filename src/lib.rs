@@ -27,6 +27,7 @@ pub mod volume;
 pub mod series;
 pub mod field;
 pub mod mask;
+pub mod isovalue_axis;
 // Rays of R⁴; one hexahedron; the min/max hierarchy and its walk; triangle meshes of L(h, c).
 pub mod flattened;
 pub mod cell;

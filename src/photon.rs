@@ -2,6 +2,7 @@
 //! kept to the last bit. \[BB09 §2.3; Jensen01\]
 
 use crate::flattened::{Departure, Side, Target};
+use crate::isovalue_axis::IsovalueAxis;
 use crate::rng::{Rng, Sobol, Stage};
 use crate::scene::Scene;
 use crate::tracer::Tracer;
@@ -164,6 +165,8 @@ pub struct PhotonSettings {
     pub max_bounces: u16,
     /// Seed of the run.
     pub seed: u64,
+    /// Photons of luminaires are emitted evenly along this axis, each with as much more power as there are fewer.
+    pub axis: IsovalueAxis,
     /// Emit the photons of luminaires at this isovalue instead of over the whole sweep: the ordinary 3D photon map of
     /// one level set. Level sets that emit are not for it: theirs come from all of the sweep.
     pub fixed_isovalue: Option<f32>,
@@ -369,8 +372,8 @@ fn foreshortening(receiver: Option<DVec3>, gradient: DVec3, direction: DVec3) ->
     (receiver / (own * share).max(1e-6)).min(4.0) as f32
 }
 
-/// Photon `index`: source by power, point uniform over the area, direction by the cosine, isovalue uniform over the
-/// sweep. All from one scrambled Sobol point, so that any power-of-two prefix is stratified in isovalue, source, place
+/// Photon `index`: source by power, point uniform over the area, direction by the cosine, isovalue along the
+/// axis. All from one scrambled Sobol point, so that any power-of-two prefix is stratified in isovalue, source, place
 /// and direction.
 #[allow(clippy::cast_possible_truncation, reason = "storage is f32; indices below 2³²")]
 fn emit(scene: &Scene, settings: &PhotonSettings, sources: &[Source], total: f64, index: u64) -> Option<Flight> {
@@ -391,7 +394,9 @@ fn emit(scene: &Scene, settings: &PhotonSettings, sources: &[Source], total: f64
     let direction = cosine_hemisphere(set.point2(i, 3));
     match *source {
         Source::Luminaire(id, _) => {
-            let isovalue = settings.fixed_isovalue.unwrap_or(set.coordinate(i, 0) as f32);
+            let drawn = || settings.axis.isovalue(set.coordinate(i, 0)) as f32;
+            let isovalue = settings.fixed_isovalue.unwrap_or_else(drawn);
+            let density = if settings.fixed_isovalue.is_none() { settings.axis.density(isovalue) } else { 1.0 };
             let p = &scene.polygons()[id as usize];
             let y = p.sample(set.point2(i, 1));
             Some(Flight {
@@ -399,7 +404,7 @@ fn emit(scene: &Scene, settings: &PhotonSettings, sources: &[Source], total: f64
                 direction: Frame::new(p.normal()).to_world(direction),
                 isovalue,
                 departure: Departure::Polygon(id),
-                power: share,
+                power: share / f64::from(density),
                 bounces: 0,
             })
         }

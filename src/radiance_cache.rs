@@ -12,6 +12,7 @@ use crate::direct::{Receiver, direct_irradiance};
 use crate::field::Field;
 use crate::flat::{self, FlatTexture};
 use crate::flattened::{Departure, Side, Target};
+use crate::isovalue_axis::IsovalueAxis;
 use crate::mask::{Mask, masks, stand_ins};
 use crate::nearest::Neighbours;
 use crate::node_set::NodeSet;
@@ -39,6 +40,8 @@ pub struct CacheSettings {
     pub flat_resolution: usize,
     /// Texels along the isovalue.
     pub isovalue_resolution: usize,
+    /// Where these stand.
+    pub axis: IsovalueAxis,
     /// Seed of the run.
     pub seed: u64,
 }

@@ -16,6 +16,7 @@ use crate::direct::Receiver;
 use crate::error::Result;
 use crate::export::ply;
 use crate::flattened::{Departure, Side};
+use crate::isovalue_axis::IsovalueAxis;
 use crate::photon::{PhotonSettings, trace_photons};
 use crate::rng::{Rng, Stage};
 use crate::scene::Scene;
@@ -172,6 +173,7 @@ pub fn reference<T: Tracer>(
                     max_bounces: u16::MAX,
                     // Streams of batches must differ in the seed: photons are keyed by nothing else.
                     seed: settings.seed.wrapping_mul(0x1_0000_0001).wrapping_add(batch << 32),
+                    axis: IsovalueAxis::EVEN,
                     fixed_isovalue: Some(isovalue),
                 },
                 &|_| tick(0),

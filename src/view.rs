@@ -170,7 +170,7 @@ fn describe_flat(baked: &BakedVolume, frame: &Frame, n: usize, factor: f32, byte
     let texture = baked.flats[n].as_ref().map(|t: &FlatTexture| {
         let offset = bytes.len();
         codec::append_colours(bytes, &t.texels, factor);
-        json!({ "offset": offset, "dims": t.dims })
+        json!({ "offset": offset, "dims": t.dims, "axis": t.axis })
     });
     let emission = polygon.map_or(DVec3::ZERO, |p| p.emission * baked.exposure);
     Some(json!({

@@ -246,3 +246,39 @@ fn light_does_not_walk_along_narrow_tubes() {
     // Light falls to a hundred thousandth of that; 11 to 22 times as much once.
     assert!(ratios[1..7].iter().all(|r| (0.5..2.0).contains(r)), "beside it: {ratios:?}");
 }
+
+/// A density that falls by three orders of magnitude, by previews of a sweep over all of them and of its lowest
+/// fiftieth: what walls send to the same level sets is the same, though all of these lie within a third of a texel were
+/// texels as long everywhere.
+#[test]
+fn how_far_the_sweep_goes_changes_no_level_set() {
+    let lattice = Lattice::aligned([33; 3], DVec3::splat(-0.5), DVec3::splat(1.0 / 32.0)).unwrap();
+    let samples: Vec<f64> = (0..lattice.len())
+        .map(|o| {
+            let x = lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|x| x as f64)));
+            (-15.0 * (x - DVec3::new(0.013, -0.02, -0.007)).length()).exp()
+        })
+        .collect();
+    let volume = Volume::new("density", lattice.clone(), Samples::F64(samples)).unwrap();
+    for engine in [Engine::Sweep, Engine::Photon] {
+        let bakes = [1.0, 0.02].map(|hi| {
+            let field = Field::new(&volume, Sweep::new(0.001, hi).unwrap()).unwrap();
+            let walls = cornell_box(&lattice, 0.1).unwrap();
+            let scene = Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap();
+            let options = BakeOptions { preset: Some(Preset::Preview), engine: Some(engine), ..BakeOptions::default() };
+            let settings = BakeSettings::new(&options, &scene).unwrap();
+            bake(&scene, &settings, &Device::new(0).unwrap(), Progress::Quiet).unwrap().sides.remove(0).1
+        });
+        let [whole, part] = &bakes;
+        let both = |&o: &usize| (0..2).all(|n| bakes[n].mask[o] == Mask::Valid) && volume.value(o) < 0.018;
+        let light: Vec<[f64; 2]> = (0..lattice.len())
+            .filter(both)
+            .map(|o| [whole, part].map(|grid| grid.radiance[o].iter().map(|l| f64::from(*l)).sum::<f64>()))
+            .collect();
+        let sum = |of: fn([f64; 2]) -> f64| light.iter().map(|&l| of(l)).sum::<f64>();
+        let mean = sum(|[a, b]| a - b) / sum(|[_, b]| b);
+        let rms = (sum(|[a, b]| (a - b).powi(2)) / sum(|[_, b]| b * b)).sqrt();
+        println!("{engine:?}: {} points, mean {mean:.4}, RMS {rms:.4}", light.len());
+        assert!(light.len() > 3000 && mean.abs() < 0.01 && rms < 0.015, "{engine:?}: {mean:.4}, {rms:.4}");
+    }
+}

@@ -9,6 +9,7 @@ use crate::error::{Error, Result};
 use crate::flat;
 use crate::flattened::Side;
 use crate::irradiance_caching;
+use crate::isovalue_axis::IsovalueAxis;
 use crate::mask::{Mask, masks, own_light};
 use crate::node_set::NodeSet;
 use crate::photon::{FlatPhoton, PhotonSettings, SurfacePhoton, trace_photons};
@@ -367,6 +368,7 @@ fn landings(scene: &Scene, settings: &BakeSettings, device: &Device) -> Result<[
         count: PILOTS.min(settings.photons),
         max_bounces: settings.bounces,
         seed: settings.seed,
+        axis: IsovalueAxis::EVEN,
         fixed_isovalue: None,
     };
     let pilots = trace_photons(scene, &tracer, &pilot, &|_| true);

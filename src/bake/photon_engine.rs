@@ -11,6 +11,7 @@ use crate::fitted_grid::{PULL, Wish, fit};
 use crate::flattened::Side;
 use crate::illumination_grid::{IlluminationGrid, shepard};
 use crate::irradiance_caching::interpolate;
+use crate::isovalue_axis::IsovalueAxis;
 use crate::mask::Mask;
 use crate::node_set::NodeSet;
 use crate::photon::{PhotonSettings, trace_photons};
@@ -50,10 +51,13 @@ pub(super) fn light(
 
     let clock = Clock::start();
     let stage = progress.stage("photons", settings.photons);
+    let fields = std::iter::once(&first.field).chain(first.companions().iter().map(|c| &c.member.field));
+    let axis = IsovalueAxis::of(fields.map(|field| field.samples()));
     let photon_settings = PhotonSettings {
         count: settings.photons,
         max_bounces: settings.bounces,
         seed: settings.seed,
+        axis,
         fixed_isovalue: None,
     };
     let photons = trace_photons(first, &tracers[0], &photon_settings, &|n| stage.tick(n));
@@ -70,7 +74,7 @@ pub(super) fn light(
     // The walls' light of all isovalues; what the nodes take from photons.
     let clock = Clock::start();
     let stage = progress.stage("walls", 0);
-    let cache_settings = settings.cache();
+    let cache_settings = settings.cache(axis);
     let estimate = settings.estimate();
     let gather = settings.gather_rays > 0;
     let unsaved = [checkpoint::Stage::UNSAVED; 2];

@@ -3,6 +3,7 @@
 use super::{can_sweep, left_out};
 use crate::error::{Error, Result};
 use crate::illumination_grid::GridSize;
+use crate::isovalue_axis::IsovalueAxis;
 use crate::photon_map::{EstimateSettings, Estimator, Normalisation};
 use crate::radiance_cache::CacheSettings;
 use crate::sampling::Strategy;
@@ -476,12 +477,13 @@ impl BakeSettings {
         }
     }
 
-    pub(super) fn cache(&self) -> CacheSettings {
+    pub(super) fn cache(&self, axis: IsovalueAxis) -> CacheSettings {
         CacheSettings {
             node_shadow_rays: self.cache_shadow_rays,
             flat_shadow_rays: self.wall_shadow_rays,
             flat_resolution: self.wall_resolution,
             isovalue_resolution: self.wall_isovalues,
+            axis,
             seed: self.seed,
         }
     }

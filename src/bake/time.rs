@@ -8,6 +8,7 @@ use crate::error::Result;
 use crate::flat;
 use crate::flattened::Departure;
 use crate::illumination_grid::GridSize;
+use crate::isovalue_axis::IsovalueAxis;
 use crate::mask::{Mask, masks};
 use crate::nearest::Neighbours;
 use crate::photon::{PhotonSettings, Photons, trace_photons};
@@ -107,7 +108,13 @@ impl TimeEstimate {
         let pyramids = pyramids(scene);
         let tracer = GraphTracer::with_pyramids(device, scene, &pyramids)?;
         let count = settings.photons.min(PHOTONS);
-        let pilot = PhotonSettings { count, max_bounces: settings.bounces, seed: settings.seed, fixed_isovalue: None };
+        let pilot = PhotonSettings {
+            count,
+            max_bounces: settings.bounces,
+            seed: settings.seed,
+            axis: IsovalueAxis::EVEN,
+            fixed_isovalue: None,
+        };
         let begun = Instant::now();
         let photons = trace_photons(scene, &tracer, &pilot, &|_| true);
         let all = begun.elapsed().as_secs_f64() * settings.photons as f64 / count.max(1) as f64;
@@ -258,7 +265,7 @@ fn walls_seconds(scene: &Scene, tracer: &GraphTracer<'_>, photons: &Photons, set
     let all = texels(walls);
     let share = (photons.emitted as f64 / settings.photons.max(1) as f64).min(MOST_SHADOWED / all.max(1.0));
     let across = ((walls as f64 * share.sqrt()) as usize).clamp(walls.min(LEAST_ACROSS), walls);
-    let tried = CacheSettings { flat_resolution: across, ..settings.cache() };
+    let tried = CacheSettings { flat_resolution: across, ..settings.cache(IsovalueAxis::EVEN) };
     let unsaved = [checkpoint::Stage::UNSAVED; 2];
     let begun = Instant::now();
     RadianceCache::new(scene, tracer, photons, settings.estimate(), &tried, false, unsaved, &|_| true);

@@ -10,6 +10,7 @@ use crate::field::{Field, FieldRows, Sweep, span};
 use crate::flat::{self, FlatTexture};
 use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
+use crate::isovalue_axis::IsovalueAxis;
 use crate::mask::Mask;
 use crate::polygon::Polygon;
 use crate::reflectance::Reflectance;
@@ -57,9 +58,21 @@ struct TextureDescription {
     array: String,
     /// Texels along u, v and the isovalue.
     dims: [usize; 3],
+    /// Where the isovalue's texels crowd, if not ½ ([`IsovalueAxis::around`]).
+    #[serde(default = "half", skip_serializing_if = "is_half")]
+    middle: f32,
     /// Texels of the array before it.
     #[serde(default)]
     start: usize,
+}
+
+/// [`IsovalueAxis::middle`] of even texels.
+fn half() -> f32 {
+    0.5
+}
+
+fn is_half(middle: &f32) -> bool {
+    *middle == 0.5
 }
 
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -212,7 +225,7 @@ fn completed(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
         } else {
             texels.push((array.clone(), Cow::Borrowed(t.texels.as_flattened())));
         }
-        textures.push(TextureDescription { flat: n, array, dims: t.dims, start });
+        textures.push(TextureDescription { flat: n, array, dims: t.dims, middle: t.axis.middle(), start });
     }
     if !context.is_empty() {
         texels.push((CONTEXT.to_owned(), Cow::Owned(context)));
@@ -468,7 +481,7 @@ impl BakedVolume {
                 ))
             })?;
             if let Some(slot) = flats.get_mut(t.flat) {
-                *slot = Some(FlatTexture { dims: t.dims, texels: own.to_vec() });
+                *slot = Some(FlatTexture { dims: t.dims, axis: IsovalueAxis::around(t.middle), texels: own.to_vec() });
             }
         }
         let (exposure, report) = (d.exposure, d.report);

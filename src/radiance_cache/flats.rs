@@ -39,21 +39,22 @@ pub(super) fn fill_flat<T: Tracer>(
 ) -> Filled {
     let Some(flat) = flat::flat(scene, number).filter(|f| !f.albedo.black()) else { return Filled::default() };
     let dims = flat.resolution(settings.flat_resolution, settings.isovalue_resolution);
-    let centres = FlatTexture::black(dims);
+    let black = FlatTexture { axis: settings.axis, ..FlatTexture::black(dims) };
+    let isovalues = settings.axis.centres(dims[2]);
     let lattice = scene.lattice();
     let mut parts = flat.texels(dims);
     let hidden = Hidden::new(scene, number, &flat);
     hidden.take_off(dims, &mut parts);
     let solid = Solid::new(scene, number, &flat);
-    let open = solid.as_ref().and_then(|s| Open::new(s, dims));
+    let open = solid.as_ref().and_then(|s| Open::new(s, dims, &settings.axis));
     // Where no solid stands, none holds photons.
     let solid = solid.filter(|_| open.is_some());
     // What lights the hidden part is no light of what is left of a texel.
     let photons = photons.filter(|p| !hidden.holds([p.uvc[0], p.uvc[1]].map(f64::from)));
-    let Landings { powers, counts } = Landings::new(dims, &parts, photons, solid.as_ref());
+    let Landings { powers, counts } = Landings::new(&black, &parts, photons, solid.as_ref());
     let outer = |i: usize| open.as_ref().is_none_or(|o| o.outer[i]);
     let irradiance = |i: usize, at: [f64; 2]| {
-        let c = centres.centre(i)[2];
+        let c = isovalues[i / parts.len()];
         #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
         let receiver = Receiver {
             position: lattice.to_index(flat.at(at)).as_vec3(),
@@ -66,7 +67,7 @@ pub(super) fn fill_flat<T: Tracer>(
         rays.fetch_add(direct.rays, Ordering::Relaxed);
         direct.mean
     };
-    let lit: Vec<Option<DVec3>> = (0..centres.texels.len())
+    let lit: Vec<Option<DVec3>> = (0..black.texels.len())
         .into_par_iter()
         .with_min_len(256)
         .map(|i| {
@@ -80,8 +81,10 @@ pub(super) fn fill_flat<T: Tracer>(
         })
         .collect();
     let direct = widened(&lit, dims, &outer);
-    let texel = areas * flat.area() / (dims[0] * dims[1]) as f64 / dims[2] as f64;
-    let densities = powers.map(|power| power.into_iter().map(|p| p / texel).collect::<Vec<DVec3>>());
+    let texel = areas * flat.area() / (dims[0] * dims[1]) as f64;
+    let sizes: Vec<f64> = settings.axis.edges(dims[2]).windows(2).map(|c| texel * (c[1] - c[0])).collect();
+    let density = |(i, p): (usize, DVec3)| p / sizes[i / parts.len()];
+    let densities = powers.map(|power| power.into_iter().enumerate().map(density).collect::<Vec<DVec3>>());
     // Of each texel, the outer part and that within solids.
     let share = |i: usize| open.as_ref().map_or(1.0, |o| o.shares[i]);
     let covered = |i: usize| parts[i % parts.len()].covered;
@@ -95,8 +98,8 @@ pub(super) fn fill_flat<T: Tracer>(
     // The texel that stands for one.
     let source = |n: usize| n - n % parts.len() + parts[n % parts.len()].source;
     let texture = |reflects: &dyn Fn(usize) -> DVec3| {
-        let texels = (0..direct.len()).map(|n| reflected(flat.albedo.at(centres.centre(n)[2]), reflects(n)));
-        FlatTexture { dims, texels: texels.map(|l| l.as_vec3().to_array()).collect() }
+        let texels = (0..direct.len()).map(|n| reflected(flat.albedo.at(isovalues[n / parts.len()]), reflects(n)));
+        FlatTexture { dims, axis: settings.axis, texels: texels.map(|l| l.as_vec3().to_array()).collect() }
     };
     // Outside solids and within.
     let smoothed = |kernel: &Kernel| [Some(indirect(0, kernel)), (counts[1] > 0).then(|| indirect(1, kernel))];
@@ -160,12 +163,11 @@ struct Landings {
 
 impl Landings {
     fn new(
-        dims: [usize; 3],
+        bins: &FlatTexture,
         parts: &[Texel],
         photons: impl Iterator<Item = FlatPhoton>,
         solid: Option<&Solid>,
     ) -> Self {
-        let bins = FlatTexture::black(dims);
         let mut all = Self { powers: [(); 2].map(|()| vec![DVec3::ZERO; bins.texels.len()]), counts: [0; 2] };
         for p in photons.filter(|p| p.bounces > 0) {
             let texel = bins.texel(p.uvc);
@@ -258,6 +260,7 @@ mod tests {
     use super::*;
     use crate::field::{Field, Sweep};
     use crate::flattened::{FlattenedHit, FlattenedRay, Side};
+    use crate::isovalue_axis::IsovalueAxis;
     use crate::rng::Rng;
     use crate::scene::{Boundary, Surface, cornell_box};
     use crate::volume::{Lattice, Samples, Volume};
@@ -268,6 +271,7 @@ mod tests {
         flat_shadow_rays: 64,
         flat_resolution: 24,
         isovalue_resolution: 12,
+        axis: IsovalueAxis::EVEN,
         seed: 1,
     };
 
@@ -385,7 +389,7 @@ mod tests {
         let lit = fill(&photons.iter().copied().chain(within).collect::<Vec<_>>());
         let deep = [place[0], place[1], 0.4];
         assert!(lit.lookup(deep).x > 3.0 * expected && texture.lookup(deep).x == 0.0, "{}", lit.lookup(deep));
-        let open = Open::new(&solid, texture.dims).unwrap();
+        let open = Open::new(&solid, texture.dims, &texture.axis).unwrap();
         assert!((0..texture.texels.len()).filter(|&i| open.outer[i]).all(|i| texture.texels[i] == lit.texels[i]));
     }
 

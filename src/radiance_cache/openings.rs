@@ -3,6 +3,7 @@
 use crate::field::Field;
 use crate::flat::{Flat, Texel};
 use crate::flattened::{Side, split_face};
+use crate::isovalue_axis::IsovalueAxis;
 use crate::neighbourhood::neighbourhood;
 use crate::polygon::Polygon;
 use crate::scene::Scene;
@@ -94,6 +95,8 @@ const PLACES: usize = 4;
 /// The part of each texel that light reaches.
 pub(super) struct Open {
     dims: [usize; 3],
+    /// The isovalues' centres.
+    middles: Vec<f64>,
     /// Per texel of one isovalue: at its places, the last of which is its centre.
     openings: Vec<[Opening; MOST + 1]>,
     /// Its share, [0, 1].
@@ -108,8 +111,9 @@ const MOST: usize = PLACES * PLACES;
 
 impl Open {
     /// `None` if all is open.
-    pub(super) fn new(solid: &Solid, dims: [usize; 3]) -> Option<Self> {
+    pub(super) fn new(solid: &Solid, dims: [usize; 3], axis: &IsovalueAxis) -> Option<Self> {
         let [nu, nv, nc] = dims;
+        let edges = axis.edges(nc);
         let openings: Vec<[Opening; MOST + 1]> = (0..nu * nv)
             .into_par_iter()
             .with_min_len(64)
@@ -119,22 +123,22 @@ impl Open {
             .into_par_iter()
             .with_min_len(1024)
             .map(|i| {
-                let isovalue = (i / (nu * nv)) as f64;
-                let [lo, hi] = [isovalue / nc as f64, (isovalue + 1.0) / nc as f64];
+                let isovalue = i / (nu * nv);
+                let [lo, hi] = [edges[isovalue], edges[isovalue + 1]];
                 let open = |[above, up_to]: Opening| (hi.min(up_to) - lo.max(above)).max(0.0) / (hi - lo);
                 openings[i % (nu * nv)][..MOST].iter().map(|&p| open(p)).sum::<f64>() / MOST as f64
             })
             .collect();
         let outer = |i: usize| neighbourhood(dims, i).any(|run| shares[run].iter().any(|s| *s > 0.0));
         let outer = (0..shares.len()).map(outer).collect();
-        shares.iter().any(|&s| s < 1.0).then_some(Self { dims, openings, shares, outer })
+        shares.iter().any(|&s| s < 1.0).then_some(Self { dims, middles: axis.centres(nc), openings, shares, outer })
     }
 
     /// Where texel `i` is open at its middle isovalue, or where it is not: its centre if that is so, else the place
     /// nearest to the centroid of those that are; `None` if it is nowhere so.
     pub(super) fn place(&self, i: usize, open: bool) -> Option<Place> {
-        let [nu, nv, nc] = self.dims;
-        let (texel, middle) = (i % (nu * nv), ((i / (nu * nv)) as f64 + 0.5) / nc as f64);
+        let [nu, nv, _] = self.dims;
+        let (texel, middle) = (i % (nu * nv), self.middles[i / (nu * nv)]);
         let of = |n: usize| is_open(self.openings[texel][n], middle) == open;
         if of(MOST) {
             return Some(place(self.dims, texel, MOST));

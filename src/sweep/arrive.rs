@@ -2,7 +2,7 @@
 //! running maximum of h.
 
 use super::ends::Ends;
-use super::flats::{Arrivals, Flats, Stop, fill_column, shapes, sinks};
+use super::flats::{Arrivals, Flats, Stop, below, fill_column, shapes, sinks};
 use super::gaps::Crossing;
 use super::gather::{Pass, local_bounds};
 use super::half::{Half4, colour, decode};
@@ -368,7 +368,7 @@ impl<'a> Walls<'a> {
 
     /// Its sign · c.
     fn height(&self, t: usize) -> f32 {
-        (t as f32 + 0.5) / self.flats.isovalues as f32 - if self.plan.sign < 0.0 { 1.0 } else { 0.0 }
+        self.plan.sign * self.flats.centres[self.ordinal(t)]
     }
 
     /// The first `count` isovalues meet the cap where the line crosses Ω's face at `tau`.
@@ -412,13 +412,12 @@ impl<'a> Walls<'a> {
     }
 
     /// What the caps at a line's entry and exit see outside Ω.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the isovalues")]
     fn caps(&self, pack: &Pack, lane: usize, span: [f64; 2], (p, q): (isize, isize), out: &mut Arrivals) {
         let nc = self.flats.isovalues;
         let pq = (p as f64, q as f64);
         for (end, h) in [false, true].map(|forward| pack.border(lane, forward)).into_iter().enumerate() {
             let Some(h) = h else { continue };
-            let covered = ((h * nc as f32 + 0.5).floor().max(0.0) as usize).min(nc);
+            let covered = below(&self.flats.axis, nc, h);
             if covered > 0 {
                 let next = self.ends.stop(pq.0, pq.1, span[end], end == 1, None);
                 let cap = self.cap_stop(span[end], pq);

@@ -4,7 +4,7 @@
 use super::blockers::Blockers;
 use super::clearance::Clearance;
 use super::fans::Fans;
-use super::flats::{Flats, capped};
+use super::flats::{self, Flats, capped};
 use super::grid::Geometry;
 use super::near;
 use super::open_share::OpenShare;
@@ -212,9 +212,9 @@ fn walls(
     let lattice = scene.lattice();
     let light = &scene.polygons()[number as usize];
     let points = part.on(light, number);
-    let nc = flats.isovalues;
+    let (nc, axis) = (flats.isovalues, flats.axis);
     let corrections = [Side::Lower, Side::Higher]
-        .map(|side| (0..nc).map(|t| share.correction(side, (t as f32 + 0.5) / nc as f32)).collect::<Vec<f64>>());
+        .map(|side| flats.centres.iter().map(|&c| share.correction(side, c)).collect::<Vec<f64>>());
     let caps = scene.polygons().len();
     let [lower, higher] = [Side::Lower, Side::Higher].map(|s| sides.contains(&s));
     let higher = higher && !capped(scene);
@@ -239,7 +239,7 @@ fn walls(
             let stream = stream(part.replicate, number, id, texel);
             let mut rng = Rng::stream(part.seed, Stage::Sweep, stream);
             // Number of isovalue texels at or below h.
-            let below = |h: f32| ((h * nc as f32 + 0.5).floor().max(0.0) as usize).min(nc);
+            let below = |h: f32| flats::below(&axis, nc, h);
             // Σ g of what begins at each isovalue texel on the lower side, and of what ends before it on the higher
             // one.
             let (mut lit, mut all) = (Staircases::new(nc), Staircases::new(nc));

@@ -142,7 +142,7 @@ impl<'a> Touching<'a> {
     #[allow(clippy::cast_possible_truncation, reason = "texture coordinates")]
     pub(super) fn now(&self, geometry: &Geometry, flats: &Flats) -> Touched<'_> {
         let (lattice, dims) = (self.scene.lattice(), geometry.dims);
-        let stands = Light { b: &[], flats: &flats.packed, isovalues: flats.isovalues };
+        let stands = Light { b: &[], flats: &flats.packed, isovalues: flats.isovalues, axis: &flats.axis };
         let radiance = std::array::from_fn(|face| {
             let shown = |(at, &number): (usize, &u16)| {
                 let Some(wall) = self.scene.polygons().get(usize::from(number)) else { return Half4::default() };

@@ -6,6 +6,7 @@ use super::gather::local_bounds;
 use super::half::{Half4, encode};
 use crate::flat::{self, Flat, FlatTexture};
 use crate::isa::Isa;
+use crate::isovalue_axis::IsovalueAxis;
 use crate::scene::{Boundary, Scene};
 use rayon::prelude::*;
 use std::f32::consts::PI;
@@ -15,6 +16,8 @@ use std::f32::consts::PI;
 pub(super) struct Texture {
     /// Texels along u, v and isovalues.
     pub dims: [usize; 3],
+    /// Where the isovalues stand.
+    axis: IsovalueAxis,
     /// Diffuse reflectance at every isovalue.
     pub albedo: Vec<[f32; 3]>,
     /// Texels along u and v that lines report to, as [`sinks`].
@@ -133,6 +136,10 @@ pub(super) struct Flats {
     pub textures: Vec<Option<Texture>>,
     /// Isovalue texels of every texture.
     pub isovalues: usize,
+    /// Where they stand.
+    pub axis: IsovalueAxis,
+    /// Their centres.
+    pub centres: Vec<f32>,
     /// B of black and of all textures times the pass's scale, as lines read it: isovalues fastest.
     pub packed: Vec<Half4>,
 }
@@ -170,8 +177,18 @@ pub(crate) fn texels(scene: &Scene, across: usize, isovalues: usize) -> usize {
     shapes(scene, across).flatten().map(|(_, [u, v])| u * v * isovalues).sum()
 }
 
+/// How many of `n` isovalues that stand along `axis` are at or below h.
+#[inline(always)]
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the isovalues")]
+pub(super) fn below(axis: &IsovalueAxis, n: usize, h: f32) -> usize {
+    ((axis.place(h) * n as f32 + 0.5).floor().max(0.0) as usize).min(n)
+}
+
 impl Flats {
+    #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
     pub(super) fn new(scene: &Scene, across: usize, isovalues: usize) -> Self {
+        let axis = IsovalueAxis::of([scene.field.samples()]);
+        let centres = axis.centres(isovalues);
         // Black comes first.
         let mut next = isovalues;
         let textures = shapes(scene, across)
@@ -184,9 +201,8 @@ impl Flats {
                 Some(Texture {
                     dims: [u, v, isovalues],
                     sink,
-                    albedo: (0..isovalues)
-                        .map(|i| flat.albedo.at((i as f64 + 0.5) / isovalues as f64).as_vec3().to_array())
-                        .collect(),
+                    axis,
+                    albedo: centres.iter().map(|&c| flat.albedo.at(c).as_vec3().to_array()).collect(),
                     sink_area: flat.area() / (sink[0] * sink[1]) as f64,
                     direct: vec![0.0; n],
                     indirect: vec![0.0; n],
@@ -198,7 +214,8 @@ impl Flats {
                 })
             })
             .collect();
-        Self { textures, isovalues, packed: vec![[0; 4]; next] }
+        let centres = centres.into_iter().map(|c| c as f32).collect();
+        Self { textures, isovalues, axis, centres, packed: vec![[0; 4]; next] }
     }
 
     /// Whether nothing reflects.
@@ -474,7 +491,7 @@ impl Texture {
     /// `values` (isovalues fastest) in the order of [`FlatTexture`].
     pub(super) fn export(&self, values: &[f32]) -> FlatTexture {
         let [nu, nv, nc] = self.dims;
-        let mut out = FlatTexture::black(self.dims);
+        let mut out = FlatTexture { axis: self.axis, ..FlatTexture::black(self.dims) };
         for texel in 0..nu * nv {
             for i in 0..nc {
                 out.texels[i * nu * nv + texel] = std::array::from_fn(|c| values[(3 * texel + c) * nc + i]);

@@ -365,6 +365,7 @@ enum Met {
 mod tests {
     use super::*;
     use crate::isa::Isa;
+    use crate::isovalue_axis::IsovalueAxis;
     use crate::rng::{Rng, Stage};
     use crate::sweep::fans::{SAMPLED, march_row};
     use crate::sweep::half::{decode, encode};
@@ -428,7 +429,7 @@ mod tests {
             pack.cuts = vec![Cut { row: 14, lane: 3, places: [12, 16] }, Cut { row: 27, lane: 3, places: [20, 24] }];
             pack.open_gaps();
             let way = Way { strict: seed % 2 == 1, sign: 1.0, capped: seed % 4 == 2 };
-            let light = Light { b: &front, flats: &flats, isovalues: 4 };
+            let light = Light { b: &front, flats: &flats, isovalues: 4, axis: &IsovalueAxis::EVEN };
             let mut out = vec![vec![0f32; (ROWS - 2) * LANES]; 3];
             pack.scan(way, light, &mut out, (LANES, 0));
             let mut missing = [0; ROWS - 2];

@@ -81,7 +81,7 @@ struct Family<'a> {
 
 impl Family<'_> {
     fn light(&self) -> Light<'_> {
-        Light { b: self.source.b, flats: &self.flats.packed, isovalues: self.flats.isovalues }
+        Light { b: self.source.b, flats: &self.flats.packed, isovalues: self.flats.isovalues, axis: &self.flats.axis }
     }
 }
 

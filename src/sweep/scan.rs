@@ -4,6 +4,7 @@
 
 use super::half::{Half4, colour, decode};
 use super::pack::{Cut, LANES, OUTSIDE, Pack};
+use crate::isovalue_axis::IsovalueAxis;
 
 /// What rays meet.
 #[derive(Clone, Copy)]
@@ -13,13 +14,15 @@ pub(super) struct Light<'a> {
     /// What stands at ends, as [`super::flats::Flats`] packs it, and its isovalues.
     pub flats: &'a [Half4],
     pub isovalues: usize,
+    /// Where these stand.
+    pub axis: &'a IsovalueAxis,
 }
 
 impl Light<'_> {
     /// What stands at a place of the ends on isovalue `c`.
     #[inline(always)]
     pub(super) fn end(&self, place: usize, c: f32) -> [f32; 3] {
-        let (i, f) = isovalue(self.isovalues, c);
+        let (i, f) = isovalue(self.axis, self.isovalues, c);
         let (a, b) = (self.flats[place + i], self.flats[place + i + 1]);
         std::array::from_fn(|c| (1.0 - f) * decode(a[c]) + f * decode(b[c]))
     }
@@ -141,11 +144,11 @@ impl Pack {
         Ok(self.node.as_flattened()[if first { near } else { j }])
     }
 }
-/// Between which texels of n ≥ 2 isovalue c lies, and how far: linear between texel centres.
+/// Between which of n ≥ 2 texels of an axis isovalue c stands, and how far: linear between texel centres.
 #[inline]
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the texture")]
-fn isovalue(n: usize, c: f32) -> (usize, f32) {
-    let x = (c * n as f32 - 0.5).max(0.0).min((n - 1) as f32);
+fn isovalue(axis: &IsovalueAxis, n: usize, c: f32) -> (usize, f32) {
+    let x = (axis.place(c) * n as f32 - 0.5).max(0.0).min((n - 1) as f32);
     let i = (x as usize).min(n - 2);
     (i, x - i as f32)
 }

@@ -138,6 +138,7 @@ in vec3 v_position;
 out vec4 colour;
 uniform sampler3D u_wall;
 uniform vec3 u_normal, u_corner, u_du, u_dv, u_emission;
+uniform float u_place;
 uniform bool u_cap, u_textured, u_opaque_back;
 
 // Texel-centred trilinear lookup, continued linearly over the outer half texels.
@@ -172,6 +173,6 @@ void main() {
     return;
   }
   vec3 x = v_position - u_corner, light = u_emission;
-  if (u_textured) light += wall(vec3(dot(u_du, x), dot(u_dv, x), u_iso));
+  if (u_textured) light += wall(vec3(dot(u_du, x), dot(u_dv, x), u_place));
   colour = display(light);
 }`;

@@ -24,6 +24,12 @@ function fail(text) {
 
 const toSource = (u) => scene.isovalues[0] + u * (scene.isovalues[1] - scene.isovalues[0]);
 const toUnit = (v) => (v - scene.isovalues[0]) / (scene.isovalues[1] - scene.isovalues[0]);
+const bits = (x) => new Int32Array(Float32Array.of(x).buffer)[0];
+/// Where the isovalue shown stands among a wall's texels (isovalue_axis.rs).
+function place({ even, from, slope, first, scale }) {
+  const c = clamp(state.iso, 0, 1);
+  return even * c + scale * (bits(from + slope * c) - first);
+}
 /// Linear between stops [isovalue, colour], constant beyond, at the isovalue shown.
 function albedo(stops) {
   const next = stops.findIndex(([c]) => c >= state.iso);
@@ -211,6 +217,7 @@ function draw() {
     programs.flat.set({
       u_normal: f.normal, u_albedo: albedo(f.albedo), u_emission: f.emission, u_corner: f.corner, u_du: f.du, u_dv: f.dv,
       u_cap: f.cap ? 1 : 0, u_textured: f.texture ? 1 : 0, u_opaque_back: f.opaqueBack ? 1 : 0,
+      u_place: f.texture ? place(f.texture.axis) : 0,
     });
     gl.bindVertexArray(f.vertex_array);
     gl.drawArrays(gl.TRIANGLE_FAN, 0, f.count);

@@ -8,6 +8,7 @@ use isolume::direct::Receiver;
 use isolume::embree::{Device, GraphTracer, SurfaceTracer};
 use isolume::flattened::{Departure, Side};
 use isolume::gather::gathered_irradiance;
+use isolume::isovalue_axis::IsovalueAxis;
 use isolume::photon::trace_photons;
 use isolume::photon_map::EstimateSettings;
 use isolume::radiance::{Indirect, RadianceSample, sample_radiance};
@@ -98,6 +99,7 @@ fn joint_cache(views: &[Scene; 2], tracers: &[GraphTracer; 2], count: u64) -> Ra
         flat_shadow_rays: 128,
         flat_resolution: 64,
         isovalue_resolution: 32,
+        axis: IsovalueAxis::EVEN,
         seed: 1,
     };
     let (estimate, unsaved) = (EstimateSettings::default(), [checkpoint::Stage::UNSAVED; 2]);

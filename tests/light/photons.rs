@@ -6,6 +6,7 @@ use isolume::direct::{Receiver, direct_irradiance, luminance};
 use isolume::embree::{Device, GraphTracer};
 use isolume::flattened::{Departure, Side};
 use isolume::gather::gathered_irradiance;
+use isolume::isovalue_axis::IsovalueAxis;
 use isolume::nearest::Neighbours;
 use isolume::photon::{ENERGY_BINS, PhotonSettings, Photons, octant};
 use isolume::photon_map::{EstimateSettings, Estimator, Normalisation, PhotonMap};
@@ -191,6 +192,7 @@ fn forward_is_backward() {
         flat_shadow_rays: 16,
         flat_resolution: 48,
         isovalue_resolution: 24,
+        axis: IsovalueAxis::EVEN,
         seed: 2,
     };
     let estimate = EstimateSettings::default();

@@ -5,6 +5,7 @@ use isolume::bake::{Bake, BakeOptions, BakeSettings, Engine, StrategyName, bake}
 use isolume::embree::{Device, GraphTracer};
 use isolume::field::{Field, Sweep};
 use isolume::flattened::Side;
+use isolume::isovalue_axis::IsovalueAxis;
 use isolume::mask::Mask;
 use isolume::photon::{PhotonSettings, Photons, trace_photons};
 use isolume::polygon::Polygon;
@@ -87,7 +88,7 @@ pub(crate) fn photons(scene: &Scene, settings: &PhotonSettings) -> Photons {
 
 /// `count` photons of any isovalue, cut off by roulette only.
 pub(crate) fn emission(count: u64, seed: u64) -> PhotonSettings {
-    PhotonSettings { count, max_bounces: u16::MAX, seed, fixed_isovalue: None }
+    PhotonSettings { count, max_bounces: u16::MAX, seed, axis: IsovalueAxis::EVEN, fixed_isovalue: None }
 }
 
 /// (node, world position, isovalue, green radiance, standard error) of the first side's valid points.

@@ -2,6 +2,7 @@
 //! all ones in a lane that is meant. Gathers cost as much as loads one by one here, or more, so that lines which lie
 //! close together are permuted out of what two loads bring.
 
+use crate::isovalue_axis::IsovalueAxis;
 use crate::sweep::clearance::Clearance;
 use crate::sweep::fans::{HIGHER, LOWER, SAMPLED, march_row};
 use crate::sweep::half::Half4;
@@ -339,6 +340,17 @@ fn look(pack: &Pack, way: Way, light: Light, out: &mut [Vec<f32>], (width, start
     }
 }
 
+/// [`IsovalueAxis::place`] of eight isovalues.
+#[target_feature(enable = "avx2")]
+#[inline]
+fn place(axis: &IsovalueAxis, c: __m256) -> __m256 {
+    let c = _mm256_min_ps(_mm256_max_ps(c, _mm256_setzero_ps()), _mm256_set1_ps(1.0));
+    let u = _mm256_add_ps(_mm256_set1_ps(axis.from), _mm256_mul_ps(_mm256_set1_ps(axis.slope), c));
+    let rise = _mm256_sub_epi32(_mm256_castps_si256(u), _mm256_set1_epi32(axis.first));
+    let rise = _mm256_mul_ps(_mm256_set1_ps(axis.scale), _mm256_cvtepi32_ps(rise));
+    _mm256_add_ps(_mm256_mul_ps(_mm256_set1_ps(axis.even), c), rise)
+}
+
 /// What the downhill rays of half a row meet; asks memory for it.
 #[target_feature(enable = "avx2,f16c")]
 #[inline]
@@ -373,7 +385,7 @@ fn meet(pack: &Pack, way: Way, light: Light, (row, side): (usize, usize), met: &
     }
     if _mm256_movemask_ps(ended) != 0 {
         let c = _mm256_mul_ps(h, _mm256_set1_ps(way.sign));
-        let x = _mm256_sub_ps(_mm256_mul_ps(c, _mm256_set1_ps(n as f32)), half);
+        let x = _mm256_sub_ps(_mm256_mul_ps(place(light.axis, c), _mm256_set1_ps(n as f32)), half);
         let x = _mm256_min_ps(_mm256_max_ps(x, zero), _mm256_set1_ps((n - 1) as f32));
         let i = _mm256_min_epi32(_mm256_cvttps_epi32(x), _mm256_set1_epi32(n as i32 - 2));
         met.f = _mm256_sub_ps(x, _mm256_cvtepi32_ps(i));

@@ -1,5 +1,6 @@
 //! AVX-512, sixteen lines in sixteen lanes: what the compiler does not find in the plain code.
 
+use crate::isovalue_axis::IsovalueAxis;
 use crate::sweep::clearance::Clearance;
 use crate::sweep::fans::{HIGHER, LOWER, SAMPLED};
 use crate::sweep::half::Half4;
@@ -286,6 +287,17 @@ fn look(pack: &Pack, way: Way, light: Light, out: &mut [Vec<f32>], (width, start
     }
 }
 
+/// [`IsovalueAxis::place`] of sixteen isovalues.
+#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
+#[inline]
+fn place(axis: &IsovalueAxis, c: __m512) -> __m512 {
+    let c = _mm512_min_ps(_mm512_max_ps(c, _mm512_setzero_ps()), _mm512_set1_ps(1.0));
+    let u = _mm512_add_ps(_mm512_set1_ps(axis.from), _mm512_mul_ps(_mm512_set1_ps(axis.slope), c));
+    let rise = _mm512_sub_epi32(_mm512_castps_si512(u), _mm512_set1_epi32(axis.first));
+    let rise = _mm512_mul_ps(_mm512_set1_ps(axis.scale), _mm512_cvtepi32_ps(rise));
+    _mm512_add_ps(_mm512_mul_ps(_mm512_set1_ps(axis.even), c), rise)
+}
+
 /// What the downhill rays of a row meet; asks memory for it.
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
 #[inline]
@@ -328,7 +340,7 @@ fn meet(pack: &Pack, way: Way, light: Light, row: usize) -> Met {
     }
     if ended != 0 {
         let c = _mm512_mul_ps(h, _mm512_set1_ps(way.sign));
-        let x = _mm512_sub_ps(_mm512_mul_ps(c, _mm512_set1_ps(n as f32)), half);
+        let x = _mm512_sub_ps(_mm512_mul_ps(place(light.axis, c), _mm512_set1_ps(n as f32)), half);
         let x = _mm512_min_ps(_mm512_max_ps(x, zero), _mm512_set1_ps((n - 1) as f32));
         let i = _mm512_min_epi32(_mm512_cvttps_epi32(x), _mm512_set1_epi32(n as i32 - 2));
         met.f = _mm512_sub_ps(x, _mm512_cvtepi32_ps(i));

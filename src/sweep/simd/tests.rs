@@ -1,5 +1,6 @@
 use super::*;
 use crate::field::{Field, Sweep};
+use crate::isovalue_axis::IsovalueAxis;
 use crate::rng::{Rng, Stage};
 use crate::sweep::clearance::tests::specks;
 use crate::sweep::grid::Geometry;
@@ -52,7 +53,8 @@ fn every_instruction_set_scans_to_the_same_bits() {
             let way = Way { strict: way & 2 == 2, sign: if way & 1 == 1 { 1.0 } else { -1.0 }, capped: false };
             let scan = |isa: Isa| {
                 let mut out = vec![vec![0f32; 48 * LANES]; 3];
-                let light = Light { b: &random(9), flats: &random(10), isovalues: 4 };
+                let axis = IsovalueAxis::around([0.5, 0.02, 0.9][seed as usize % 3]);
+                let light = Light { b: &random(9), flats: &random(10), isovalues: 4, axis: &axis };
                 isa.scan(&mut noise(seed), way, light, &mut out, (LANES, 0));
                 out.iter().flatten().map(|x| x.to_bits()).collect::<Vec<_>>()
             };
@@ -169,7 +171,8 @@ fn scans_find_the_next_greater_value() {
     let reference = noise(7);
     let mut out = vec![vec![0f32; 48 * LANES]; 3];
     let b = random(9);
-    let light = Light { b: &b, flats: &random(10), isovalues: 4 };
+    let axis = IsovalueAxis::EVEN;
+    let light = Light { b: &b, flats: &random(10), isovalues: 4, axis: &axis };
     Isa::current().scan(&mut pack, Way { strict: false, sign: 1.0, capped: false }, light, &mut out, (LANES, 0));
     let mut found = [0; 2];
     let h = |row: usize, lane: usize| reference.h[row][lane];
