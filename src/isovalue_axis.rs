@@ -15,10 +15,10 @@ const BINS: usize = 1 << 16;
 /// Samples that one thread counts at least.
 const BLOCK: usize = 1 << 20;
 
-/// A rising map of the sweep, [0, 1], onto itself: (1 − s) c + s ln(1 + c / a) / ln(1 + 1 / a) with s = ½ if half of
-/// all samples lie in the lowest tenth, that upside down if they lie in the highest, and otherwise c. a = m² / (1 − 2 m)
-/// puts the middle of the second term at their median m. For the logarithm stands what a float's bits are as an
-/// integer, which is linear between powers of two: the same everywhere, and inverted without loss.
+/// A rising map of the sweep, [0, 1], onto itself: (1 − s) c + s ln(1 + c / a) / ln(1 + 1 / a) with s = ½ if half
+/// of all samples lie in the lowest tenth, that upside down if they lie in the highest, and otherwise c. The middle of
+/// the second term is at their median m with a = m² / (1 − 2 m). For the logarithm stands what a float's bits are as
+/// an integer, which is linear between powers of two: the same everywhere, and inverted without loss.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct IsovalueAxis {
     middle: f32,
