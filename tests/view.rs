@@ -330,6 +330,34 @@ fn axes_caps_and_sides_are_where_render_has_them() {
     compare(dir, &program, &views, "");
 }
 
+/// Densities that fall by orders of magnitude, whose walls hold their isovalues along a bent axis: two level sets that
+/// lie within a texel of an even one.
+#[test]
+fn walls_of_crowded_isovalues_are_as_bright_as_render_has_them() {
+    let Some(program) = chromium() else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let lattice = Lattice::aligned([33; 3], DVec3::splat(-0.5), DVec3::splat(1.0 / 32.0)).unwrap();
+    let samples = (0..lattice.len()).map(|o| {
+        let x = lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)));
+        (-15.0 * (x - DVec3::new(0.013, -0.02, -0.007)).length()).exp()
+    });
+    let volume = Volume::new("density", lattice.clone(), Samples::F64(samples.collect())).unwrap();
+    volume.write(dir.join("b.nrrd")).unwrap();
+    isolume(
+        dir,
+        &[&["bake", "b.nrrd", "--isovalues", "0.001", "1", "-o", "out.vti", "--margin", "0.1"][..], &QUICK].concat(),
+    );
+    let texels = BakedVolume::read(&dir.join("out.vti")).unwrap().flats.into_iter().flatten();
+    assert!(texels.map(|t| t.axis).all(|axis| !axis.is_even() && axis.place(0.01) > 0.2));
+    let views = [0.0015, 0.01].map(|isovalue: f64| View {
+        name: if isovalue < 0.005 { "faint" } else { "dense" },
+        page: format!("{{ iso: {} }}", (isovalue - 0.001) / 0.999),
+        render: words(&format!("--isovalue {isovalue}")),
+    });
+    compare(dir, &program, &views, "");
+}
+
 /// Samples that are not finite were above every isovalue: their borders were drawn as surfaces, and as caps.
 #[test]
 fn gaps_are_open_where_render_has_them() {
