@@ -7,10 +7,12 @@
 mod belongs;
 mod clamped;
 mod floor;
+mod survey;
 
 pub use belongs::belongs;
 pub use clamped::clamped_variance;
 pub use floor::{interpolation_floor, through_grid, total_floor};
+pub use survey::{Part, Survey, SurveySettings, survey};
 
 use crate::error::{Error, Result};
 use crate::export::ply::PlyMesh;

@@ -85,6 +85,24 @@ impl Field {
         }
     }
 
+    /// The field of which this is a copy on a lattice `factor` times as fine: every so many-th sample. `None` if the
+    /// lattice is of no such.
+    #[must_use]
+    pub fn coarsened(&self, factor: usize) -> Option<Self> {
+        let cells = self.lattice.cells();
+        if factor == 0 || cells.iter().any(|n| n % factor != 0) {
+            return None;
+        }
+        let [nx, ny, nz] = cells.map(|n| n / factor + 1);
+        let lattice = Lattice::new([nx, ny, nz], self.lattice.origin(), self.lattice.axes() * factor as f64).ok()?;
+        let at = |o: usize| {
+            let [i, j, k] = lattice.ijk(o).map(|i| i * factor);
+            self.samples[self.lattice.offset(i, j, k)]
+        };
+        let samples = (0..lattice.len()).into_par_iter().with_min_len(1 << 14).map(at).collect();
+        Some(Self { lattice, samples, coarse: None, ..self.clone() })
+    }
+
     /// h at the points of another lattice over the same Ω, x fastest.
     pub fn samples_at(&self, lattice: &Lattice) -> Vec<f32> {
         let [nx, ny, _] = lattice.dims();
@@ -483,6 +501,14 @@ mod tests {
             assert!((f.receiver_gradient(p) - fine.receiver_gradient(2.0 * p)).length() < 1e-9);
         }
         assert!((fine.node_gradient([3, 2, 5]) - f.receiver_gradient(DVec3::new(1.5, 1.0, 2.5))).length() < 1e-12);
+        let back = fine.coarsened(2).unwrap();
+        assert_eq!(back.samples(), f.samples());
+        assert!(back.has_own_normals() && back.lattice().dims() == f.lattice().dims());
+        assert!(
+            (back.lattice().to_world(back.lattice().far()) - f.lattice().to_world(f.lattice().far())).length() < 1e-12
+        );
+        assert!(fine.coarsened(3).is_none() && fine.coarsened(0).is_none());
+        assert_eq!(f.coarsened(1).unwrap().samples(), f.samples());
     }
 
     /// A lattice whose points lie in cells and on nodes, the field's own, and those of a finer copy; gaps in the

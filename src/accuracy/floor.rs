@@ -141,7 +141,7 @@ pub fn through_grid(
 
 /// The eight lattice points around index coordinates `p`, with their linear weights.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "inside the lattice")]
-fn corners(lattice: &Lattice, p: DVec3) -> [(usize, f64); 8] {
+pub(super) fn corners(lattice: &Lattice, p: DVec3) -> [(usize, f64); 8] {
     let far = lattice.far();
     let p = p.clamp(DVec3::ZERO, far);
     let base = p.floor().min(far - 1.0);

@@ -1,10 +1,12 @@
-//! `isolume compare`: a bake against one or two references of an isosurface.
+//! `isolume compare`: a bake against one or two references of an isosurface, or all of its isosurfaces against paths.
 
-use super::{expect_extension, outputs};
-use crate::accuracy::{Accuracy, ReferenceMesh, belongs, compare};
+use super::{device, expect_extension, outputs};
+use crate::accuracy::{Accuracy, ReferenceMesh, Survey, SurveySettings, belongs, compare, survey};
+use crate::embree::GraphTracer;
 use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
 use crate::export::{Mesh, ply};
+use crate::field::span;
 use crate::progress::{Progress, say};
 use crate::reference::{Origin, light};
 use crate::scene_file::Inputs;
@@ -13,30 +15,51 @@ use std::path::PathBuf;
 
 #[derive(clap::Args, Debug)]
 #[command(after_help = "\
+Without references, all isosurfaces of the sweep are looked at: as many random points for each isovalue, over each isosurface
+evenly by area, against two independent sets of paths, whose noise cancels; and points of the grid, which interpolation has no part
+in. If those are much better, a finer --grid helps; if not, more directions, light points, photons or rays do.
+
 Colours are linear radiance × π / (largest albedo × E0), clamped to [0, 1]; percent_rms = 100 sqrt(mean |difference|²) over the
 reference's vertices, the squared Euclidean norm over three channels (BB09's printed formula leaves the square out).
 A reference that is of no isosurface of the bake's volume and sweep is refused; one of another material or box is warned of.
 One reference adds its own noise to the result (noise_floor); two of different seeds do not.
 
 Examples:
+  isolume compare out.vti
   isolume compare out.vti ref.ply --json
   isolume compare out.vti ref1.ply ref2.ply -o error.ply")]
 pub(super) struct Compare {
-    /// A bake (.vti)
+    /// A bake (.vti; without references also .vtm)
     bake: PathBuf,
     /// One or two references of the same isosurface (.ply)
-    #[arg(required = true, num_args = 1..=2, value_name = "REF")]
+    #[arg(num_args = 1..=2, value_name = "REF")]
     references: Vec<PathBuf>,
+    /// Without references: points on isosurfaces
+    #[arg(long, value_name = "N", default_value_t = 2000, conflicts_with = "references")]
+    points: usize,
+    /// Without references: paths of each of a point's two estimates
+    #[arg(long, value_name = "N", default_value_t = 256, conflicts_with = "references")]
+    paths: u32,
+    /// Without references: seed of points and paths
+    #[arg(long, default_value_t = 1, conflicts_with = "references")]
+    seed: u64,
+    /// Without references, of several volumes: the one to look at, by its name (default: the first)
+    #[arg(long, value_name = "NAME", conflicts_with = "references")]
+    field: Option<String>,
     /// Print JSON
     #[arg(long)]
     json: bool,
-    /// Write the mesh coloured by the error: `error` per vertex, and colours from black (0) over red to white (10 %)
-    #[arg(short, long, value_name = "FILE")]
+    /// With references: write the mesh coloured by the error: `error` per vertex, and colours from black (0) over red
+    /// to white (10 %)
+    #[arg(short, long, value_name = "FILE", requires = "references")]
     output: Option<PathBuf>,
 }
 
 impl Compare {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
+        if self.references.is_empty() {
+            return self.everywhere(progress);
+        }
         if let Some(output) = &self.output {
             expect_extension(output, &["ply"])?;
             outputs([&**output], &Inputs::files(self.references.iter().chain([&self.bake]).map(PathBuf::as_path)))?;
@@ -77,6 +100,74 @@ impl Compare {
         }
         Ok(())
     }
+
+    /// All isosurfaces of the bake against paths.
+    fn everywhere(&self, progress: Progress) -> Result<()> {
+        if !(1..=1 << 24).contains(&self.points) || !(1..=1 << 20).contains(&self.paths) {
+            return Err(Error::Invalid("--points: 1 to 16777216; --paths: 1 to 1048576".into()));
+        }
+        let in_file = |e: Error| e.in_file(&self.bake);
+        let baked = BakedVolume::read(&self.bake)?;
+        let baked = match &self.field {
+            Some(name) => baked.select(name).map_err(in_file)?,
+            None => baked,
+        };
+        baked.whole().map_err(in_file)?;
+        let own = baked.source().map_err(in_file)?;
+        if own.is_none() {
+            say!(
+                "warning: {}: its grid is not a whole number of times as fine as the volume, which it does not hold; paths see \
+                 normals of the grid, not of the volume",
+                self.bake.display()
+            );
+        }
+        let scene = own.unwrap_or_else(|| baked.scene.lit(baked.scene.number()));
+        let side = scene.surface.outside;
+        let Some((_, grid)) = baked.sides.iter().find(|(s, _)| *s == side) else {
+            return Err(Error::invalid(&self.bake, "does not hold the surface's outside"));
+        };
+        let settings = SurveySettings { points: self.points, paths: self.paths, seed: self.seed };
+        let device = device()?;
+        let tracer = GraphTracer::new(&device, &scene)?;
+        let stage = progress.stage("paths", 2 * self.points as u64);
+        let found = survey(&scene, &tracer, (baked.lattice(), grid), &settings, &|n| stage.tick(n));
+        stage.end()?;
+        let found = found.map_err(in_file)?;
+        if self.json {
+            println!("{}", serde_json::to_string_pretty(&found).expect("the numbers are plain data"));
+        } else {
+            print!("{}", everywhere(&found));
+        }
+        Ok(())
+    }
+}
+
+/// A survey's numbers, a line each.
+fn everywhere(s: &Survey) -> String {
+    let interval = |[lo, hi]: [f64; 2]| format!("(95 % confidence {lo:.3} … {hi:.3})");
+    let parts: String = s
+        .parts
+        .iter()
+        .filter(|p| p.points > 0)
+        .map(|p| {
+            // Fifths of a sweep have digits that mean nothing.
+            let ends = p.isovalues.map(|c| format!("{c:.5e}").parse().unwrap_or(c));
+            format!("  isovalues        {:8.3}   ({}; {} points)\n", p.percent_rms, span(ends.into()), p.points)
+        })
+        .collect();
+    format!(
+        "percent RMS       {:8.3}   {}\n  per channel, /√3 {:8.3}\n{parts}at grid points    {:8.3}   {}\n\
+         bias              {:+8.3}\npoints            {:8}   (2 × {} paths each; {} left out)\n",
+        s.percent_rms,
+        interval(s.confidence),
+        s.percent_rms_sqrt3,
+        s.percent_rms_grid_points,
+        interval(s.confidence_grid_points),
+        s.bias,
+        s.points,
+        s.paths,
+        s.left_out
+    )
 }
 
 /// The numbers, a line each.

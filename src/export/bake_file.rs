@@ -9,7 +9,7 @@ use crate::error::{Error, Result};
 use crate::field::{Field, FieldRows, Sweep, span};
 use crate::flat::{self, FlatTexture};
 use crate::flattened::Side;
-use crate::illumination_grid::IlluminationGrid;
+use crate::illumination_grid::{GridSize, IlluminationGrid};
 use crate::isovalue_axis::IsovalueAxis;
 use crate::mask::Mask;
 use crate::polygon::Polygon;
@@ -531,6 +531,23 @@ impl BakedVolume {
     /// The grid's lattice.
     pub fn lattice(&self) -> &Lattice {
         self.scene.lattice()
+    }
+
+    /// The scene that was lit, with its volumes on their own lattices again if the grid is so many times as fine.
+    /// `None` if the grid has other points: the volume's samples, and with them its normals, are not kept then.
+    ///
+    /// # Errors
+    /// `Invalid` if the file says nothing of its grid.
+    pub fn source(&self) -> Result<Option<Scene>> {
+        let grid = self.report.pointer("/settings/grid").and_then(serde_json::Value::as_str);
+        let Some(size) = grid.and_then(|g| g.parse().ok()) else {
+            return Err(Error::Invalid("its report names no grid; bake anew".into()));
+        };
+        let GridSize::Factor(factor) = size else { return Ok(None) };
+        let coarse = |m: Member| Some(Member { field: m.field.coarsened(factor)?.into(), ..m });
+        let Some(members) = self.scene.members().into_iter().map(coarse).collect() else { return Ok(None) };
+        let scene = Scene::with_members(members, self.scene.policy(), self.scene.polygons().to_vec())?;
+        Ok(Some(scene.lit(self.scene.number())))
     }
 
     /// Radiance of `side` at local `p`: trilinear over the points of the cell that hold something, as a 3D texture

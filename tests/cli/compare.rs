@@ -1,7 +1,9 @@
-//! `compare`: what it takes for a reference of a bake, and what it writes.
+//! `compare`: what it takes for a reference of a bake, what it finds without, and what it writes.
 
 use super::{QUICK, isolume, ok, refused, text};
 use glam::DVec3;
+use isolume::accuracy::SurveySettings;
+use isolume::embree::{Device, GraphTracer};
 use isolume::export::bake_file::BakedVolume;
 use isolume::export::ply::{self, PlyMesh};
 use isolume::volume::{Lattice, Samples, Volume};
@@ -122,6 +124,113 @@ fn another_material_or_box_is_warned_of() {
     assert!(comments[1].starts_with("isolume reference isovalue=47.0 seed=1 samples=4 integrator=path light="));
     let output = isolume(dir, &["compare", "lit.vti", "b.vti"]);
     assert_eq!(output.status.code(), Some(2), "a volume is no reference");
+}
+
+fn survey(dir: &Path, file: &str, more: &[&str]) -> serde_json::Value {
+    serde_json::from_slice(&ok(dir, &[&["compare", file, "--json", "-q"], more].concat()).stdout).unwrap()
+}
+
+/// Without references: a preview is as far off whatever the number of paths, with the same bits on any number of
+/// threads; and farther if some of its light is missing.
+#[test]
+fn all_isosurfaces_are_compared_with_paths() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "31", "-o", "b.vti", "-q"]);
+    ok(dir, &[&["bake", "b.vti", "-o", "lit.vti", "--preset", "preview", "-q"], &RANGE[..]].concat());
+    let number = |s: &serde_json::Value, name: &str| s[name].as_f64().unwrap();
+    let few = ["--points", "1500", "--paths", "64"];
+    let found = survey(dir, "lit.vti", &few);
+    assert_eq!(found, survey(dir, "lit.vti", &[&few[..], &["--threads", "1"]].concat()));
+    let other = survey(dir, "lit.vti", &[&few[..], &["--seed", "2"]].concat());
+    assert_ne!(found, other);
+    // However noisy paths are, that does not count.
+    let fewest = survey(dir, "lit.vti", &["--points", "6000", "--paths", "8"]);
+    for s in [&found, &other, &fewest] {
+        let confidence = s["confidence"].as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).collect::<Vec<_>>();
+        // 4.88 (4.64 to 5.11) by 60 000 points and 256 paths, 1.35 (1.21 to 1.48) at the grid's.
+        assert!((confidence[0]..confidence[1]).contains(&4.88) && number(s, "percent_rms") < 6.0, "{s}");
+        assert!((0.6..2.1).contains(&number(s, "percent_rms_grid_points")), "{s}");
+        assert!(number(s, "bias").abs() < 1.0 && s["parts"].as_array().unwrap().len() == 5, "{s}");
+    }
+    // A tenth of the light is missing.
+    let baked = BakedVolume::read(&dir.join("lit.vti")).unwrap();
+    let (device, scene) = (Device::new(0).unwrap(), baked.source().unwrap().unwrap());
+    let tracer = GraphTracer::new(&device, &scene).unwrap();
+    let mut grid = baked.sides[0].1.clone();
+    grid.radiance.as_flattened_mut().iter_mut().for_each(|x| *x *= 0.9);
+    let settings = SurveySettings { points: 1500, paths: 64, seed: 1 };
+    let dim = isolume::accuracy::survey(&scene, &tracer, (baked.lattice(), &grid), &settings, &|_| true).unwrap();
+    let missing = number(&found, "bias") - dim.bias;
+    assert!((1.0..8.0).contains(&missing) && dim.percent_rms > number(&found, "percent_rms") + 1.0, "{dim:?}");
+    let said = text(&ok(dir, &["compare", "lit.vti", "--points", "200", "--paths", "8", "-q"]).stdout);
+    assert!(
+        said.contains("percent RMS") && said.contains("at grid points") && said.contains("58.44 … 76.72"),
+        "{said}"
+    );
+}
+
+/// Paths see the volume's normals, not those of a grid twice as fine, as long as the file tells them.
+#[test]
+fn finer_grids_are_compared_on_the_volume_they_are_of() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
+    let field = |file: &str| BakedVolume::read(&dir.join(file)).unwrap().source().unwrap();
+    for (grid, own) in [("1x", true), ("3x", true), ("12,12,12", false)] {
+        bake(dir, "b.vti", "lit.vti", &[&RANGE[..], &["--grid", grid]].concat());
+        let said = text(&ok(dir, &["compare", "lit.vti", "--points", "50", "--paths", "2"]).stderr);
+        assert_eq!(said.contains("warning: lit.vti: its grid is not a whole number of times as fine"), !own, "{said}");
+        let Some(scene) = field("lit.vti") else {
+            assert!(!own, "{grid}");
+            continue;
+        };
+        assert!(own && scene.lattice().dims() == [9; 3]);
+        let volume = Volume::open(dir.join("b.vti")).unwrap();
+        let exact = (0..volume.samples().len()).map(|o| scene.field.sweep().isovalue(volume.value(o)));
+        assert!(scene.field.samples().iter().zip(exact).all(|(a, b)| (a - b).abs() < 1e-6));
+    }
+}
+
+#[test]
+fn several_volumes_are_compared_one_by_one_with_all_of_them_there() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
+    let volume = |name: &str, origin: &str| {
+        format!("[[volume]]\nname = \"{name}\"\nfile = \"b.vti\"\nisovalues = [3.6, 95.0]\norigin = {origin}\n")
+    };
+    let two = volume("left", "[0.0, 0.0, 0.0]") + &volume("right", "[1.5, 0.0, 0.0]");
+    fs::write(dir.join("two.toml"), two).unwrap();
+    bake(dir, "two.toml", "two.vtm", &["--engine", "photon"]);
+    let few = ["--points", "100", "--paths", "4"];
+    let [first, left, right] =
+        [&[][..], &["--field", "left"], &["--field", "right"]].map(|f| survey(dir, "two.vtm", &[&few[..], f].concat()));
+    assert!(first == left && left != right, "{left} {right}");
+    refused(dir, &["compare", "two-left.vti"], &["two-left.vti", "name the .vtm"]);
+    refused(dir, &["compare", "two.vtm", "--field", "middle"], &["two.vtm", "left", "right"]);
+}
+
+#[test]
+fn what_is_for_the_other_way_to_compare_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
+    bake(dir, "b.vti", "lit.vti", &RANGE);
+    reference(dir, "lit.vti", "r.ply", &["--isovalue", "47"]);
+    for wrong in [
+        &["compare", "lit.vti", "-o", "e.ply"][..],
+        &["compare", "lit.vti", "r.ply", "--points", "9"],
+        &["compare", "lit.vti", "r.ply", "--paths", "9"],
+        &["compare", "lit.vti", "r.ply", "--field", "x"],
+    ] {
+        let output = isolume(dir, wrong);
+        assert_eq!(output.status.code(), Some(2), "{wrong:?}");
+    }
+    for wrong in [["--points", "0"], ["--paths", "0"]] {
+        refused(dir, &["compare", "lit.vti", wrong[0], wrong[1]], &[wrong[0]]);
+    }
+    refused(dir, &["compare", "b.vti"], &["b.vti", "is no bake"]);
 }
 
 /// `error` and colour of every vertex of `compare -o`, from the two files that were compared.

@@ -1,0 +1,347 @@
+//! A survey of all isosurfaces of a bake at random points: no references need be made first, and no isovalue chosen.
+
+use super::display;
+use super::floor::corners;
+use crate::direct::Receiver;
+use crate::error::{Error, Result};
+use crate::field::Field;
+use crate::illumination_grid::IlluminationGrid;
+use crate::mask::{Mask, local_position};
+use crate::reference::{PathTracer, receiver};
+use crate::rng::{Rng, Stage};
+use crate::sampling::{Strategy, positions};
+use crate::scene::Scene;
+use crate::tracer::Tracer;
+use crate::volume::Lattice;
+use glam::DVec3;
+use rayon::prelude::*;
+use serde::Serialize;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// How much work a survey is worth.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SurveySettings {
+    /// Points on isosurfaces of the sweep, and as many points of the grid.
+    pub points: usize,
+    /// Paths of each of the two independent estimates that every point is compared with.
+    pub paths: u32,
+    /// Seed of points and paths.
+    pub seed: u64,
+}
+
+impl Default for SurveySettings {
+    fn default() -> Self {
+        Self { points: 2000, paths: 256, seed: 1 }
+    }
+}
+
+/// Percent RMS of isosurfaces of a part of the sweep.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Part {
+    /// Isovalues from and to, source units.
+    pub isovalues: [f64; 2],
+    /// Points that took part.
+    pub points: usize,
+    /// As [`Survey::percent_rms`].
+    pub percent_rms: f64,
+}
+
+/// How far a bake is from path tracing over all isosurfaces of its sweep. Percentages are of the display range [0, 1],
+/// as those of [`super::Accuracy`].
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Survey {
+    /// Points on isosurfaces that took part.
+    pub points: usize,
+    /// Paths of each of a point's two estimates.
+    pub paths: u32,
+    /// 100 √⟨(t − r₁)·(t − r₂)⟩ over points of which each isovalue has as many and each isosurface evenly by its area,
+    /// where t is what the bake's texture shows and r what paths find: without their noise, 0 where that is negative.
+    pub percent_rms: f64,
+    /// The same per channel: / √3.
+    pub percent_rms_sqrt3: f64,
+    /// 95 % confidence interval of `percent_rms`, from the scatter over points.
+    pub confidence: [f64; 2],
+    /// The same of points of the grid, each compared on its own level set: what is not due to interpolation.
+    pub percent_rms_grid_points: f64,
+    /// Its interval.
+    pub confidence_grid_points: [f64; 2],
+    /// 100 ⟨t − r⟩ over channels: the sign of the error.
+    pub bias: f64,
+    /// The error in fifths of the sweep.
+    pub parts: Vec<Part>,
+    /// Points left out since ∇h vanishes there, or since a luminaire covers them.
+    pub left_out: usize,
+    /// Rays traced.
+    pub rays: u64,
+}
+
+/// Parts of [`Survey::parts`].
+const PARTS: usize = 5;
+
+/// Isovalues that get as many points each.
+const STRATA: usize = 40;
+
+/// Points to choose from for each that is chosen.
+const CANDIDATES: usize = 32;
+
+/// Compares `grid` (over `lattice`, of the outside) with paths through `scene`, of whose field it is. `tick(n)` reports
+/// n of 2 · points done; returning false stops early, with a result that is worth nothing.
+///
+/// # Errors
+/// `Invalid` if no isosurface of the sweep is found.
+pub fn survey<T: Tracer>(
+    scene: &Scene,
+    tracer: &T,
+    (lattice, grid): (&Lattice, &IlluminationGrid),
+    settings: &SurveySettings,
+    tick: &(dyn Fn(u64) -> bool + Sync),
+) -> Result<Survey> {
+    let chosen = places(&scene.field, settings)?;
+    if chosen.is_empty() {
+        return Err(Error::Invalid("no isosurface of its sweep was found; bake a sweep that has some".into()));
+    }
+    let (exposure, side) = (scene.exposure(), scene.surface.outside);
+    let scale = lattice.far() / scene.lattice().far();
+    let rays = AtomicU64::new(0);
+    let compare = |p: DVec3, texture: DVec3, index: usize| {
+        #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
+        let receiver = receiver(scene, p, scene.field.value(p) as f32, side)?;
+        let open = !scene.covers(scene.lattice().to_world(p)) && tick(0);
+        open.then(|| Deviation::new(&receiver, texture, exposure, settings, (scene, tracer), (index, &rays)))
+    };
+    // On the isosurface, and at a point of the grid beside it.
+    let found: Vec<[Option<Deviation>; 2]> = chosen
+        .par_iter()
+        .enumerate()
+        .with_max_len(16)
+        .map(|(i, &p)| {
+            let between = compare(p, grid.interpolate(lattice, p * scale), 2 * i);
+            tick(1);
+            let at = beside(lattice, grid, p * scale, &mut stream(settings, i as u64)).and_then(|o| {
+                let texture = DVec3::from_array(grid.radiance[o].map(f64::from));
+                compare(local_position(&scene.field, lattice, o), texture, 2 * i + 1)
+            });
+            tick(1);
+            [between, at]
+        })
+        .collect();
+    let [all, at_points]: [Vec<Deviation>; 2] = [0, 1].map(|k| found.iter().filter_map(|f| f[k]).collect());
+    let (square, confidence) = mean_square(&all);
+    let (square_grid_points, confidence_grid_points) = mean_square(&at_points);
+    let sweep = scene.field.sweep();
+    let parts = (0..PARTS).map(|n| {
+        let ends = [n, n + 1].map(|i| i as f64 / PARTS as f64);
+        let within = |d: &&Deviation| (ends[0]..ends[1]).contains(&d.isovalue) || (n + 1 == PARTS && d.isovalue >= 1.0);
+        let own: Vec<Deviation> = all.iter().filter(within).copied().collect();
+        Part {
+            isovalues: ends.map(|u| sweep.from_unit(u)),
+            points: own.len(),
+            percent_rms: percent(mean_square(&own).0),
+        }
+    });
+    Ok(Survey {
+        points: all.len(),
+        paths: settings.paths,
+        percent_rms: percent(square),
+        percent_rms_sqrt3: percent(square / 3.0),
+        confidence: confidence.map(percent),
+        percent_rms_grid_points: percent(square_grid_points),
+        confidence_grid_points: confidence_grid_points.map(percent),
+        bias: 100.0 * all.iter().map(|d| d.bias).sum::<f64>() / (all.len() as f64).max(1.0),
+        parts: parts.collect(),
+        left_out: chosen.len() - all.len(),
+        rays: rays.into_inner(),
+    })
+}
+
+fn percent(square: f64) -> f64 {
+    100.0 * square.max(0.0).sqrt()
+}
+
+/// One point against paths.
+#[derive(Clone, Copy)]
+struct Deviation {
+    /// In units of the sweep.
+    isovalue: f64,
+    /// (t − r₁)·(t − r₂).
+    square: f64,
+    /// t − r, mean over channels.
+    bias: f64,
+}
+
+impl Deviation {
+    fn new<T: Tracer>(
+        at: &Receiver,
+        texture: DVec3,
+        exposure: f64,
+        settings: &SurveySettings,
+        (scene, tracer): (&Scene, &T),
+        (index, rays): (usize, &AtomicU64),
+    ) -> Self {
+        let mut paths = PathTracer::new(scene, tracer);
+        let [a, b] = [1, 2].map(|n| {
+            let key = (seed(settings, n), index as u64);
+            display(texture, exposure) - display(paths.outgoing(at, settings.paths, key), exposure)
+        });
+        rays.fetch_add(paths.rays, Ordering::Relaxed);
+        Self { isovalue: f64::from(at.isovalue), square: a.dot(b), bias: (a + b).element_sum() / 6.0 }
+    }
+}
+
+/// The seeds of a survey: none that anybody gives a bake.
+fn seed(settings: &SurveySettings, number: u64) -> u64 {
+    settings.seed ^ (number << 62)
+}
+
+/// What chooses: stream `index`.
+fn stream(settings: &SurveySettings, index: u64) -> Rng {
+    Rng::stream(seed(settings, 3), Stage::Sample, index)
+}
+
+/// Mean of the squares, and its 95 % confidence interval.
+fn mean_square(all: &[Deviation]) -> (f64, [f64; 2]) {
+    let n = (all.len() as f64).max(1.0);
+    let mean = all.iter().map(|d| d.square).sum::<f64>() / n;
+    let variance = all.iter().map(|d| (d.square - mean).powi(2)).sum::<f64>() / n;
+    let deviation = (variance / n).sqrt();
+    (mean, [mean - 1.96 * deviation, mean + 1.96 * deviation])
+}
+
+/// Points on isosurfaces of the sweep, local: as many for each isovalue, over each isosurface evenly by its area. Of
+/// points even in the volume, whose measure is dV = dA dc / |∇h|, those with a greater |∇h| are chosen more often.
+fn places(field: &Field, settings: &SurveySettings) -> Result<Vec<DVec3>> {
+    let count = (CANDIDATES * settings.points).max(1 << 16) as u64;
+    let candidates = positions(field, &Strategy::Uniform, count, seed(settings, 3))?;
+    let found: Vec<(f64, usize)> = candidates
+        .par_iter()
+        .map(|p| {
+            let (h, gradient) = field.value_and_gradient(p.as_dvec3());
+            #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within the strata")]
+            let stratum = ((h * STRATA as f64) as usize).min(STRATA - 1);
+            (gradient.length(), stratum)
+        })
+        .collect();
+    let mut area = [0.0; STRATA];
+    found.iter().filter(|f| f.0.is_finite()).for_each(|&(g, s)| area[s] += g);
+    let strata = area.iter().filter(|a| **a > 0.0).count() as f64;
+    // Every 1 / points of the running sum of weights, which end at 1.
+    let mut chosen = Vec::with_capacity(settings.points);
+    let offset = stream(settings, u64::MAX).unit();
+    let mut sum = 0.0;
+    for (&(g, s), p) in found.iter().zip(&candidates) {
+        if g.is_finite() && area[s] > 0.0 {
+            sum += g / (area[s] * strata) * settings.points as f64;
+            while chosen.len() < settings.points && chosen.len() as f64 + offset < sum {
+                chosen.push(p.as_dvec3());
+            }
+        }
+    }
+    Ok(chosen)
+}
+
+/// A point of the grid around index coordinates `p` that holds light of its own level set, as likely as interpolation
+/// weighs it; `None` without any.
+fn beside(lattice: &Lattice, grid: &IlluminationGrid, p: DVec3, rng: &mut Rng) -> Option<usize> {
+    let corners = corners(lattice, p);
+    let valid = || corners.into_iter().filter(|&(o, w)| w > 0.0 && grid.mask[o] == Mask::Valid);
+    let mut left = rng.unit() * valid().map(|c| c.1).sum::<f64>();
+    let chosen = valid().find(|&(_, w)| {
+        left -= w;
+        left < 0.0
+    });
+    chosen.map(|c| c.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::embree::{Device, GraphTracer};
+    use crate::field::Sweep;
+    use crate::flattened::Side;
+    use crate::scene::{Boundary, Surface, cornell_box};
+    use crate::volume::{Samples, Volume};
+
+    const N: usize = 41;
+    const GLOW: f64 = 0.5;
+
+    /// Black surfaces that glow, in a Cornell box, on [−1, 1]³: every path says exactly the same.
+    fn scene(h: impl Fn(DVec3) -> f64, sweep: [f64; 2]) -> Scene {
+        let step = 2.0 / (N - 1) as f64;
+        let lattice = Lattice::aligned([N; 3], DVec3::splat(-1.0), DVec3::splat(step)).unwrap();
+        let samples = (0..lattice.len()).map(|o| h(place(&lattice, o))).collect();
+        let volume = Volume::new("h", lattice.clone(), Samples::F64(samples)).unwrap();
+        let field = Field::new(&volume, Sweep::new(sweep[0], sweep[1]).unwrap()).unwrap();
+        let surface = Surface {
+            albedo: DVec3::ZERO.into(),
+            emission: DVec3::splat(GLOW),
+            outside: Side::Lower,
+            both_sides: false,
+        };
+        Scene::new(field, surface, Boundary::Open, cornell_box(&lattice, 0.0).unwrap()).unwrap()
+    }
+
+    fn place(lattice: &Lattice, o: usize) -> DVec3 {
+        lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)))
+    }
+
+    /// A survey of a grid that is off by `error` (of the place) in all channels.
+    fn surveyed(scene: &Scene, error: impl Fn(DVec3) -> f64, points: usize) -> Survey {
+        let lattice = scene.lattice();
+        let radiance = (0..lattice.len()).map(|o| [(GLOW + error(place(lattice, o))) as f32; 3]).collect();
+        let grid = IlluminationGrid {
+            radiance,
+            std_error: vec![0.0; lattice.len()],
+            mask: crate::mask::masks(&scene.field, lattice),
+        };
+        let device = Device::new(0).unwrap();
+        let tracer = GraphTracer::new(&device, scene).unwrap();
+        let settings = SurveySettings { points, paths: 1, seed: 3 };
+        survey(scene, &tracer, (lattice, &grid), &settings, &|_| true).unwrap()
+    }
+
+    #[test]
+    fn what_is_off_by_the_same_everywhere_is_off_by_that() {
+        let scene = scene(|x| 1.0 - x.length(), [0.1, 0.7]);
+        let s = surveyed(&scene, |_| 0.1, 300);
+        let expected = 100.0 * 0.1 * 3f64.sqrt();
+        for found in [s.percent_rms, s.percent_rms_grid_points, 3f64.sqrt() * s.percent_rms_sqrt3]
+            .into_iter()
+            .chain(s.confidence)
+            .chain(s.parts.iter().map(|p| p.percent_rms))
+        {
+            assert!((found - expected).abs() < 1e-4, "{found}: {s:?}");
+        }
+        assert!((s.bias - 10.0).abs() < 1e-4 && s.points == 300 && s.left_out == 0, "{s:?}");
+        assert_eq!(s.parts.iter().map(|p| p.points).sum::<usize>(), 300);
+        let right = surveyed(&scene, |_| 0.0, 300);
+        assert!(right.percent_rms < 1e-4 && right.bias.abs() < 1e-4, "{right:?}");
+    }
+
+    /// Spheres that are off by 0.2 z: ⟨z²⟩ is r²/3 on each, and every radius has as many points. Were they as many as
+    /// there is area, the error would be 1.13 times as large.
+    #[test]
+    fn every_isovalue_counts_as_much() {
+        let s = surveyed(&scene(|x| 1.0 - x.length(), [0.1, 0.7]), |x| 0.2 * x.z, 6000);
+        let square = |[a, b]: [f64; 2]| 0.04 * (b.powi(3) - a.powi(3)) / (3.0 * (b - a));
+        let expected = 100.0 * square([0.3, 0.9]).sqrt();
+        assert!((s.percent_rms / expected - 1.0).abs() < 0.03, "{} {expected}", s.percent_rms);
+        assert!((s.confidence[0]..s.confidence[1]).contains(&expected), "{s:?}");
+        assert!(s.bias.abs() < 0.5, "{s:?}");
+        for part in &s.parts {
+            let expected = 100.0 * square([1.0 - part.isovalues[1], 1.0 - part.isovalues[0]]).sqrt();
+            assert!((part.percent_rms / expected - 1.0).abs() < 0.06, "{part:?} {expected}");
+            assert!(part.points.abs_diff(1200) < 60, "{part:?}");
+        }
+    }
+
+    /// A roof whose one side is four times as steep: each isosurface is two planes, one on either side, of the same
+    /// area; of points even in the volume four fifths would lie on the other.
+    #[test]
+    fn isosurfaces_count_by_their_area() {
+        let roof = |x: DVec3| if x.z < 0.6 { x.z - 0.6 } else { 4.0 * (0.6 - x.z) };
+        let s = surveyed(&scene(roof, [-1.5, -0.25]), |x| if x.z > 0.6 { 0.1 } else { 0.0 }, 3000);
+        let expected = 100.0 * (0.5 * 3.0 * 0.01f64).sqrt();
+        assert!((s.percent_rms / expected - 1.0).abs() < 0.03, "{} {expected}", s.percent_rms);
+        assert!((s.bias - 5.0).abs() < 0.3, "{s:?}");
+    }
+}
