@@ -61,7 +61,9 @@ pub struct Survey {
     pub percent_rms_sqrt3: f64,
     /// 95 % confidence interval of `percent_rms`, from the scatter over points.
     pub confidence: [f64; 2],
-    /// The same of points of the grid, each compared on its own level set: what is not due to interpolation.
+    /// Points of the grid that took part: those beside the others that hold light of their own level set.
+    pub grid_points: usize,
+    /// The error of these, each compared on its own level set: what is not due to interpolation. 0 without any.
     pub percent_rms_grid_points: f64,
     /// Its interval.
     pub confidence_grid_points: [f64; 2],
@@ -145,6 +147,7 @@ pub fn survey<T: Tracer>(
         percent_rms: percent(square),
         percent_rms_sqrt3: percent(square / 3.0),
         confidence: confidence.map(percent),
+        grid_points: at_points.len(),
         percent_rms_grid_points: percent(square_grid_points),
         confidence_grid_points: confidence_grid_points.map(percent),
         bias: 100.0 * all.iter().map(|d| d.bias).sum::<f64>() / (all.len() as f64).max(1.0),
@@ -312,6 +315,8 @@ mod tests {
             assert!((found - expected).abs() < 1e-4, "{found}: {s:?}");
         }
         assert!((s.bias - 10.0).abs() < 1e-4 && s.points == 300 && s.left_out == 0, "{s:?}");
+        // Outermost and innermost cells have corners beyond the sweep.
+        assert!((250..=300).contains(&s.grid_points), "{s:?}");
         assert_eq!(s.parts.iter().map(|p| p.points).sum::<usize>(), 300);
         let right = surveyed(&scene, |_| 0.0, 300);
         assert!(right.percent_rms < 1e-4 && right.bias.abs() < 1e-4, "{right:?}");
@@ -332,6 +337,13 @@ mod tests {
             assert!((part.percent_rms / expected - 1.0).abs() < 0.06, "{part:?} {expected}");
             assert!(part.points.abs_diff(1200) < 60, "{part:?}");
         }
+    }
+
+    /// Of a sweep between two samples no grid point holds light of its own level set.
+    #[test]
+    fn grid_points_without_light_of_their_own_do_not_count() {
+        let s = surveyed(&scene(|x| x.x, [0.01, 0.04]), |_| 0.1, 200);
+        assert_eq!((s.points, s.grid_points, s.percent_rms_grid_points), (200, 0, 0.0));
     }
 
     /// A roof whose one side is four times as steep: each isosurface is two planes, one on either side, of the same

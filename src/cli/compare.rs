@@ -155,14 +155,18 @@ fn everywhere(s: &Survey) -> String {
             format!("  isovalues        {:8.3}   ({}; {} points)\n", p.percent_rms, span(ends.into()), p.points)
         })
         .collect();
+    let at_points = match s.grid_points {
+        0 => format!("{:>8}   (none holds light of its own level set)", "–"),
+        _ => format!("{:8.3}   {}", s.percent_rms_grid_points, interval(s.confidence_grid_points)),
+    };
+    let between = s.grid_points > 0 && 2.0 * s.percent_rms_grid_points.powi(2) < s.percent_rms.powi(2);
+    let advice = if between { "most of it lies between grid points: a finer --grid lowers it\n" } else { "" };
     format!(
-        "percent RMS       {:8.3}   {}\n  per channel, /√3 {:8.3}\n{parts}at grid points    {:8.3}   {}\n\
-         bias              {:+8.3}\npoints            {:8}   (2 × {} paths each; {} left out)\n",
+        "percent RMS       {:8.3}   {}\n  per channel, /√3 {:8.3}\n{parts}at grid points    {at_points}\n\
+         bias              {:+8.3}\npoints            {:8}   (2 × {} paths each; {} left out)\n{advice}",
         s.percent_rms,
         interval(s.confidence),
         s.percent_rms_sqrt3,
-        s.percent_rms_grid_points,
-        interval(s.confidence_grid_points),
         s.bias,
         s.points,
         s.paths,

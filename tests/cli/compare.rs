@@ -163,11 +163,10 @@ fn all_isosurfaces_are_compared_with_paths() {
     let dim = isolume::accuracy::survey(&scene, &tracer, (baked.lattice(), &grid), &settings, &|_| true).unwrap();
     let missing = number(&found, "bias") - dim.bias;
     assert!((1.0..8.0).contains(&missing) && dim.percent_rms > number(&found, "percent_rms") + 1.0, "{dim:?}");
-    let said = text(&ok(dir, &["compare", "lit.vti", "--points", "200", "--paths", "8", "-q"]).stdout);
-    assert!(
-        said.contains("percent RMS") && said.contains("at grid points") && said.contains("58.44 … 76.72"),
-        "{said}"
-    );
+    let said = text(&ok(dir, &["compare", "lit.vti", "-q"]).stdout);
+    for words in ["percent RMS", "at grid points", "(58.44 … 76.72; ", "most of it lies between grid points"] {
+        assert!(said.contains(words), "{said}");
+    }
 }
 
 /// Paths see the volume's normals, not those of a grid twice as fine, as long as the file tells them.
