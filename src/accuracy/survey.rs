@@ -63,7 +63,8 @@ pub struct Survey {
     pub confidence: [f64; 2],
     /// Points of the grid that took part: those beside the others that hold light of their own level set.
     pub grid_points: usize,
-    /// The error of these, each compared on its own level set: what is not due to interpolation. 0 without any.
+    /// The error of these, each compared on its own level set: what is not due to interpolation. 0 without any; more
+    /// where a fit chose what interpolates best.
     pub percent_rms_grid_points: f64,
     /// Its interval.
     pub confidence_grid_points: [f64; 2],
