@@ -100,7 +100,7 @@ impl Field {
             self.samples[self.lattice.offset(i, j, k)]
         };
         let samples = (0..lattice.len()).into_par_iter().with_min_len(1 << 14).map(at).collect();
-        Some(Self { lattice, samples, coarse: None, ..self.clone() })
+        Some(Self { lattice, sweep: self.sweep, samples, largest: self.largest, gaps: self.gaps, coarse: None })
     }
 
     /// h at the points of another lattice over the same Ω, x fastest.

@@ -1,4 +1,5 @@
 //! A survey of all isosurfaces of a bake at random points: no references need be made first, and no isovalue chosen.
+//! \[BB09 §3\]
 
 use super::display;
 use super::floor::corners;
@@ -21,7 +22,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 /// How much work a survey is worth.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SurveySettings {
-    /// Points on isosurfaces of the sweep, and as many points of the grid.
+    /// Points on isosurfaces of the sweep, and as many points of the grid; about a kilobyte each.
     pub points: usize,
     /// Paths of each of the two independent estimates that every point is compared with.
     pub paths: u32,
@@ -59,7 +60,7 @@ pub struct Survey {
     pub percent_rms: f64,
     /// The same per channel: / √3.
     pub percent_rms_sqrt3: f64,
-    /// 95 % confidence interval of `percent_rms`, from the scatter over points.
+    /// 95 % confidence interval of `percent_rms`, from the scatter over points (as if they were independent).
     pub confidence: [f64; 2],
     /// Points of the grid that took part: those beside the others that hold light of their own level set.
     pub grid_points: usize,

@@ -35,13 +35,13 @@ pub(super) struct Compare {
     #[arg(num_args = 1..=2, value_name = "REF")]
     references: Vec<PathBuf>,
     /// Without references: points on isosurfaces
-    #[arg(long, value_name = "N", default_value_t = 2000, conflicts_with = "references")]
+    #[arg(long, value_name = "N", default_value_t = SurveySettings::default().points, conflicts_with = "references")]
     points: usize,
     /// Without references: paths of each of a point's two estimates
-    #[arg(long, value_name = "N", default_value_t = 256, conflicts_with = "references")]
+    #[arg(long, value_name = "N", default_value_t = SurveySettings::default().paths, conflicts_with = "references")]
     paths: u32,
     /// Without references: seed of points and paths
-    #[arg(long, default_value_t = 1, conflicts_with = "references")]
+    #[arg(long, default_value_t = SurveySettings::default().seed, conflicts_with = "references")]
     seed: u64,
     /// Without references, of several volumes: the one to look at, by its name (default: the first)
     #[arg(long, value_name = "NAME", conflicts_with = "references")]
@@ -103,8 +103,8 @@ impl Compare {
 
     /// All isosurfaces of the bake against paths.
     fn everywhere(&self, progress: Progress) -> Result<()> {
-        if !(1..=1 << 24).contains(&self.points) || !(1..=1 << 20).contains(&self.paths) {
-            return Err(Error::Invalid("--points: 1 to 16777216; --paths: 1 to 1048576".into()));
+        if !(1..=1 << 20).contains(&self.points) || !(1..=1 << 20).contains(&self.paths) {
+            return Err(Error::Invalid("--points, --paths: 1 to 1048576".into()));
         }
         let in_file = |e: Error| e.in_file(&self.bake);
         let baked = BakedVolume::read(&self.bake)?;

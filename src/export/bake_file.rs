@@ -544,6 +544,9 @@ impl BakedVolume {
             return Err(Error::Invalid("its report names no grid; bake anew".into()));
         };
         let GridSize::Factor(factor) = size else { return Ok(None) };
+        if factor == 1 {
+            return Ok(Some(self.scene.lit(self.scene.number())));
+        }
         let coarse = |m: Member| Some(Member { field: m.field.coarsened(factor)?.into(), ..m });
         let Some(members) = self.scene.members().into_iter().map(coarse).collect() else { return Ok(None) };
         let scene = Scene::with_members(members, self.scene.policy(), self.scene.polygons().to_vec())?;
