@@ -24,6 +24,12 @@ use std::ops::AddAssign;
 /// Places around a point without a level set of its own.
 pub(super) const STAND_INS: usize = 4;
 
+/// The rays of such a place, of the gather and shadow rays of a point of the grid: points are fitted to places of their
+/// own and of their neighbours.
+pub(super) fn rays_beside([gather, shadow]: [u32; 2]) -> [u32; 2] {
+    [(gather / 4).max(gather.min(2)), (shadow / 8).max(shadow.min(2))]
+}
+
 /// What samples cost.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Counts {

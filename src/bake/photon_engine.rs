@@ -2,7 +2,7 @@
 
 use super::bands::{Band, Levels, REACH};
 use super::contacts::{Contacts, Wedge};
-use super::grid_points::{Beside, BesideLight, Counts, GridPoints, PointLight};
+use super::grid_points::{Beside, BesideLight, Counts, GridPoints, PointLight, rays_beside};
 use super::{BakeSettings, Interpolation, Lit, PhotonCounts, stages};
 use crate::checkpoint::{self, Checkpoint};
 use crate::embree::{Device, GraphTracer, pyramids};
@@ -92,24 +92,23 @@ pub(super) fn light(
     let mut fields = jobs.iter().map(|job| FieldLight::new(job, settings)).collect::<Result<Vec<_>>>()?;
     lit.spend(clock, |s| &mut s.samples);
     // In rays.
-    let [node, sample] = [2 + settings.cache_shadow_rays, 2 + settings.shadow_rays / 2 + settings.gather_rays];
+    let node = u64::from(2 + settings.cache_shadow_rays);
     let nodes = if gather { sources.iter().map(NodePhotons::work).sum() } else { 0 };
-    let samples: u64 = fields.iter().map(FieldLight::work).sum();
-    let stage = progress.stage("light", nodes * u64::from(node) + samples * u64::from(sample));
+    let samples: u64 = fields.iter().map(|field| field.work(settings)).sum();
+    let stage = progress.stage("light", nodes * node + samples);
     for &band in &bands {
         let begun = Instant::now();
         let clock = Clock::start();
         for ((job, tracer), source) in jobs.iter().zip(&tracers).zip(&sources).filter(|_| gather) {
             let saved = stages(checkpoint, STAGES * job.number);
             let block = band.number * RadianceCache::blocks(&job.scene);
-            let tick = |n| stage.tick(n * u64::from(node));
+            let tick = |n| stage.tick(n * node);
             cache.fill_band(&job.scene, tracer, source, band.range(), &cache_settings, saved, block, &tick);
         }
         lit.spend(clock, |s| &mut s.cache);
         let clock = Clock::start();
         for ((field, tracer), source) in fields.iter_mut().zip(&tracers).zip(&sources) {
-            let tick = |n| stage.tick(n * u64::from(sample));
-            let counts = field.sample(band, tracer, (&cache, source), settings, checkpoint, &tick);
+            let counts = field.sample(band, tracer, (&cache, source), settings, checkpoint, &|n| stage.tick(n));
             lit.count(counts);
         }
         lit.spend(clock, |s| &mut s.samples);
@@ -191,13 +190,17 @@ impl<'a> FieldLight<'a> {
         Ok(Self { job, places, sides })
     }
 
-    /// Samples of all sides.
-    fn work(&self) -> u64 {
+    /// Ticks of [`FieldLight::sample`]: rays of all sides, about.
+    fn work(&self, settings: &BakeSettings) -> u64 {
+        let rays = [settings.gather_rays, settings.shadow_rays];
         let each = match &self.places {
-            Places::Grid(points, beside, contacts) => points.len() + beside.len() + contacts.len(),
-            Places::Scattered(at) => at.len(),
+            Places::Grid(points, beside, contacts) => {
+                let at_points = (points.len() + contacts.len()) as u64 * work(rays);
+                at_points + beside.len() as u64 * work(rays_beside(rays))
+            }
+            Places::Scattered(at) => at.len() as u64 * work(rays),
         };
-        (each * self.sides.len()) as u64
+        each * self.sides.len() as u64
     }
 
     /// Ticks of [`FieldLight::finish`].
@@ -219,28 +222,29 @@ impl<'a> FieldLight<'a> {
         let Job { scene, number, .. } = self.job;
         let mut counts = Counts::default();
         for SideLight { side, points, scattered } in &mut self.sides {
-            let indirect = match (settings.gather_rays, source.map(*side)) {
-                (0, Some(map)) => Indirect::Map(map),
-                (rays, _) => Indirect::Gather(cache, rays),
-            };
-            let (shadow_rays, seed) = (settings.shadow_rays, settings.seed);
-            let sampler = Sampler { scene, tracer, indirect: &indirect, side: *side, shadow_rays, seed };
+            let map = source.map(*side).filter(|_| settings.gather_rays == 0);
+            let indirect = |rays: u32| map.map_or(Indirect::Gather(cache, rays), Indirect::Map);
+            let rays @ [gather_rays, shadow_rays] = [settings.gather_rays, settings.shadow_rays];
+            let (gathered, seed, each) = (indirect(gather_rays), settings.seed, work(rays));
+            let sampler = Sampler { scene, tracer, indirect: &gathered, side: *side, shadow_rays, seed };
             let saved = |kind: u32| stages(checkpoint, STAGES * number + kind)[side.index()];
             match (&self.places, points) {
                 (Places::Grid(grid, beside, contacts), Some((at_points, at_beside))) => {
                     let apart = |o: usize| contacts.holds(o);
-                    counts += grid.sample(&sampler, band, at_points, &apart, saved(2), tick);
+                    counts += grid.sample(&sampler, band, at_points, &apart, saved(2), &|n| tick(n * each));
                     let wedge = Wedge::new(tracer, cache, settings);
                     let own = |o: usize| band.holds(grid.isovalue(o));
-                    counts += contacts.solve_in(at_points.grid(), own, *side, &wedge, tick);
-                    counts += beside.sample(&sampler, band, at_beside, saved(4), tick);
+                    counts += contacts.solve_in(at_points.grid(), own, *side, &wedge, &|n| tick(n * each));
+                    let fewer @ [gather_rays, shadow_rays] = rays_beside(rays);
+                    let sampler = Sampler { indirect: &indirect(gather_rays), shadow_rays, ..sampler };
+                    counts += beside.sample(&sampler, band, at_beside, saved(4), &|n| tick(n * work(fewer)));
                 }
                 (Places::Scattered(at), _) => {
                     let isovalue = |p: Vec3| (scene.field.value(p.as_dvec3()) as f32).clamp(0.0, 1.0);
                     let own: Vec<usize> = (0..at.len()).filter(|&n| band.holds(isovalue(at[n]))).collect();
                     let first = band.number * at.len().div_ceil(BLOCK);
                     let place = |n: usize| (own[n] as u64, at[own[n]]);
-                    let got = sample_places(&sampler, own.len(), &place, saved(2), first, tick);
+                    let got = sample_places(&sampler, own.len(), &place, saved(2), first, &|n| tick(n * each));
                     counts += Counts::from(&got);
                     own.iter().zip(got.samples).for_each(|(&n, s)| scattered[n] = s);
                 }
@@ -283,6 +287,11 @@ impl<'a> FieldLight<'a> {
         };
         sides.into_iter().map(each).collect()
     }
+}
+
+/// Rays of a sample of so many gather and shadow rays, about, of which few shadow rays are needed as a rule.
+fn work([gather, shadow]: [u32; 2]) -> u64 {
+    u64::from(2 + shadow / 2 + gather)
 }
 
 /// Positions of scattered samples.

@@ -3,7 +3,7 @@
 
 use super::bands::Band;
 use super::contacts::{Contacts, Wedge};
-use super::grid_points::{Beside, Counts, STAND_INS};
+use super::grid_points::{Beside, Counts, STAND_INS, rays_beside};
 use super::photon_engine::{Job, STAGES};
 use super::{BakeSettings, Lit, stages};
 use crate::brdf::reflected;
@@ -26,10 +26,6 @@ use rayon::prelude::*;
 
 /// Resolution of the progress bar, since a sweep knows only fractions.
 const STEPS: f64 = 1000.0;
-
-/// The shares of the photon engine's gather and shadow rays that a sample beside steep edges takes: each point there is
-/// fitted to samples of its own and its neighbours'.
-const SHARES: [u32; 2] = [4, 8];
 
 /// Points nearer to a luminaire than this many voxels are sampled by exact rays: on its front light falls off within a
 /// voxel, and what lies behind it is lit by lines that a sweep mixes a voxel further.
@@ -84,18 +80,16 @@ pub(super) fn light(
     let mut sides = Vec::new();
     for mut s in swept {
         let stage = progress.stage("samples", (beside.len() + near.len() + contacts.len()) as u64);
-        let seed = settings.seed;
-        let rays = |share: u32| (settings.gather_rays / share).max(2);
-        let gather = |share: u32| Indirect::Gather(&cache, rays(share));
-        let shadow = |share: u32| (settings.shadow_rays / share).max(2);
-        let (indirect, shadow_rays) = (gather(SHARES[0]), shadow(SHARES[1]));
+        let rays = [settings.gather_rays, settings.shadow_rays].map(|n| n.max(2));
+        let [gather_rays, shadow_rays] = rays_beside(rays);
+        let (indirect, seed) = (Indirect::Gather(&cache, gather_rays), settings.seed);
         let sampler = Sampler { scene, tracer: &tracer, indirect: &indirect, side: s.side, shadow_rays, seed };
         let saved = stages(checkpoint, STAGES * number + 4)[s.side.index()];
         let mut light = beside.dark();
         let counts = beside.sample(&sampler, Band::WHOLE, &mut light, saved, &|n| stage.tick(n));
         lit.count(counts);
         beside.smooth(scene, s.side, settings.tau, &mut light, &|n| stage.tick(n));
-        let (indirect, shadow_rays) = (gather(1), shadow(1));
+        let (indirect, shadow_rays) = (Indirect::Gather(&cache, rays[0]), rays[1]);
         let sampler = Sampler { indirect: &indirect, shadow_rays, ..sampler };
         // Keys of a point beside; none of these is one.
         let place = |n: usize| ((STAND_INS * near[n]) as u64, local_position(&scene.field, lattice, near[n]).as_vec3());

@@ -8,7 +8,7 @@ use std::fs::{File, OpenOptions};
 use std::io::{BufReader, BufWriter, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
-pub(super) const MAGIC: &[u8] = b"isolume checkpoint 15\n";
+pub(super) const MAGIC: &[u8] = b"isolume checkpoint 16\n";
 /// What the magic of any version starts with.
 pub(super) const ANY_MAGIC: &[u8] = b"isolume checkpoint ";
 
