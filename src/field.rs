@@ -10,7 +10,7 @@ pub use sweep::{Shortest, Sweep, span};
 use crate::error::{Error, Result};
 use crate::neighbourhood::within;
 use crate::volume::{Lattice, Volume};
-use glam::DVec3;
+use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 use std::sync::Arc;
 
@@ -85,18 +85,20 @@ impl Field {
         }
     }
 
-    /// The field of which this is a copy on a lattice `factor` times as fine: every so many-th sample. `None` if the
-    /// lattice is of no such.
+    /// The field of which this is a copy on a lattice so many times as fine along each axis: every so many-th sample.
+    /// `None` if the lattice is of no such.
     #[must_use]
-    pub fn coarsened(&self, factor: usize) -> Option<Self> {
+    pub fn coarsened(&self, factors: [usize; 3]) -> Option<Self> {
         let cells = self.lattice.cells();
-        if factor == 0 || cells.iter().any(|n| n % factor != 0) {
+        if (0..3).any(|a| !cells[a].is_multiple_of(factors[a])) {
             return None;
         }
-        let [nx, ny, nz] = cells.map(|n| n / factor + 1);
-        let lattice = Lattice::new([nx, ny, nz], self.lattice.origin(), self.lattice.axes() * factor as f64).ok()?;
+        let dims = [0, 1, 2].map(|a| cells[a] / factors[a] + 1);
+        let scale = DMat3::from_diagonal(DVec3::from_array(factors.map(|n| n as f64)));
+        let lattice = Lattice::new(dims, self.lattice.origin(), self.lattice.axes() * scale).ok()?;
         let at = |o: usize| {
-            let [i, j, k] = lattice.ijk(o).map(|i| i * factor);
+            let coarse = lattice.ijk(o);
+            let [i, j, k] = [0, 1, 2].map(|a| coarse[a] * factors[a]);
             self.samples[self.lattice.offset(i, j, k)]
         };
         let samples = (0..lattice.len()).into_par_iter().with_min_len(1 << 14).map(at).collect();
@@ -501,14 +503,20 @@ mod tests {
             assert!((f.receiver_gradient(p) - fine.receiver_gradient(2.0 * p)).length() < 1e-9);
         }
         assert!((fine.node_gradient([3, 2, 5]) - f.receiver_gradient(DVec3::new(1.5, 1.0, 2.5))).length() < 1e-12);
-        let back = fine.coarsened(2).unwrap();
+        let back = fine.coarsened([2; 3]).unwrap();
         assert_eq!(back.samples(), f.samples());
         assert!(back.has_own_normals() && back.lattice().dims() == f.lattice().dims());
         assert!(
             (back.lattice().to_world(back.lattice().far()) - f.lattice().to_world(f.lattice().far())).length() < 1e-12
         );
-        assert!(fine.coarsened(3).is_none() && fine.coarsened(0).is_none());
-        assert_eq!(f.coarsened(1).unwrap().samples(), f.samples());
+        assert!(fine.coarsened([2, 4, 2]).is_none() && fine.coarsened([2, 2, 0]).is_none());
+        let other = fine.coarsened([4, 3, 5]).unwrap();
+        assert_eq!(other.lattice().dims(), [3, 3, 3]);
+        for o in 0..27 {
+            let p = DVec3::from_array(other.lattice().ijk(o).map(|i| i as f64)) * DVec3::new(4.0, 3.0, 5.0);
+            assert_eq!(f64::from(other.samples()[o]), fine.value(p));
+        }
+        assert_eq!(f.coarsened([1; 3]).unwrap().samples(), f.samples());
     }
 
     /// A lattice whose points lie in cells and on nodes, the field's own, and those of a finer copy; gaps in the

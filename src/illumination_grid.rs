@@ -14,52 +14,81 @@ use std::str::FromStr;
 /// The size of a grid over Ω.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum GridSize {
-    /// So many intervals per interval of the volume: 1 is the volume's own lattice.
-    Factor(usize),
+    /// So many intervals per interval of the volume along each axis: 1 is the volume's own lattice.
+    Factors([usize; 3]),
+    /// The factors that make cells nearest to cubes, the least of them 1: `Factors` once a volume is known
+    /// ([`GridSize::of`]).
+    Cubic,
     /// Points along each axis.
     Points([usize; 3]),
 }
 
+/// The greatest factor of a grid along an axis.
+const MOST_FACTOR: usize = 16;
+
 impl FromStr for GridSize {
     type Err = String;
 
-    /// `2x`, or `NX,NY,NZ`.
+    /// `2x`, `FXx,FYx,FZx`, `cubic` or `NX,NY,NZ`.
     fn from_str(text: &str) -> std::result::Result<Self, String> {
-        let wrong = || format!("'{text}' is no grid size; write a factor such as 2x, or points such as 101,101,101");
-        if let Some(factor) = text.strip_suffix('x') {
-            return match factor.parse() {
-                Ok(n) if (1..=16).contains(&n) => Ok(GridSize::Factor(n)),
-                _ => Err(wrong()),
-            };
-        }
-        let n: Vec<usize> = text
-            .split(',')
-            .map(|w| w.trim().parse().ok().filter(|&n| n >= 2))
-            .collect::<Option<_>>()
-            .ok_or_else(wrong)?;
-        n.try_into().map(GridSize::Points).map_err(|_| wrong())
+        let factor = |word: &str| {
+            let n = word.trim().strip_suffix('x')?.parse().ok()?;
+            (1..=MOST_FACTOR).contains(&n).then_some(n)
+        };
+        let points = |word: &str| word.trim().parse().ok().filter(|&n| n >= 2);
+        let words: Vec<&str> = text.split(',').collect();
+        let all = |number: &dyn Fn(&str) -> Option<usize>| {
+            words.iter().map(|w| number(w)).collect::<Option<Vec<_>>>()?.try_into().ok()
+        };
+        let size = match words[..] {
+            ["cubic"] => Some(GridSize::Cubic),
+            [one] => factor(one).map(|n| GridSize::Factors([n; 3])),
+            _ => all(&factor).map(GridSize::Factors).or_else(|| all(&points).map(GridSize::Points)),
+        };
+        size.ok_or_else(|| {
+            format!(
+                "'{text}' is no grid size; write a factor from 1x to {MOST_FACTOR}x, one of each axis such as 1x,1x,4x, \
+                 cubic, or points such as 101,101,101"
+            )
+        })
     }
 }
 
 impl std::fmt::Display for GridSize {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
-            GridSize::Factor(n) => write!(f, "{n}x"),
+            GridSize::Factors([x, y, z]) if x == y && y == z => write!(f, "{x}x"),
+            GridSize::Factors([x, y, z]) => write!(f, "{x}x,{y}x,{z}x"),
+            GridSize::Cubic => write!(f, "cubic"),
             GridSize::Points([x, y, z]) => write!(f, "{x},{y},{z}"),
         }
     }
 }
 
 impl GridSize {
+    /// The volume's own lattice.
+    pub const OWN: Self = Self::Factors([1; 3]);
+
+    /// This size for `volume`: what is cubic becomes factors.
+    #[must_use]
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the factors")]
+    pub fn of(self, volume: &Lattice) -> Self {
+        let GridSize::Cubic = self else { return self };
+        let spacing = volume.spacing();
+        let factors = spacing / spacing.min_element();
+        Self::Factors(factors.to_array().map(|x| (x.round() as usize).clamp(1, MOST_FACTOR)))
+    }
+
     /// The lattice of this size over the Ω of `volume`: same corners, other spacing.
     ///
     /// # Errors
     /// `Invalid` if it has too many points.
     pub fn lattice(self, volume: &Lattice) -> Result<Lattice> {
-        let dims = match self {
-            GridSize::Factor(1) => return Ok(volume.clone()),
-            GridSize::Factor(n) => volume.cells().map(|c| c * n + 1),
+        let dims = match self.of(volume) {
+            Self::OWN => return Ok(volume.clone()),
             GridSize::Points(p) => p,
+            GridSize::Factors(n) => std::array::from_fn(|a| volume.cells()[a] * n[a] + 1),
+            GridSize::Cubic => unreachable!("factors, of a volume"),
         };
         let step = volume.far() / DVec3::from_array(dims.map(|n| (n - 1) as f64));
         let axes = volume.axes();
@@ -257,7 +286,41 @@ mod tests {
         let fine = "2x".parse::<GridSize>().unwrap().lattice(&lattice).unwrap();
         assert_eq!((fine.dims(), fine.spacing()), ([5, 7, 9], DVec3::splat(0.5)));
         assert_eq!(fine.to_world(fine.far()), lattice.to_world(lattice.far()));
+        let own = "1x".parse::<GridSize>().unwrap();
+        assert_eq!((own, own.lattice(&lattice).unwrap().dims()), (GridSize::OWN, [3, 4, 5]));
+        let long = "1x, 2x,3x".parse::<GridSize>().unwrap().lattice(&lattice).unwrap();
+        assert_eq!(long.dims(), [3, 7, 13]);
+        assert!((long.spacing() - DVec3::new(1.0, 1.0 / 2.0, 1.0 / 3.0)).length() < 1e-15);
+        for text in ["2x", "1x,2x,3x", "cubic", "7,8,9"] {
+            assert_eq!(text.parse::<GridSize>().unwrap().to_string(), text);
+        }
         assert_eq!("7, 8,9".parse::<GridSize>(), Ok(GridSize::Points([7, 8, 9])));
-        assert!("0x".parse::<GridSize>().is_err() && "4,4".parse::<GridSize>().is_err());
+        assert_eq!("4x,4x,4x".parse::<GridSize>().unwrap().to_string(), "4x");
+        for wrong in ["0x", "17x", "4,4", "1x,2x", "1x,2x,17x", "1x,2x,3", "2x,cubic", "1,2,3", "", "x"] {
+            let message = wrong.parse::<GridSize>().unwrap_err();
+            assert!(message.contains(&format!("'{wrong}'")) && message.contains("cubic"), "{message}");
+        }
+    }
+
+    /// Whatever the unit is, and however axes lean; no factor is greater than the greatest.
+    #[test]
+    fn cubic_grids() {
+        for (spacing, factors) in [
+            ([1.0, 1.0, 1.0], [1, 1, 1]),
+            ([1.0, 1.4, 1.0], [1, 1, 1]),
+            ([0.7e-3, 0.7e-3, 3.0e-3], [1, 1, 4]),
+            ([5.0, 2.0, 1.0], [5, 2, 1]),
+            ([1.0, 1.0, 50.0], [1, 1, 16]),
+        ] {
+            for lean in [DMat3::IDENTITY, DMat3::from_rotation_y(0.7), DMat3::from_diagonal(DVec3::new(-1.0, 1.0, 1.0))]
+            {
+                let axes = lean * DMat3::from_diagonal(DVec3::from_array(spacing));
+                let lattice = Lattice::new([3, 4, 5], DVec3::ONE, axes).unwrap();
+                assert_eq!(GridSize::Cubic.of(&lattice), GridSize::Factors(factors), "{spacing:?}");
+                let [a, b] = [GridSize::Cubic, GridSize::Factors(factors)].map(|size| size.lattice(&lattice).unwrap());
+                assert_eq!(a, b);
+                assert_eq!(GridSize::Points([2, 3, 4]).of(&lattice), GridSize::Points([2, 3, 4]));
+            }
+        }
     }
 }

@@ -85,7 +85,7 @@ fn same_in_bands(name: &str, scene: &Scene, options: &BakeOptions) {
 fn light_and_counts_do_not_depend_on_the_bands() {
     same_in_bands("bumps", &scene(false, 25, true), &options());
     same_in_bands("steep", &scene(true, 25, true), &options());
-    let finer = BakeOptions { grid: Some(GridSize::Factor(2)), ..options() };
+    let finer = BakeOptions { grid: Some(GridSize::Factors([2; 3])), ..options() };
     same_in_bands("a finer grid", &scene(true, 13, false), &finer);
 }
 

@@ -8,6 +8,7 @@ use isolume::direct::{Receiver, luminance};
 use isolume::embree::{Device, GraphTracer, SurfaceTracer};
 use isolume::field::{Field, Sweep};
 use isolume::flattened::{Departure, FlattenedRay, Side, Target};
+use isolume::illumination_grid::GridSize;
 use isolume::polygon::Polygon;
 use isolume::reference::{Integrator, PathTracer, ReferenceSettings, receiver, reference, subset};
 use isolume::rng::{Rng, Stage};
@@ -442,7 +443,11 @@ fn the_interpolation_floor_falls_with_the_grid() {
     let c = scene.field.sweep().isovalue(47.0);
     let tracer = GraphTracer::new(&device, &scene).unwrap();
     let mesh = SurfaceMesh::extract(&scene, c, 1).unwrap();
-    let floor = |factor| interpolation_floor(&scene, &tracer, &mesh, c, factor, 1024, Some(300)).unwrap().percent_rms;
+    let floor = |factor| {
+        interpolation_floor(&scene, &tracer, &mesh, c, GridSize::Factors([factor; 3]), 1024, Some(300))
+            .unwrap()
+            .percent_rms
+    };
     let (coarse, fine) = (floor(1), floor(3));
     assert!(fine < 0.7 * coarse && coarse < 5.0 && fine > 0.0, "{coarse} {fine}");
 }

@@ -4,6 +4,7 @@
 use clap::{CommandFactory, Parser};
 use isolume::bake::BakeSettings;
 use isolume::cli::Cli;
+use isolume::illumination_grid::GridSize;
 use isolume::scene::Surface;
 use isolume::scene_file::{SceneFile, SceneOptions, load};
 use std::fs;
@@ -140,6 +141,8 @@ fn init_writes_a_scene_whose_comments_are_the_defaults() {
     ok(dir, &[&["init", "scan.raw", "-o", "scan.toml", "-q"], &raw[..]].concat());
     let scan = load(&dir.join("scan.toml"), &SceneOptions::default()).unwrap();
     assert_eq!((scan.volume.value(59), scan.volume.lattice.spacing().z), (413.0, 2.5));
+    // Its voxels are long.
+    assert_eq!((loaded.bake.grid, scan.bake.grid), (None, Some(GridSize::Cubic)));
 }
 
 #[test]

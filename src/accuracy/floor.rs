@@ -15,9 +15,9 @@ use crate::volume::Lattice;
 use glam::DVec3;
 use rayon::prelude::*;
 
-/// Exact direct light at the points of a grid `factor` times as fine as the volume's, interpolated linearly, against
-/// exact direct light at (a fixed subset of) the vertices of the isosurface at `isovalue` (units of the sweep). "Exact"
-/// is the closed form times the visible share of `shadow_rays` low-discrepancy points.
+/// Exact direct light at the points of a grid, interpolated linearly, against exact direct light at (a fixed subset of)
+/// the vertices of the isosurface at `isovalue` (units of the sweep). "Exact" is the closed form times the visible
+/// share of `shadow_rays` low-discrepancy points.
 ///
 /// # Errors
 /// `Invalid` if the grid has too many points or no vertex has a normal.
@@ -26,7 +26,7 @@ pub fn interpolation_floor<T: Tracer>(
     tracer: &T,
     mesh: &SurfaceMesh,
     isovalue: f32,
-    factor: usize,
+    grid: GridSize,
     shadow_rays: u32,
     vertices: Option<usize>,
 ) -> Result<Accuracy> {
@@ -35,7 +35,7 @@ pub fn interpolation_floor<T: Tracer>(
         reflected(scene.surface.albedo.at(f64::from(r.isovalue)), e)
     };
     let chosen = subset(mesh.local.len(), vertices);
-    let interpolated = through_grid(scene, mesh, &chosen, factor, &direct)?;
+    let interpolated = through_grid(scene, mesh, &chosen, grid, &direct)?;
     let n = mesh.local.len();
     let (mut texture, mut radiance, mut sampled) = (vec![DVec3::ZERO; n], vec![DVec3::ZERO; n], vec![false; n]);
     let exact: Vec<Option<DVec3>> = chosen
@@ -68,7 +68,7 @@ pub fn total_floor<T: Tracer>(
     tracer: &T,
     mesh: &SurfaceMesh,
     references: &[ReferenceMesh],
-    factor: usize,
+    grid: GridSize,
     paths: u32,
     vertices: usize,
 ) -> Result<f64> {
@@ -80,7 +80,7 @@ pub fn total_floor<T: Tracer>(
     chosen = keep.into_iter().map(|i| chosen[i]).collect();
     let texture = |seed: u64| {
         let value = |r: &Receiver, index: u64| PathTracer::new(scene, tracer).outgoing(r, paths, (seed, index));
-        through_grid(scene, mesh, &chosen, factor, &value)
+        through_grid(scene, mesh, &chosen, grid, &value)
     };
     let (first, second) = (texture(1_000_001)?, texture(1_000_002)?);
     let exposure = scene.exposure();
@@ -94,9 +94,9 @@ pub fn total_floor<T: Tracer>(
     Ok(100.0 * (sum / f64::max(count, 1.0)).max(0.0).sqrt())
 }
 
-/// Radiance at the vertices `chosen` of `mesh` as a grid `factor` times as fine as the volume's gives it if its points
-/// hold `value(receiver, index)`. Only points that the vertices' cells touch are asked for; those without a level set
-/// of their own are filled from their surroundings as bakes do. `None` where no point of a cell holds anything.
+/// Radiance at the vertices `chosen` of `mesh` as a grid gives it if its points hold `value(receiver, index)`. Only
+/// points that the vertices' cells touch are asked for; those without a level set of their own are filled from their
+/// surroundings as bakes do. `None` where no point of a cell holds anything.
 ///
 /// # Errors
 /// `Invalid` if the grid has too many points.
@@ -104,10 +104,10 @@ pub fn through_grid(
     scene: &Scene,
     mesh: &SurfaceMesh,
     chosen: &[usize],
-    factor: usize,
+    grid: GridSize,
     value: &(dyn Fn(&Receiver, u64) -> DVec3 + Sync),
 ) -> Result<Vec<Option<DVec3>>> {
-    let lattice = GridSize::Factor(factor).lattice(scene.lattice())?;
+    let lattice = grid.lattice(scene.lattice())?;
     let scale = lattice.far() / scene.lattice().far();
     let around = |v: usize| corners(&lattice, mesh.local[v] * scale);
     let mut points: Vec<usize> = chosen.iter().flat_map(|&v| around(v).map(|(o, _)| o)).collect();

@@ -140,7 +140,8 @@ pub struct BakeOptions {
     /// How scattered samples become grid values (default: irradiance)
     #[arg(long)]
     pub interpolation: Option<Interpolation>,
-    /// Size of the illumination grid: a factor of the volume's such as 2x, or NX,NY,NZ points (default: 1x)
+    /// Size of the illumination grid: a factor of the volume's such as 2x, one of each axis such as 1x,1x,4x, cubic
+    /// (the factors that make cells nearest to cubes), or NX,NY,NZ points (default: 1x)
     #[arg(long, value_name = "SIZE")]
     #[serde(default, with = "grid_text")]
     pub grid: Option<GridSize>,
@@ -288,8 +289,7 @@ impl BakeOptions {
             (None, Some(_), None) => Ok(Engine::Photon),
             (None, None, Some(_)) => Ok(Engine::Sweep),
             (None, None, None) => {
-                let swept =
-                    can_sweep(scene).is_ok() && left_out(scene, &self.grid.unwrap_or(GridSize::Factor(1)))?.is_none();
+                let swept = can_sweep(scene).is_ok() && left_out(scene, &self.grid.unwrap_or(GridSize::OWN))?.is_none();
                 Ok(if swept { Engine::Sweep } else { Engine::Photon })
             }
         }
@@ -353,6 +353,18 @@ pub struct BakeSettings {
     pub bands: usize,
 }
 
+/// `size` for the volumes of a scene.
+fn grid(size: GridSize, scene: &Scene) -> Result<GridSize> {
+    let mut sizes = scene.members().into_iter().map(|m| size.of(m.field.lattice()));
+    let first = sizes.next().unwrap_or(size);
+    match sizes.find(|other| *other != first) {
+        None => Ok(first),
+        Some(other) => Err(Error::Invalid(format!(
+            "--grid {size}: is {first} of one volume and {other} of another; give all one of them"
+        ))),
+    }
+}
+
 fn grid_size_text<S: serde::Serializer>(grid: &GridSize, s: S) -> std::result::Result<S::Ok, S::Error> {
     s.collect_str(grid)
 }
@@ -369,10 +381,11 @@ impl BakeSettings {
     /// `Invalid` for values out of range, and for options of both engines if neither is named; the message names the
     /// option.
     pub fn new(o: &BakeOptions, scene: &Scene) -> Result<Self> {
-        Self::with_engine(o, o.engine(scene)?)
+        let settings = Self::with_engine(o, o.engine(scene)?)?;
+        Ok(Self { grid: grid(settings.grid, scene)?, ..settings })
     }
 
-    /// As [`BakeSettings::new`], for an engine that is decided.
+    /// As [`BakeSettings::new`], for an engine that is decided; a grid of cubes is left so.
     ///
     /// # Errors
     /// `Invalid` for values out of range; the message names the option.
@@ -418,7 +431,7 @@ impl BakeSettings {
             smoothing: o.smoothing.unwrap_or(true),
             neighbours: o.neighbours.unwrap_or(if interpolation == Interpolation::Irradiance { 16 } else { 8 }),
             interpolation,
-            grid: o.grid.unwrap_or(GridSize::Factor(1)),
+            grid: o.grid.unwrap_or(GridSize::OWN),
             wall_resolution: o.wall_resolution.unwrap_or(wall),
             wall_isovalues: isovalues,
             wall_shadow_rays: wall_shadow,

@@ -238,6 +238,7 @@ impl Bake {
                 let (mut bands, mut estimate) = fit(&settings)?;
                 if estimate.peak() > most && settings.engine == Engine::Sweep && options.leaves_engine() {
                     let photon = BakeSettings::with_engine(&options, Engine::Photon)?;
+                    let photon = BakeSettings { grid: settings.grid, ..photon };
                     let fitted = fit(&photon)?;
                     // If neither fits, the one that needs less is worth hearing of.
                     if fitted.1.peak() < estimate.peak() {

@@ -3,8 +3,10 @@
 use super::{expect_extension, export};
 use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
+use crate::illumination_grid::GridSize;
 use crate::progress::{Progress, say};
 use crate::scene_file::RawOptions;
+use crate::volume::Lattice;
 use crate::volume::statistics::VolumeStatistics;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -37,7 +39,7 @@ impl Init {
         let volume = export::open(&self.file, &self.raw)?;
         let statistics = VolumeStatistics::of(&volume);
         let named = relative(&self.file, &output)?;
-        let text = scene_text(&named, &self.raw, &statistics);
+        let text = scene_text(&named, &self.raw, &statistics, &volume.lattice);
         let mut file = AtomicFile::create(&output)?;
         file.write_all(text.as_bytes()).map_err(|e| Error::io(&output, e))?;
         file.commit()?;
@@ -74,7 +76,7 @@ fn relative(volume: &Path, output: &Path) -> Result<PathBuf> {
     std::path::absolute(volume).map_err(|e| Error::io(volume, e))
 }
 
-fn scene_text(volume: &Path, raw: &RawOptions, statistics: &VolumeStatistics) -> String {
+fn scene_text(volume: &Path, raw: &RawOptions, statistics: &VolumeStatistics, lattice: &Lattice) -> String {
     // Debug strings of text without control characters are TOML strings.
     let quoted = |s: &str| toml::Value::String(s.to_owned()).to_string();
     let [nx, ny, nz] = statistics.dims;
@@ -91,6 +93,8 @@ fn scene_text(volume: &Path, raw: &RawOptions, statistics: &VolumeStatistics) ->
         }
         None => "# isovalues = [LO, HI]    # nothing to suggest: choose them".to_owned(),
     };
+    // Light on a grid of long voxels is blurred.
+    let grid = if GridSize::Cubic.of(lattice) == GridSize::OWN { "# grid = \"1x\"" } else { "grid = \"cubic\"" };
     let mut layout = String::new();
     if raw.given() {
         layout = "\n# The layout of the headerless file.\n[volume.raw]\n".to_owned();
@@ -109,6 +113,7 @@ fn scene_text(volume: &Path, raw: &RawOptions, statistics: &VolumeStatistics) ->
     include_str!("init/scene.toml")
         .replace("@about@", &about)
         .replace("@sweep@", &sweep)
+        .replace("@grid@", grid)
         .replace("@layout@", &layout)
         .replace("@file@", &quoted(&volume.to_string_lossy()))
 }

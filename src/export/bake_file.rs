@@ -533,8 +533,9 @@ impl BakedVolume {
         self.scene.lattice()
     }
 
-    /// The scene that was lit, with its volumes on their own lattices again if the grid is so many times as fine.
-    /// `None` if the grid has other points: the volume's samples, and with them its normals, are not kept then.
+    /// The scene that was lit, with its volumes on their own lattices again if the grid is a whole number of times as
+    /// fine along each axis. `None` if it has other points: the volume's samples, and with them its normals, are not
+    /// kept then.
     ///
     /// # Errors
     /// `Invalid` if the file says nothing of its grid.
@@ -543,11 +544,11 @@ impl BakedVolume {
         let Some(size) = grid.and_then(|g| g.parse().ok()) else {
             return Err(Error::Invalid("its report names no grid; bake anew".into()));
         };
-        let GridSize::Factor(factor) = size else { return Ok(None) };
-        if factor == 1 {
+        let GridSize::Factors(factors) = size else { return Ok(None) };
+        if size == GridSize::OWN {
             return Ok(Some(self.scene.lit(self.scene.number())));
         }
-        let coarse = |m: Member| Some(Member { field: m.field.coarsened(factor)?.into(), ..m });
+        let coarse = |m: Member| Some(Member { field: m.field.coarsened(factors)?.into(), ..m });
         let Some(members) = self.scene.members().into_iter().map(coarse).collect() else { return Ok(None) };
         let scene = Scene::with_members(members, self.scene.policy(), self.scene.polygons().to_vec())?;
         Ok(Some(scene.lit(self.scene.number())))

@@ -44,8 +44,8 @@ const COLUMNS: [&str; 26] = [
 
 /// Each data set at its main isovalue: straight from the map, with uniform samples as BB09 and with samples at the
 /// nodes; samples at the nodes with final gather, and the sweep engine (or those of the engine that `base` names); the
-/// interpolation floor of direct light at grid factors 1, 2, 3, and of all light at that of the bakes (1 if their grid
-/// is given in points); the reference on triangles against the one on the trilinear surface.
+/// interpolation floor of direct light at grid factors 1, 2, 3, and of all light on the bakes' grid; the reference on
+/// triangles against the one on the trilinear surface.
 ///
 /// # Errors
 /// As bakes, references and tables.
@@ -86,16 +86,13 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
         let vertices = references[0].sampled.iter().filter(|s| **s).count();
         let shadow = if study.quick { 64 } else { 1024 };
         let mut floors = Vec::new();
-        for factor in 1..=3 {
-            let floor = interpolation_floor(scene, &tracer, &mesh, unit, factor, shadow, Some(vertices))?;
+        for grid in [1, 2, 3].map(|n| GridSize::Factors([n; 3])) {
+            let floor = interpolation_floor(scene, &tracer, &mesh, unit, grid, shadow, Some(vertices))?;
             floors.push(floor.percent_rms);
         }
         let paths = if study.quick { 64 } else { 256 };
-        let factor = match base.grid {
-            Some(GridSize::Factor(factor)) => factor,
-            _ => 1,
-        };
-        let total = total_floor(scene, &tracer, &mesh, &references, factor, paths, vertices)?;
+        let grid = base.grid.unwrap_or(GridSize::OWN);
+        let total = total_floor(scene, &tracer, &mesh, &references, grid, paths, vertices)?;
         let triangles = triangle_error(study, subject, &mesh, unit)?;
         for (mode, options) in &modes {
             if table.has(&key(mode)) {

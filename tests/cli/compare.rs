@@ -176,7 +176,7 @@ fn finer_grids_are_compared_on_the_volume_they_are_of() {
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
     let field = |file: &str| BakedVolume::read(&dir.join(file)).unwrap().source().unwrap();
-    for (grid, own) in [("1x", true), ("3x", true), ("12,12,12", false)] {
+    for (grid, own) in [("1x", true), ("3x", true), ("1x,3x,2x", true), ("12,12,12", false)] {
         bake(dir, "b.vti", "lit.vti", &[&RANGE[..], &["--grid", grid]].concat());
         let said = text(&ok(dir, &["compare", "lit.vti", "--points", "50", "--paths", "2"]).stderr);
         assert_eq!(said.contains("warning: lit.vti: its grid is not a whole number of times as fine"), !own, "{said}");
@@ -189,6 +189,44 @@ fn finer_grids_are_compared_on_the_volume_they_are_of() {
         let exact = (0..volume.samples().len()).map(|o| scene.field.sweep().isovalue(volume.value(o)));
         assert!(scene.field.samples().iter().zip(exact).all(|(a, b)| (a - b).abs() < 1e-6));
     }
+}
+
+/// Slices four voxels apart: without a grid of its own a bake warns of that, and cubes have a fraction of the error.
+#[test]
+fn cubic_grids_suit_long_voxels() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let lattice = Lattice::aligned([21, 21, 6], DVec3::ZERO, DVec3::new(0.05, 0.05, 0.2)).unwrap();
+    let bumps =
+        |p: DVec3| [1.0, 2.0].map(|f| (3.0 * f * p.x + f).sin() * (4.0 * p.y).cos() + (8.0 * p.z / f).sin() + 1.0);
+    let at = |o: usize| bumps(lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)))).iter().sum();
+    let samples = Samples::F64((0..lattice.len()).map(at).collect());
+    Volume::new("slices", lattice.clone(), samples).unwrap().write(dir.join("slices.nrrd")).unwrap();
+    let bake = |grid: &[&str]| {
+        let given =
+            ["bake", "slices.nrrd", "--isovalues", "0.5", "4", "-o", "lit.vti", "--preset", "preview", "--json"];
+        let output = ok(dir, &[&given[..], grid].concat());
+        let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+        let warned = text(&output.stderr).contains("warning: voxels are 4.0 times as long as wide");
+        let error = survey(dir, "lit.vti", &["--points", "1000", "--paths", "64"])["percent_rms"].as_f64().unwrap();
+        (report["settings"]["grid"].as_str().unwrap().to_owned(), warned, error)
+    };
+    let (grid, warned, long) = bake(&[]);
+    assert!(warned && grid == "1x");
+    let (grid, warned, own) = bake(&["--grid", "1x"]);
+    assert!(!warned && grid == "1x" && own == long);
+    let (grid, warned, cubic) = bake(&["--grid", "cubic"]);
+    assert!(!warned && grid == "1x,1x,4x", "{grid}");
+    assert_eq!(BakedVolume::read(&dir.join("lit.vti")).unwrap().lattice().dims(), [21, 21, 21]);
+    assert!(cubic < 0.5 * long, "{long} {cubic}");
+
+    // One grid is for all volumes of a scene.
+    ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
+    let scene = "[[volume]]\nname = \"a\"\nfile = \"slices.nrrd\"\nisovalues = [0.5, 4]\n\
+                 [[volume]]\nname = \"b\"\nfile = \"b.vti\"\nisovalues = [3.6, 95]\n";
+    fs::write(dir.join("two.toml"), scene).unwrap();
+    let words = ["cubic", "1x,1x,4x of one volume and 1x of another"];
+    refused(dir, &["bake", "two.toml", "--grid", "cubic", "-o", "two.vtm"], &words);
 }
 
 #[test]

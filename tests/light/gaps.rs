@@ -49,7 +49,7 @@ fn cells(field: &Field, p: DVec3) -> [bool; 2] {
 fn points_beside_a_gap_are_lit_on_all_its_sides() {
     let [scene, turned] = [false, true].map(bumps_with_a_gap);
     for (grid, engine) in [(1, Engine::Photon), (2, Engine::Photon), (1, Engine::Sweep), (2, Engine::Sweep)] {
-        let settings = BakeSettings { grid: GridSize::Factor(grid), engine, ..at_nodes(1) };
+        let settings = BakeSettings { grid: GridSize::Factors([grid; 3]), engine, ..at_nodes(1) };
         let [one, other] = [&scene, &turned].map(|scene| run(scene, &settings));
         let name = format!("{engine:?}, {grid}x");
         for report in [&one.report, &other.report] {

@@ -3,6 +3,7 @@
 use crate::bake::{BakeOptions, BakeSettings, Engine, left_out};
 use crate::error::Result;
 use crate::flattened::Side;
+use crate::illumination_grid::GridSize;
 use crate::scene::{Boundary, Scene};
 use crate::sweep::lit_within_solids;
 use glam::DVec3;
@@ -42,5 +43,21 @@ pub(super) fn warnings(scene: &Scene, options: &BakeOptions, settings: &BakeSett
             100.0 * share
         ));
     }
+    if options.grid.is_none() {
+        lines.extend(long_voxels(scene)?);
+    }
     Ok(lines)
+}
+
+/// Of volumes whose voxels are long what grid would suit them.
+fn long_voxels(scene: &Scene) -> Result<Option<String>> {
+    let lattices = scene.members().into_iter().map(|m| m.field.lattice().clone());
+    let Some(volume) = lattices.into_iter().find(|l| GridSize::Cubic.of(l) != GridSize::OWN) else { return Ok(None) };
+    let [nx, ny, nz] = GridSize::Cubic.lattice(&volume)?.dims();
+    let spacing = volume.spacing();
+    Ok(Some(format!(
+        "voxels are {:.1} times as long as wide, and light on a grid of these is blurred as much; use --grid cubic \
+         ({nx}×{ny}×{nz} points), or --grid 1x for the volume's own",
+        spacing.max_element() / spacing.min_element()
+    )))
 }
