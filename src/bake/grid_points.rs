@@ -420,6 +420,16 @@ mod tests {
     use super::*;
     use crate::rng::{Rng, Stage};
 
+    /// Two gather rays have two halves, whose difference is their noise; nobody gets more rays than are asked for.
+    #[test]
+    fn places_beside_take_fewer_rays() {
+        for (rays, fewer) in
+            [([64, 256], [16, 32]), ([9, 17], [2, 2]), ([2, 2], [2, 2]), ([1, 1], [1, 1]), ([0, 8], [0, 2])]
+        {
+            assert_eq!(rays_beside(rays), fewer, "{rays:?}");
+        }
+    }
+
     #[test]
     fn packing_keeps_what_matters() {
         let mut rng = Rng::stream(1, Stage::Test, 0);

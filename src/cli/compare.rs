@@ -7,10 +7,12 @@ use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
 use crate::export::{Mesh, ply};
 use crate::field::span;
+use crate::illumination_grid::GridSize;
 use crate::progress::{Progress, say};
 use crate::reference::{Origin, light};
 use crate::scene_file::Inputs;
 use crate::surface_mesh::texture;
+use crate::volume::Lattice;
 use std::path::PathBuf;
 
 #[derive(clap::Args, Debug)]
@@ -136,14 +138,14 @@ impl Compare {
         if self.json {
             println!("{}", serde_json::to_string_pretty(&found).expect("the numbers are plain data"));
         } else {
-            print!("{}", everywhere(&found));
+            print!("{}", everywhere(&found, baked.lattice()));
         }
         Ok(())
     }
 }
 
-/// A survey's numbers, a line each.
-fn everywhere(s: &Survey) -> String {
+/// A survey's numbers, a line each, and what lowers the error on the grid's `lattice`.
+fn everywhere(s: &Survey, lattice: &Lattice) -> String {
     let interval = |[lo, hi]: [f64; 2]| format!("(95 % confidence {lo:.3} … {hi:.3})");
     let parts: String = s
         .parts
@@ -160,7 +162,9 @@ fn everywhere(s: &Survey) -> String {
         _ => format!("{:8.3}   {}", s.percent_rms_grid_points, interval(s.confidence_grid_points)),
     };
     let between = s.grid_points > 0 && 2.0 * s.percent_rms_grid_points.powi(2) < s.percent_rms.powi(2);
-    let advice = if between { "most of it lies between grid points: a finer --grid lowers it\n" } else { "" };
+    let finer = if GridSize::Cubic.of(lattice) == GridSize::OWN { "a finer --grid" } else { "--grid cubic" };
+    let advice =
+        if between { format!("most of it lies between grid points: {finer} lowers it\n") } else { String::new() };
     format!(
         "percent RMS       {:8.3}   {}\n  per channel, /√3 {:8.3}\n{parts}at grid points    {at_points}\n\
          bias              {:+8.3}\npoints            {:8}   (2 × {} paths each; {} left out)\n{advice}",

@@ -209,6 +209,11 @@ fn cubic_grids_suit_long_voxels() {
         let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
         let warned = text(&output.stderr).contains("warning: voxels are 4.0 times as long as wide");
         let error = survey(dir, "lit.vti", &["--points", "1000", "--paths", "64"])["percent_rms"].as_f64().unwrap();
+        let said = text(&ok(dir, &["compare", "lit.vti", "--points", "300", "--paths", "16"]).stdout);
+        assert_eq!(
+            said.contains("most of it lies between grid points: --grid cubic lowers it"),
+            grid != ["--grid", "cubic"]
+        );
         (report["settings"]["grid"].as_str().unwrap().to_owned(), warned, error)
     };
     let (grid, warned, long) = bake(&[]);
