@@ -12,7 +12,6 @@ use crate::progress::{Progress, say};
 use crate::reference::{Origin, light};
 use crate::scene_file::Inputs;
 use crate::surface_mesh::texture;
-use crate::volume::Lattice;
 use std::path::PathBuf;
 
 #[derive(clap::Args, Debug)]
@@ -138,14 +137,16 @@ impl Compare {
         if self.json {
             println!("{}", serde_json::to_string_pretty(&found).expect("the numbers are plain data"));
         } else {
-            print!("{}", everywhere(&found, baked.lattice()));
+            // Along long voxels first.
+            let long = baked.lattice() == scene.lattice() && GridSize::Cubic.of(baked.lattice()) != GridSize::OWN;
+            print!("{}", everywhere(&found, if long { "--grid cubic" } else { "a finer --grid" }));
         }
         Ok(())
     }
 }
 
-/// A survey's numbers, a line each, and what lowers the error on the grid's `lattice`.
-fn everywhere(s: &Survey, lattice: &Lattice) -> String {
+/// A survey's numbers, a line each, and that a `finer` grid lowers what interpolation costs.
+fn everywhere(s: &Survey, finer: &str) -> String {
     let interval = |[lo, hi]: [f64; 2]| format!("(95 % confidence {lo:.3} … {hi:.3})");
     let parts: String = s
         .parts
@@ -162,7 +163,6 @@ fn everywhere(s: &Survey, lattice: &Lattice) -> String {
         _ => format!("{:8.3}   {}", s.percent_rms_grid_points, interval(s.confidence_grid_points)),
     };
     let between = s.grid_points > 0 && 2.0 * s.percent_rms_grid_points.powi(2) < s.percent_rms.powi(2);
-    let finer = if GridSize::Cubic.of(lattice) == GridSize::OWN { "a finer --grid" } else { "--grid cubic" };
     let advice =
         if between { format!("most of it lies between grid points: {finer} lowers it\n") } else { String::new() };
     format!(

@@ -113,7 +113,7 @@ fn scene_text(volume: &Path, raw: &RawOptions, statistics: &VolumeStatistics, la
     include_str!("init/scene.toml")
         .replace("@about@", &about)
         .replace("@sweep@", &sweep)
-        .replace("@grid@", grid)
+        .replace("@grid@", &format!("{grid:<26}"))
         .replace("@layout@", &layout)
         .replace("@file@", &quoted(&volume.to_string_lossy()))
 }

@@ -44,20 +44,44 @@ pub(super) fn warnings(scene: &Scene, options: &BakeOptions, settings: &BakeSett
         ));
     }
     if options.grid.is_none() {
-        lines.extend(long_voxels(scene)?);
+        lines.extend(long_voxels(scene));
     }
     Ok(lines)
 }
 
-/// Of volumes whose voxels are long what grid would suit them.
-fn long_voxels(scene: &Scene) -> Result<Option<String>> {
-    let lattices = scene.members().into_iter().map(|m| m.field.lattice().clone());
-    let Some(volume) = lattices.into_iter().find(|l| GridSize::Cubic.of(l) != GridSize::OWN) else { return Ok(None) };
-    let [nx, ny, nz] = GridSize::Cubic.lattice(&volume)?.dims();
+/// Of volumes whose voxels are long what grid would suit them, if that is not too large.
+fn long_voxels(scene: &Scene) -> Option<String> {
+    let mut lattices = scene.members().into_iter().map(|m| m.field.lattice().clone());
+    let volume = lattices.find(|l| GridSize::Cubic.of(l) != GridSize::OWN)?;
+    let [nx, ny, nz] = GridSize::Cubic.lattice(&volume).ok()?.dims();
     let spacing = volume.spacing();
-    Ok(Some(format!(
+    Some(format!(
         "voxels are {:.1} times as long as wide, and light on a grid of these is blurred as much; use --grid cubic \
          ({nx}×{ny}×{nz} points), or --grid 1x for the volume's own",
         spacing.max_element() / spacing.min_element()
-    )))
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::{Field, Sweep};
+    use crate::scene::Surface;
+    use crate::volume::{Lattice, Samples, Volume};
+
+    /// A grid that no lattice can be is no advice, nor a fault of a bake that did not ask for it.
+    #[test]
+    fn long_voxels_are_told_of_a_grid_that_can_be() {
+        let said = |dims: [usize; 3], spacing: DVec3| {
+            let lattice = Lattice::aligned(dims, DVec3::ZERO, spacing).unwrap();
+            let samples = (0..lattice.len()).map(|o| (o % 2) as u8).collect();
+            let volume = Volume::new("v", lattice, Samples::U8(samples)).unwrap();
+            let field = Field::new(&volume, Sweep::new(0.2, 0.8).unwrap()).unwrap();
+            long_voxels(&Scene::new(field, Surface::default(), Boundary::Open, Vec::new()).unwrap())
+        };
+        let advice = said([5, 3, 3], DVec3::new(3.2, 1.0, 1.0)).unwrap();
+        assert!(advice.contains("3.2 times") && advice.contains("13×3×3"), "{advice}");
+        assert_eq!(said([5, 3, 3], DVec3::new(1.0, 1.3, 1.0)), None);
+        assert_eq!(said([600_000, 2, 2], DVec3::new(20.0, 1.0, 1.0)), None);
+    }
 }
