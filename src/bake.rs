@@ -10,6 +10,7 @@ mod sweep_engine;
 mod time;
 
 pub use memory::MemoryEstimate;
+pub(crate) use settings::common_size;
 pub use settings::{BakeOptions, BakeSettings, Engine, Interpolation, MOST_BANDS, Preset, StrategyName};
 pub use time::TimeEstimate;
 

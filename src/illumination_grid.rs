@@ -71,12 +71,11 @@ impl GridSize {
 
     /// This size for `volume`: what is cubic becomes factors.
     #[must_use]
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the factors")]
     pub fn of(self, volume: &Lattice) -> Self {
-        let GridSize::Cubic = self else { return self };
-        let spacing = volume.spacing();
-        let factors = spacing / spacing.min_element();
-        Self::Factors(factors.to_array().map(|x| (x.round() as usize).clamp(1, MOST_FACTOR)))
+        match self {
+            Self::Cubic => Self::Factors(cubic(volume)),
+            other => other,
+        }
     }
 
     /// The lattice of this size over the Ω of `volume`: same corners, other spacing.
@@ -84,17 +83,27 @@ impl GridSize {
     /// # Errors
     /// `Invalid` if it has too many points.
     pub fn lattice(self, volume: &Lattice) -> Result<Lattice> {
-        let dims = match self.of(volume) {
-            Self::OWN => return Ok(volume.clone()),
+        let times = |n: [usize; 3]| std::array::from_fn(|a| volume.cells()[a] * n[a] + 1);
+        let dims = match self {
+            GridSize::Factors(n) => times(n),
+            GridSize::Cubic => times(cubic(volume)),
             GridSize::Points(p) => p,
-            GridSize::Factors(n) => std::array::from_fn(|a| volume.cells()[a] * n[a] + 1),
-            GridSize::Cubic => unreachable!("factors, of a volume"),
         };
+        if dims == volume.dims() {
+            return Ok(volume.clone());
+        }
         let step = volume.far() / DVec3::from_array(dims.map(|n| (n - 1) as f64));
         let axes = volume.axes();
         let axes = DMat3::from_cols(axes.x_axis * step.x, axes.y_axis * step.y, axes.z_axis * step.z);
         Lattice::new(dims, volume.origin(), axes).map_err(|e| Error::Invalid(format!("--grid {self}: {e}")))
     }
+}
+
+/// The factors that make cells of `volume` nearest to cubes.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the factors")]
+fn cubic(volume: &Lattice) -> [usize; 3] {
+    let spacing = volume.spacing();
+    (spacing / spacing.min_element()).to_array().map(|x| (x.round() as usize).clamp(1, MOST_FACTOR))
 }
 
 /// Radiance of one side over a lattice.

@@ -195,10 +195,10 @@ impl<'a> FieldLight<'a> {
         let rays = [settings.gather_rays, settings.shadow_rays];
         let each = match &self.places {
             Places::Grid(points, beside, contacts) => {
-                let at_points = (points.len() + contacts.len()) as u64 * work(rays);
-                at_points + beside.len() as u64 * work(rays_beside(rays))
+                let at_points = (points.len() + contacts.len()) as u64 * rays_of(rays);
+                at_points + beside.len() as u64 * rays_of(rays_beside(rays))
             }
-            Places::Scattered(at) => at.len() as u64 * work(rays),
+            Places::Scattered(at) => at.len() as u64 * rays_of(rays),
         };
         each * self.sides.len() as u64
     }
@@ -225,7 +225,7 @@ impl<'a> FieldLight<'a> {
             let map = source.map(*side).filter(|_| settings.gather_rays == 0);
             let indirect = |rays: u32| map.map_or(Indirect::Gather(cache, rays), Indirect::Map);
             let rays @ [gather_rays, shadow_rays] = [settings.gather_rays, settings.shadow_rays];
-            let (gathered, seed, each) = (indirect(gather_rays), settings.seed, work(rays));
+            let (gathered, seed, each) = (indirect(gather_rays), settings.seed, rays_of(rays));
             let sampler = Sampler { scene, tracer, indirect: &gathered, side: *side, shadow_rays, seed };
             let saved = |kind: u32| stages(checkpoint, STAGES * number + kind)[side.index()];
             match (&self.places, points) {
@@ -237,7 +237,7 @@ impl<'a> FieldLight<'a> {
                     counts += contacts.solve_in(at_points.grid(), own, *side, &wedge, &|n| tick(n * each));
                     let fewer @ [gather_rays, shadow_rays] = rays_beside(rays);
                     let sampler = Sampler { indirect: &indirect(gather_rays), shadow_rays, ..sampler };
-                    counts += beside.sample(&sampler, band, at_beside, saved(4), &|n| tick(n * work(fewer)));
+                    counts += beside.sample(&sampler, band, at_beside, saved(4), &|n| tick(n * rays_of(fewer)));
                 }
                 (Places::Scattered(at), _) => {
                     let isovalue = |p: Vec3| (scene.field.value(p.as_dvec3()) as f32).clamp(0.0, 1.0);
@@ -289,8 +289,8 @@ impl<'a> FieldLight<'a> {
     }
 }
 
-/// Rays of a sample of so many gather and shadow rays, about, of which few shadow rays are needed as a rule.
-fn work([gather, shadow]: [u32; 2]) -> u64 {
+/// Rays of a sample of so many gather and shadow rays, about: half of the shadow rays are spared as a rule.
+fn rays_of([gather, shadow]: [u32; 2]) -> u64 {
     u64::from(2 + shadow / 2 + gather)
 }
 

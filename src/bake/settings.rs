@@ -354,7 +354,10 @@ pub struct BakeSettings {
 }
 
 /// `size` for the volumes of a scene.
-fn grid(size: GridSize, scene: &Scene) -> Result<GridSize> {
+///
+/// # Errors
+/// `Invalid` if it is another of one volume than of another.
+pub(crate) fn common_size(size: GridSize, scene: &Scene) -> Result<GridSize> {
     let mut sizes = scene.members().into_iter().map(|m| size.of(m.field.lattice()));
     let first = sizes.next().unwrap_or(size);
     match sizes.find(|other| *other != first) {
@@ -382,7 +385,7 @@ impl BakeSettings {
     /// option.
     pub fn new(o: &BakeOptions, scene: &Scene) -> Result<Self> {
         let settings = Self::with_engine(o, o.engine(scene)?)?;
-        Ok(Self { grid: grid(settings.grid, scene)?, ..settings })
+        Ok(Self { grid: common_size(settings.grid, scene)?, ..settings })
     }
 
     /// As [`BakeSettings::new`], for an engine that is decided; a grid of cubes is left so.

@@ -232,6 +232,9 @@ fn cubic_grids_suit_long_voxels() {
     fs::write(dir.join("two.toml"), scene).unwrap();
     let words = ["cubic", "1x,1x,4x of one volume and 1x of another"];
     refused(dir, &["bake", "two.toml", "--grid", "cubic", "-o", "two.vtm"], &words);
+    let few = ["--engine", "photon", "--dry-run"];
+    let said = text(&ok(dir, &[&["bake", "two.toml", "-o", "two.vtm"], &few[..]].concat()).stderr);
+    assert!(!said.contains("cubic"), "no advice that is refused: {said}");
 }
 
 #[test]

@@ -63,6 +63,13 @@ fn binary_volumes_are_baked_by_exact_rays() {
     let lit: Vec<f32> = light.chunks_exact(3).zip(mask).filter(|(_, m)| **m != 0).map(|(rgb, _)| rgb[0]).collect();
     let mean = lit.iter().sum::<f32>() / lit.len() as f32;
     assert!(lit.len() > 500 && (1.9..2.1).contains(&mean), "{mean} of {}", lit.len());
+    // All samples are at places beside steep edges, which take a quarter of the gather rays.
+    let [few, many] = ["64", "128"].map(|gather| {
+        let json = ok(dir, &[&bake[..], &more, &["--gather", gather, "--json", "-q"]].concat()).stdout;
+        let report: serde_json::Value = serde_json::from_slice(&json).unwrap();
+        ["rays", "samples"].map(|name| report[name].as_u64().unwrap())
+    });
+    assert!(few[1] == many[1] && many[0] - few[0] == 16 * few[1], "{few:?} {many:?}");
     // Sweeps that are asked for say what they leave out; on a finer grid points lie within the sweep.
     let dry = |more: &[&str]| text(&ok(dir, &[&bake[..], &["-o", "lit.vti", "--dry-run"], more].concat()).stderr);
     let lines = dry(&["--engine", "sweep"]);

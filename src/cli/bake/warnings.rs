@@ -1,6 +1,6 @@
 //! What a bake warns of before it begins.
 
-use crate::bake::{BakeOptions, BakeSettings, Engine, left_out};
+use crate::bake::{BakeOptions, BakeSettings, Engine, common_size, left_out};
 use crate::error::Result;
 use crate::flattened::Side;
 use crate::illumination_grid::GridSize;
@@ -49,11 +49,11 @@ pub(super) fn warnings(scene: &Scene, options: &BakeOptions, settings: &BakeSett
     Ok(lines)
 }
 
-/// Of volumes whose voxels are long what grid would suit them, if that is not too large.
+/// Of volumes whose voxels are long what grid would suit them, if one suits all of them and is not too large.
 fn long_voxels(scene: &Scene) -> Option<String> {
-    let mut lattices = scene.members().into_iter().map(|m| m.field.lattice().clone());
-    let volume = lattices.find(|l| GridSize::Cubic.of(l) != GridSize::OWN)?;
-    let [nx, ny, nz] = GridSize::Cubic.lattice(&volume).ok()?.dims();
+    let cubic = common_size(GridSize::Cubic, scene).ok().filter(|size| *size != GridSize::OWN)?;
+    let volume = scene.lattice();
+    let [nx, ny, nz] = cubic.lattice(volume).ok()?.dims();
     let spacing = volume.spacing();
     Some(format!(
         "voxels are {:.1} times as long as wide, and light on a grid of these is blurred as much; use --grid cubic \
