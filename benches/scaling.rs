@@ -206,7 +206,7 @@ fn main() {
             "fit",
             Box::new(|| {
                 let free = NodeSet::new(lattice.len(), |o| start.mask[o] != Mask::Empty);
-                drop(black_box(fit(&scene.field, lattice, &wishes, start.clone(), &free, PULL, &|_| true)));
+                drop(black_box(fit(&scene.field, lattice, &wishes, start.radiance.clone(), &free, PULL, &|_| true)));
             }),
         ),
         ("sweep, direct", Box::new(|| swept(8, 64, 1))),

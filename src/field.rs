@@ -85,6 +85,12 @@ impl Field {
         }
     }
 
+    /// This field with the receiver normals of `coarse`, of which it is a finer copy.
+    #[must_use]
+    pub fn with_normals_of(self, coarse: Field) -> Self {
+        Self { coarse: Some(Arc::new(coarse)), ..self }
+    }
+
     /// The field of which this is a copy on a lattice so many times as fine along each axis: every so many-th sample.
     /// `None` if the lattice is of no such.
     #[must_use]
@@ -141,6 +147,11 @@ impl Field {
     /// Whether normals come from these samples, not from those of a coarser field that these interpolate.
     pub fn has_own_normals(&self) -> bool {
         self.coarse.is_none()
+    }
+
+    /// The field of which receiver normals are: this one, or a coarser one.
+    pub fn normals_from(&self) -> &Field {
+        self.coarse.as_deref().unwrap_or(self)
     }
 
     /// The largest magnitude that a sample may have.

@@ -8,7 +8,6 @@
 //! matrix-free.
 
 use crate::field::Field;
-use crate::illumination_grid::IlluminationGrid;
 use crate::node_set::NodeSet;
 use crate::radiance::RadianceSample;
 use crate::volume::Lattice;
@@ -26,13 +25,15 @@ const STEPS: usize = 16;
 pub struct Wish {
     /// Where, local frame.
     pub position: Vec3,
-    /// Radiance wished for.
-    pub radiance: Vec3,
+    /// Light wished for.
+    pub light: Vec3,
+    /// How much it counts, among samples of equal |∇h|.
+    pub weight: f32,
 }
 
 impl From<&RadianceSample> for Wish {
     fn from(s: &RadianceSample) -> Self {
-        Self { position: s.position, radiance: s.radiance }
+        Self { position: s.position, light: s.radiance, weight: 1.0 }
     }
 }
 
@@ -52,7 +53,7 @@ struct Placed {
     /// Position in the cell, [0, 1]³.
     u: Vec3,
     weight: f32,
-    radiance: Vec3,
+    light: Vec3,
 }
 
 impl Placed {
@@ -65,18 +66,18 @@ impl Placed {
     }
 }
 
-/// Improves `start` (Shepard's grid on `lattice`, say) by the least-squares fit described above at the nodes that
-/// `free` holds; the others stay as they are. `pull` as [`PULL`]. The result does not depend on the number of threads.
-/// Beside the grid it takes 84 bytes per free node and 110 per sample.
+/// Improves `start`, light at the points of `lattice` (Shepard's, say), by the least-squares fit described above at the
+/// nodes that `free` holds; the others stay as they are. `pull` as [`PULL`]. The result does not depend on the number
+/// of threads. Beside the grid it takes 84 bytes per free node and 114 per sample.
 pub fn fit(
     field: &Field,
     lattice: &Lattice,
     samples: &[Wish],
-    mut start: IlluminationGrid,
+    mut start: Vec<[f32; 3]>,
     free: &NodeSet,
     pull: f32,
     tick: &(dyn Fn(u64) -> bool + Sync),
-) -> IlluminationGrid {
+) -> Vec<[f32; 3]> {
     let sorted = Sorted::new(field, lattice, samples);
     if free.is_empty() || samples.is_empty() {
         return start;
@@ -98,8 +99,8 @@ pub fn fit(
     };
     // A x = b with x = start + d: r = Σ w φ (r_j − interpolated start).
     let mut r = {
-        let said = each(&|o| [o, o + 1].map(|o| Vec3::from_array(start.radiance[o])));
-        sorted.gather(free, |n| sorted.samples[n].weight * (sorted.samples[n].radiance - said[n]))
+        let said = each(&|o| [o, o + 1].map(|o| Vec3::from_array(start[o])));
+        sorted.gather(free, |n| sorted.samples[n].weight * (sorted.samples[n].light - said[n]))
     };
     let mut d = vec![Vec3::ZERO; free.len()];
     let precondition = |r: &[Vec3]| -> Vec<Vec3> {
@@ -124,8 +125,8 @@ pub fn fit(
     }
     tick(lattice.len() as u64);
     for (o, d) in free.members(0..lattice.len()).zip(d) {
-        // Radiance is not negative, but a fit through noise may be.
-        start.radiance[o] = (Vec3::from_array(start.radiance[o]) + d).max(Vec3::ZERO).to_array();
+        // Light is not negative, but a fit through noise may be.
+        start[o] = (Vec3::from_array(start[o]) + d).max(Vec3::ZERO).to_array();
     }
     start
 }
@@ -159,8 +160,8 @@ impl Sorted {
                 let cell = [0, 1, 2].map(|a| (p[a] as usize).min(cells[a] - 1));
                 let u = p - DVec3::from_array(cell.map(|c| c as f64));
                 let index = (cell[2] * cells[1] + cell[1]) * cells[0] + cell[0];
-                let weight = field.gradient(local).length() as f32;
-                Placed { cell: index as u64, u: u.as_vec3(), weight, radiance: s.radiance }
+                let weight = s.weight * field.gradient(local).length() as f32;
+                Placed { cell: index as u64, u: u.as_vec3(), weight, light: s.light }
             })
             .collect();
         // Stable: samples of one cell keep their order.
@@ -227,7 +228,7 @@ impl Sorted {
 mod tests {
     use super::*;
     use crate::field::Sweep;
-    use crate::illumination_grid::shepard;
+    use crate::illumination_grid::{IlluminationGrid, shepard};
     use crate::mask::{Mask, masks};
     use crate::rng::{Sobol, Stage};
     use crate::volume::{Samples, Volume};
@@ -265,7 +266,11 @@ mod tests {
         let before = error(&start);
         let wishes: Vec<Wish> = samples.iter().map(Wish::from).collect();
         let free = NodeSet::new(field.lattice().len(), |o| start.mask[o] != Mask::Empty);
-        let with = |pull: f32| error(&fit(&field, field.lattice(), &wishes, start.clone(), &free, pull, &|_| true));
+        let with = |pull: f32| {
+            let radiance = start.radiance.clone();
+            let radiance = fit(&field, field.lattice(), &wishes, radiance, &free, pull, &|_| true);
+            error(&IlluminationGrid { radiance, ..start.clone() })
+        };
         // These samples have no noise.
         let [after, held] = [0.01, PULL].map(with);
         println!("RMS error: Shepard {before}, fitted {after}, held against noise {held}");

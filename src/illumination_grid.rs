@@ -3,9 +3,12 @@
 
 use crate::error::{Error, Result};
 use crate::field::Field;
+use crate::flattened::Side;
 use crate::mask::Mask;
 use crate::nearest::{Neighbours, PointGrid};
 use crate::radiance::RadianceSample;
+use crate::scene::Scene;
+use crate::split::{self, Split};
 use crate::volume::Lattice;
 use glam::{DMat3, DVec3, Vec3};
 use rayon::prelude::*;
@@ -115,12 +118,30 @@ pub struct IlluminationGrid {
     pub std_error: Vec<f32>,
     /// What each point holds.
     pub mask: Vec<Mask>,
+    /// The radiance in two parts, if that is asked for.
+    pub split: Option<Split>,
 }
 
 impl IlluminationGrid {
     /// Radiance at index coordinates `p` of its `lattice`, as a 3D texture gives it: trilinear over the points of the
     /// cell that hold something; 0 where none does.
     pub fn interpolate(&self, lattice: &Lattice, p: DVec3) -> DVec3 {
+        let [radiance] = self.between(lattice, p, [&self.radiance]);
+        radiance
+    }
+
+    /// Radiance of `side` at local position `p` of `scene`, which this grid over `lattice` lights: as
+    /// [`IlluminationGrid::interpolate`] of a grid that is not split; else direct light is that of the place and its
+    /// normal, in closed form, times the share that is visible.
+    pub fn radiance_at(&self, scene: &Scene, lattice: &Lattice, p: DVec3, side: Side) -> DVec3 {
+        let at = if lattice == scene.lattice() { p } else { p * (lattice.far() / scene.lattice().far()) };
+        let Some(Split { indirect, visible }) = &self.split else { return self.interpolate(lattice, at) };
+        let [indirect, visible] = self.between(lattice, at, [indirect, visible]);
+        split::radiance(scene, p, side, indirect, visible)
+    }
+
+    /// What `values` of the points, three channels each, say between them.
+    fn between<const N: usize>(&self, lattice: &Lattice, p: DVec3, values: [&[[f32; 3]]; N]) -> [DVec3; N] {
         let far = lattice.far();
         let p = p.clamp(DVec3::ZERO, far);
         let base = p.floor().min(far - 1.0);
@@ -130,7 +151,7 @@ impl IlluminationGrid {
             let i = x as usize;
             i
         });
-        let (mut sum, mut weight) = (DVec3::ZERO, 0.0);
+        let (mut sums, mut weight) = ([DVec3::ZERO; N], 0.0);
         for corner in 0..8 {
             let [x, y, z] = [corner & 1, corner >> 1 & 1, corner >> 2];
             let o = lattice.offset(cell[0] + x, cell[1] + y, cell[2] + z);
@@ -140,17 +161,22 @@ impl IlluminationGrid {
             let w = (if x == 1 { u.x } else { 1.0 - u.x })
                 * (if y == 1 { u.y } else { 1.0 - u.y })
                 * (if z == 1 { u.z } else { 1.0 - u.z });
-            sum += w * DVec3::from_array(self.radiance[o].map(f64::from));
+            sums.iter_mut().zip(values).for_each(|(sum, v)| *sum += w * DVec3::from_array(v[o].map(f64::from)));
             weight += w;
         }
-        if weight > 0.0 { sum / weight } else { DVec3::ZERO }
+        sums.map(|sum| if weight > 0.0 { sum / weight } else { DVec3::ZERO })
     }
 
     /// Empties points whose radiance or standard error is not finite, and counts them.
     pub(crate) fn clear_non_finite(&mut self) -> u64 {
         let points = self.radiance.par_iter_mut().zip(&mut self.std_error).zip(&mut self.mask);
         let bad = points.filter(|((rgb, e), _)| !(e.is_finite() && rgb.iter().all(|x| x.is_finite())));
-        bad.map(|((rgb, e), mask)| (*rgb, *e, *mask) = ([0.0; 3], 0.0, Mask::Empty)).count() as u64
+        let count = bad.map(|((rgb, e), mask)| (*rgb, *e, *mask) = ([0.0; 3], 0.0, Mask::Empty)).count() as u64;
+        if let (Some(Split { indirect, visible }), true) = (&mut self.split, count > 0) {
+            let points = indirect.par_iter_mut().zip(visible).zip(&self.mask);
+            points.filter(|(_, m)| **m == Mask::Empty).for_each(|((a, b), _)| (*a, *b) = ([0.0; 3], [0.0; 3]));
+        }
+        count
     }
 }
 
@@ -211,7 +237,7 @@ pub(crate) fn from_nearest(
         }
         tick(radiance.len() as u64);
     });
-    IlluminationGrid { radiance, std_error, mask: masks.to_vec() }
+    IlluminationGrid { radiance, std_error, mask: masks.to_vec(), split: None }
 }
 
 /// Shepard's mean of (squared distance, slot) entries of (radiance, variance), and its standard error.
@@ -253,6 +279,7 @@ mod tests {
             radiance: light.to_vec(),
             std_error: vec![0.1, 0.2, f32::NAN, f32::INFINITY, f32::NAN],
             mask: vec![Mask::Valid, Mask::Valid, Mask::Valid, Mask::Filled, Mask::Empty],
+            split: Some(Split { indirect: light.to_vec(), visible: vec![[0.5; 3]; 5] }),
         };
         assert_eq!(grid.clear_non_finite(), 4);
         assert_eq!((grid.radiance[0], grid.std_error[0], grid.mask[0]), (light[0], 0.1, Mask::Valid));

@@ -55,6 +55,7 @@ pub mod gather;
 // Where, how much, onto the lattice.
 pub mod sampling;
 pub mod radiance;
+pub mod split;
 pub mod illumination_grid;
 pub mod irradiance_caching;
 pub mod fitted_grid;

@@ -81,6 +81,8 @@ pub struct SweepSettings {
     pub replicates: usize,
     /// Texels along the longer edge of a wall, and isovalues of its texture.
     pub flat_resolution: (usize, usize),
+    /// Whether direct light is told apart: 12 bytes per node and stored side.
+    pub direct: bool,
     /// Seed of the run.
     pub seed: u64,
 }
@@ -94,6 +96,7 @@ impl Default for SweepSettings {
             target: 4e-3,
             replicates: 4,
             flat_resolution: (32, 32),
+            direct: false,
             seed: 1,
         }
     }
@@ -106,6 +109,8 @@ pub struct SweptSide {
     pub side: Side,
     /// Irradiance E (world, not divided by π), straight from luminaires and from everything else.
     pub irradiance: Vec<[f32; 3]>,
+    /// What of it comes straight from luminaires; empty unless [`SweepSettings::direct`] asks for it.
+    pub direct: Vec<[f32; 3]>,
     /// Standard error of the luminance of the reflected radiance ρE/π, from the spread of the replicates and how much
     /// better than independent ones they are together (measured at one node in sixteen; a bound unless they are 4, 8,
     /// 16 …). Empty with fewer than 2. What the grid cannot hold between its nodes is not part of it.
@@ -292,12 +297,13 @@ pub fn sweep_resumable(
         })
     });
     let flats = flats.collect();
-    let mut sides = total.finish(&Focus { dims, lit: |at| lit[at] }, done);
+    let mut sides = total.finish(&Focus { dims, lit: |at| lit[at] }, done, settings.direct);
     let world = |o: usize| scene.lattice().to_world(DVec3::from_array(scene.lattice().ijk(o).map(|i| i as f64)));
     let dark = slits.hidden.iter().map(|hidden| hidden.0).filter(|&o| scene.covers(world(o)));
     for o in dark {
         for side in &mut sides {
             side.irradiance[o] = [0.0; 3];
+            side.direct.get_mut(o).into_iter().for_each(|d| *d = [0.0; 3]);
             side.std_error.get_mut(o).into_iter().for_each(|e| *e = 0.0);
         }
     }

@@ -9,8 +9,10 @@ use crate::export::bake_file::BakedVolume;
 use crate::flat::{self, FlatTexture};
 use crate::flattened::Side;
 use crate::mask::Mask;
+use crate::polygon::Polygon;
 use crate::render::Camera;
 use crate::scene::{Boundary, Scene};
+use crate::split::{MOST_VISIBLE, Split};
 use base64::Engine;
 use flate2::{Compression, write::ZlibEncoder};
 use glam::{DMat3, DVec3};
@@ -82,11 +84,17 @@ impl Payload {
         let codes: Vec<u16> = samples.par_iter().map(|&s| codec::encode(s)).collect();
         codec::append_codes(&mut bytes, &codes);
         drop(codes);
-        let mut lights = Vec::new();
+        let luminaires = luminaires(baked, &frame);
+        let (mut lights, mut visible) = (Vec::new(), Vec::new());
         for (_, grid) in &baked.sides {
             lights.push(bytes.len());
-            codec::append_colours(&mut bytes, &grid.radiance, factor);
+            let split = grid.split.as_ref().filter(|_| !luminaires.is_empty());
+            codec::append_colours(&mut bytes, split.map_or(&grid.radiance, |split| &split.indirect), factor);
             codec::append_plane(&mut bytes, grid.mask.iter().map(|&m| if m == Mask::Empty { 0 } else { 255 }));
+            if let Some(Split { visible: shares, .. }) = split {
+                visible.push(bytes.len());
+                codec::append_colours(&mut bytes, shares, 1.0 / MOST_VISIBLE);
+            }
         }
         let flats: Vec<Value> = (0..flat::count(scene))
             .filter(|&n| !leaves_out(scene) || scene.polygons().get(n).is_none_or(|p| p.other_face == 0))
@@ -110,6 +118,13 @@ impl Payload {
             "capped": scene.boundary == Boundary::Capped,
             "albedo": scene.surface.albedo.stops(),
             "lights": lights,
+            "split": {
+                "visible": visible,
+                "most": MOST_VISIBLE,
+                "luminaires": luminaires,
+                // A finer grid's normals are those of the volume.
+                "steps": normal_steps(scene),
+            },
             "flats": flats,
             "histogram": histogram(samples),
             "length": bytes.len(),
@@ -186,6 +201,35 @@ fn describe_flat(baked: &BakedVolume, frame: &Frame, n: usize, factor: f32, byte
         "dv": dual(g, e),
         "texture": texture,
     }))
+}
+
+/// Luminaires, and corners of them, from which a page computes direct light at most; of more it shows the radiance of
+/// the grid's points.
+const MOST_LUMINAIRES: usize = 8;
+const MOST_CORNERS: usize = 64;
+
+/// What direct light of a split bake is computed from; none where the page takes radiance instead.
+fn luminaires(baked: &BakedVolume, frame: &Frame) -> Vec<Value> {
+    let scene = &baked.scene;
+    let all: Vec<&Polygon> = scene.luminaires().iter().map(|&l| &scene.polygons()[l as usize]).collect();
+    let corners: usize = all.iter().map(|l| l.vertices().len()).sum();
+    let split = baked.sides.iter().all(|(_, grid)| grid.split.is_some());
+    if !split || all.len() > MOST_LUMINAIRES || corners > MOST_CORNERS {
+        return Vec::new();
+    }
+    let describe = |l: &Polygon| {
+        json!({
+            "corners": l.vertices().iter().map(|&v| frame.point(v)).collect::<Vec<_>>(),
+            "normal": l.normal().to_array(),
+            "power": (l.emission * baked.exposure).to_array(),
+        })
+    };
+    all.into_iter().map(describe).collect()
+}
+
+/// Points of the grid between the samples that normals come from, along each axis.
+fn normal_steps(scene: &Scene) -> [f64; 3] {
+    (scene.lattice().far() / scene.field.normals_from().lattice().far()).to_array()
 }
 
 /// Samples per bin of the sweep.

@@ -19,7 +19,9 @@ fn document(name: &str) -> String {
 fn help(flag: &str) -> String {
     let output = Command::new(env!("CARGO_BIN_EXE_isolume")).args(["help", "bake"]).output().unwrap();
     let text = String::from_utf8(output.stdout).unwrap();
-    let from = text.find(&format!("      --{flag} ")).unwrap_or_else(|| panic!("no --{flag} in: {text}"));
+    // Its value follows, which of some may be left out.
+    let from = [" ", "[="].iter().find_map(|end| text.find(&format!("      --{flag}{end}")));
+    let from = from.unwrap_or_else(|| panic!("no --{flag} in: {text}"));
     let about = text[from..].lines().skip(1).take_while(|l| !l.trim_start().starts_with('-'));
     about.flat_map(str::split_whitespace).collect::<Vec<_>>().join(" ")
 }

@@ -69,6 +69,7 @@ const ONE_BOUNCE: SweepSettings = SweepSettings {
     target: 1e-3,
     replicates: 1,
     flat_resolution: (16, 16),
+    direct: false,
     seed: 1,
 };
 

@@ -330,6 +330,49 @@ fn axes_caps_and_sides_are_where_render_has_them() {
     compare(dir, &program, &views, "");
 }
 
+/// Direct light that the page computes itself: on a skew volume with a finer grid, whose normals are those of the
+/// volume, by a square above and a triangle in front.
+#[test]
+fn split_light_is_what_render_draws() {
+    let Some(program) = chromium() else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let axes = DMat3::from_cols(DVec3::new(0.0, 0.2, -1.0), DVec3::new(2.0, 0.0, 0.3), DVec3::new(0.1, -0.9, 0.0));
+    let lattice = Lattice::new([11, 7, 13], DVec3::new(1000.0, -2000.0, 500.0), 2.0 * axes).unwrap();
+    let samples = (0..lattice.len()).map(|o| {
+        let p = DVec3::from_array(lattice.ijk(o).map(|i| i as f64)) / DVec3::new(10.0, 6.0, 12.0);
+        let bump = |m: DVec3, s: f64| (-(p - m).length_squared() / (2.0 * s * s)).exp();
+        (100.0 * bump(DVec3::new(0.6, 0.15, 0.5), 0.2) + 80.0 * bump(DVec3::new(0.3, 0.7, 0.3), 0.12)) as f32
+    });
+    Volume::new("skew", lattice.clone(), Samples::F32(samples.collect())).unwrap().write(dir.join("b.nrrd")).unwrap();
+    let lamp = "newmtl lamp\nKd 0 0 0\nKe 1 6 9\n";
+    fs::write(dir.join("lamp.mtl"), lamp).unwrap();
+    // A triangle in front of the volume, facing it.
+    let lamp = "mtllib lamp.mtl\nusemtl lamp\nv 1000 -2030 478\nv 1006 -2030 478\nv 1003 -2030 484\nf 1 3 2\n";
+    fs::write(dir.join("lamp.obj"), lamp).unwrap();
+    let scene = "isovalues = [5, 90]\n[volume]\nfile = \"b.nrrd\"\n[surface]\noutside = \"higher\"\nsides = \"both\"\n\
+                 albedo = [{ isovalue = 5, colour = [0.9, 0.8, 0.7] }, { isovalue = 90, colour = [0.3, 0.4, 0.5] }]\n[box]\nmargin = 0.3\n[[context]]\nfile = \"lamp.obj\"\n\
+                 [bake]\npreset = \"preview\"\ngrid = \"2x\"\nsplit = true\n";
+    fs::write(dir.join("b.toml"), scene).unwrap();
+    isolume(dir, &["bake", "b.toml", "-o", "out.vti", "-q"]);
+    let baked = BakedVolume::read(&dir.join("out.vti")).unwrap();
+    let lights = baked.scene.luminaires().iter().map(|&l| baked.scene.polygons()[l as usize].vertices().len());
+    assert!(baked.sides.iter().all(|(_, grid)| grid.split.is_some()) && lights.collect::<Vec<_>>() == [4, 3, 3]);
+    let view = |name, iso: f64, extra: &str| View {
+        name,
+        page: format!("{{ iso: {} }}", (iso - 5.0) / 85.0),
+        render: words(&format!("--isovalue {iso} {extra}")),
+    };
+    compare(dir, &program, &[view("split-40", 40.0, ""), view("split-15", 15.0, "")], "");
+    // What the page shows is not the grid's radiance.
+    let whole = Bytes::render(dir, &["--isovalue", "40"]);
+    isolume(dir, &["bake", "b.toml", "-o", "out.vti", "-q", "--split=false"]);
+    let without = Bytes::render(dir, &["--isovalue", "40"]);
+    let differing = whole.rgb.iter().zip(&without.rgb).filter(|(a, b)| a != b).count();
+    println!("{differing} pixels differ from those without");
+    assert!(differing > 500);
+}
+
 /// Densities that fall by orders of magnitude, whose walls hold their isovalues along a bent axis: two level sets that
 /// lie within a texel of an even one.
 #[test]

@@ -56,8 +56,11 @@ pub struct Survey {
     /// Paths of each of a point's two estimates.
     pub paths: u32,
     /// 100 √⟨(t − r₁)·(t − r₂)⟩ over points of which each isovalue has as many and each isosurface evenly by its area,
-    /// where t is what the bake's texture shows and r what paths find: without their noise, 0 where that is negative.
+    /// where t is what the bake shows and r what paths find: without their noise, 0 where that is negative.
     pub percent_rms: f64,
+    /// The same where t is radiance as a 3D texture shows it: another number if the bake is split
+    /// ([`crate::split::Split`]).
+    pub percent_rms_texture: f64,
     /// The same per channel: / √3.
     pub percent_rms_sqrt3: f64,
     /// 95 % confidence interval of `percent_rms`, from the scatter over points (as if they were independent).
@@ -107,11 +110,11 @@ pub fn survey<T: Tracer>(
     let (exposure, side) = (scene.exposure(), scene.surface.outside);
     let scale = lattice.far() / scene.lattice().far();
     let rays = AtomicU64::new(0);
-    let compare = |p: DVec3, texture: DVec3, index: usize| {
+    let compare = |p: DVec3, shown: [DVec3; 2], index: usize| {
         #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
         let receiver = receiver(scene, p, scene.field.value(p) as f32, side)?;
         let open = !scene.covers(scene.lattice().to_world(p)) && tick(0);
-        open.then(|| Deviation::new(&receiver, texture, exposure, settings, (scene, tracer), (index, &rays)))
+        open.then(|| Deviation::new(&receiver, shown, exposure, settings, (scene, tracer), (index, &rays)))
     };
     // On the isosurface, and at a point of the grid beside it.
     let found: Vec<[Option<Deviation>; 2]> = chosen
@@ -119,11 +122,12 @@ pub fn survey<T: Tracer>(
         .enumerate()
         .with_max_len(16)
         .map(|(i, &p)| {
-            let between = compare(p, grid.interpolate(lattice, p * scale), 2 * i);
+            let shown = [grid.radiance_at(scene, lattice, p, side), grid.interpolate(lattice, p * scale)];
+            let between = compare(p, shown, 2 * i);
             tick(1);
             let at = beside(lattice, grid, p * scale, &mut stream(settings, i as u64)).and_then(|o| {
                 let texture = DVec3::from_array(grid.radiance[o].map(f64::from));
-                compare(local_position(&scene.field, lattice, o), texture, 2 * i + 1)
+                compare(local_position(&scene.field, lattice, o), [texture; 2], 2 * i + 1)
             });
             tick(1);
             [between, at]
@@ -147,6 +151,7 @@ pub fn survey<T: Tracer>(
         points: all.len(),
         paths: settings.paths,
         percent_rms: percent(square),
+        percent_rms_texture: percent(all.iter().map(|d| d.texture_square).sum::<f64>() / (all.len() as f64).max(1.0)),
         percent_rms_sqrt3: percent(square / 3.0),
         confidence: confidence.map(percent),
         grid_points: at_points.len(),
@@ -168,8 +173,9 @@ fn percent(square: f64) -> f64 {
 struct Deviation {
     /// In units of the sweep.
     isovalue: f64,
-    /// (t − r₁)·(t − r₂).
+    /// (t − r₁)·(t − r₂), and the same of the texture.
     square: f64,
+    texture_square: f64,
     /// t − r, mean over channels.
     bias: f64,
 }
@@ -177,19 +183,20 @@ struct Deviation {
 impl Deviation {
     fn new<T: Tracer>(
         at: &Receiver,
-        texture: DVec3,
+        shown: [DVec3; 2],
         exposure: f64,
         settings: &SurveySettings,
         (scene, tracer): (&Scene, &T),
         (index, rays): (usize, &AtomicU64),
     ) -> Self {
         let mut paths = PathTracer::new(scene, tracer);
-        let [a, b] = [1, 2].map(|n| {
-            let key = (seed(settings, n), index as u64);
-            display(texture, exposure) - display(paths.outgoing(at, settings.paths, key), exposure)
-        });
+        let found =
+            [1, 2].map(|n| display(paths.outgoing(at, settings.paths, (seed(settings, n), index as u64)), exposure));
         rays.fetch_add(paths.rays, Ordering::Relaxed);
-        Self { isovalue: f64::from(at.isovalue), square: a.dot(b), bias: (a + b).element_sum() / 6.0 }
+        let off = |shown: DVec3| found.map(|r| display(shown, exposure) - r);
+        let ([a, b], [c, d]) = (off(shown[0]), off(shown[1]));
+        let bias = (a + b).element_sum() / 6.0;
+        Self { isovalue: f64::from(at.isovalue), square: a.dot(b), texture_square: c.dot(d), bias }
     }
 }
 
@@ -297,6 +304,7 @@ mod tests {
             radiance,
             std_error: vec![0.0; lattice.len()],
             mask: crate::mask::masks(&scene.field, lattice),
+            split: None,
         };
         let device = Device::new(0).unwrap();
         let tracer = GraphTracer::new(&device, scene).unwrap();

@@ -14,6 +14,7 @@ use crate::node_set::NodeSet;
 use crate::radiance::{BLOCK, RadianceSample, RadianceSamples, Sampler, sample_places};
 use crate::scene::Scene;
 use crate::smoothing::{Halves, Scattered, Smoothed, smooth, smooth_scattered};
+use crate::split::{MOST_VISIBLE, Parts, Split};
 use crate::tracer::Tracer;
 use crate::volume::Lattice;
 use glam::{DVec3, Vec3};
@@ -69,6 +70,8 @@ pub(super) struct PointLight {
     grid: IlluminationGrid,
     /// Gathered light of the points, if it is to be smoothed.
     halves: Option<Vec<Packed>>,
+    /// Direct irradiance, if light is to be split.
+    direct: Option<Vec<[f32; 3]>>,
 }
 
 impl PointLight {
@@ -135,12 +138,15 @@ impl<'a> GridPoints<'a> {
         self.set.len()
     }
 
-    /// Darkness on one side; `smoothing`: whether what is gathered will be smoothed.
-    pub(super) fn dark(&self, smoothing: bool) -> PointLight {
+    /// Darkness on one side; `smoothing`: whether what is gathered will be smoothed; `split`: whether light will be.
+    pub(super) fn dark(&self, smoothing: bool, split: bool) -> PointLight {
         let n = self.lattice.len();
-        let grid =
-            IlluminationGrid { radiance: vec![[0.0; 3]; n], std_error: vec![0.0; n], mask: vec![Mask::Empty; n] };
-        PointLight { grid, halves: smoothing.then(|| vec![Packed::NONE; self.set.len()]) }
+        let (radiance, std_error, mask) = (vec![[0.0; 3]; n], vec![0.0; n], vec![Mask::Empty; n]);
+        PointLight {
+            grid: IlluminationGrid { radiance, std_error, mask, split: None },
+            halves: smoothing.then(|| vec![Packed::NONE; self.set.len()]),
+            direct: split.then(|| vec![[0.0; 3]; n]),
+        }
     }
 
     /// The isovalue of a point, or the nearest of the sweep.
@@ -166,7 +172,7 @@ impl<'a> GridPoints<'a> {
         saved: checkpoint::Stage<'_>,
         tick: &(dyn Fn(u64) -> bool + Sync),
     ) -> Counts {
-        let PointLight { grid, halves } = light;
+        let PointLight { grid, halves, direct } = light;
         let smoothing = halves.is_some();
         let halves = match halves {
             Some(halves) => self.set.split(halves, BLOCK),
@@ -174,39 +180,45 @@ impl<'a> GridPoints<'a> {
         };
         let first = band.number * blocks(self.lattice);
         let rows = grid.radiance.par_chunks_mut(BLOCK).zip(grid.std_error.par_chunks_mut(BLOCK));
-        let rows = rows.zip(grid.mask.par_chunks_mut(BLOCK)).zip(halves);
-        let counts = rows.enumerate().with_max_len(1).map(|(block, (((radiance, std_error), mask), halves))| {
-            let start = block * BLOCK;
-            let range = start..start + radiance.len();
-            let own: Vec<usize> = self.set.members(range).filter(|&o| band.holds(self.isovalue(o))).collect();
-            if own.is_empty() || !tick(0) {
-                return Counts::default();
-            }
-            let place = |&o: &usize| {
-                let position = local_position(self.field, self.lattice, o).as_vec3();
-                ((STAND_INS * o) as u64, position)
-            };
-            let places: Vec<(u64, Vec3)> = own.iter().map(place).collect();
-            let mut samples = vec![None; own.len()];
-            let [rays, misses] = sampler.block(&places, &mut samples, saved, first + block);
-            let before = self.set.before(start);
-            for (&o, s) in own.iter().zip(&samples) {
-                let Some(s) = s else { continue };
-                radiance[o - start] = s.radiance.to_array();
-                mask[o - start] = self.masks[o];
-                let smoothing = smoothing && !apart(o);
-                std_error[o - start] = match smoothing {
-                    true => s.variance - s.indirect_variance,
-                    false => s.variance.sqrt(),
-                };
-                if smoothing {
-                    halves[self.set.before(o) - before] = Packed::new(s.indirect);
+        let direct: Vec<&mut [[f32; 3]]> = match direct {
+            Some(direct) => direct.chunks_mut(BLOCK).collect(),
+            None => (0..blocks(self.lattice)).map(|_| &mut [][..]).collect(),
+        };
+        let rows = rows.zip(grid.mask.par_chunks_mut(BLOCK)).zip(halves).zip(direct);
+        let counts =
+            rows.enumerate().with_max_len(1).map(|(block, ((((radiance, std_error), mask), halves), direct))| {
+                let start = block * BLOCK;
+                let range = start..start + radiance.len();
+                let own: Vec<usize> = self.set.members(range).filter(|&o| band.holds(self.isovalue(o))).collect();
+                if own.is_empty() || !tick(0) {
+                    return Counts::default();
                 }
-            }
-            let without_gradient = samples.iter().filter(|s| s.is_none()).count() as u64;
-            tick(own.len() as u64);
-            Counts { rays, misses, samples: own.len() as u64 - without_gradient, without_gradient }
-        });
+                let place = |&o: &usize| {
+                    let position = local_position(self.field, self.lattice, o).as_vec3();
+                    ((STAND_INS * o) as u64, position)
+                };
+                let places: Vec<(u64, Vec3)> = own.iter().map(place).collect();
+                let mut samples = vec![None; own.len()];
+                let [rays, misses] = sampler.block(&places, &mut samples, saved, first + block);
+                let before = self.set.before(start);
+                for (&o, s) in own.iter().zip(&samples) {
+                    let Some(s) = s else { continue };
+                    radiance[o - start] = s.radiance.to_array();
+                    mask[o - start] = self.masks[o];
+                    direct.get_mut(o - start).into_iter().for_each(|d| *d = s.direct.to_array());
+                    let smoothing = smoothing && !apart(o);
+                    std_error[o - start] = match smoothing {
+                        true => s.variance - s.indirect_variance,
+                        false => s.variance.sqrt(),
+                    };
+                    if smoothing {
+                        halves[self.set.before(o) - before] = Packed::new(s.indirect);
+                    }
+                }
+                let without_gradient = samples.iter().filter(|s| s.is_none()).count() as u64;
+                tick(own.len() as u64);
+                Counts { rays, misses, samples: own.len() as u64 - without_gradient, without_gradient }
+            });
         counts.reduce(Counts::default, |mut a, b| {
             a += b;
             a
@@ -220,10 +232,26 @@ impl<'a> GridPoints<'a> {
         scene: &Scene,
         side: Side,
         tau: f64,
-        PointLight { mut grid, halves }: PointLight,
+        PointLight { mut grid, halves, direct }: PointLight,
         tick: &(dyn Fn(u64) -> bool + Sync),
     ) -> IlluminationGrid {
-        let Some(packed) = halves else { return grid };
+        if let Some(packed) = halves {
+            self.smooth(scene, side, tau, (&mut grid, &packed), tick);
+        }
+        grid.split = direct.map(|direct| split(scene, self.lattice, side, &grid, &direct));
+        grid
+    }
+
+    /// Smooths what was gathered, in `packed` halves, over the points.
+    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+    fn smooth(
+        &self,
+        scene: &Scene,
+        side: Side,
+        tau: f64,
+        (grid, packed): (&mut IlluminationGrid, &[Packed]),
+        tick: &(dyn Fn(u64) -> bool + Sync),
+    ) {
         let halves = |o: usize| self.set.slot(o).map_or([Vec3::NAN; 2], |slot| packed[slot].unpack());
         smooth(scene, self.lattice, side, tau, &halves, &mut |z, smoothed| {
             if !tick(0) {
@@ -246,8 +274,25 @@ impl<'a> GridPoints<'a> {
             });
             tick(area as u64);
         });
-        grid
     }
+}
+
+/// The light of `side` at the points of `grid` that hold some, in two parts, of which `direct` irradiance is known.
+pub(super) fn split(
+    scene: &Scene,
+    lattice: &Lattice,
+    side: Side,
+    grid: &IlluminationGrid,
+    direct: &[[f32; 3]],
+) -> Split {
+    let mut split = Split::dark(lattice.len());
+    let points = split.indirect.par_iter_mut().zip(&mut split.visible).enumerate().with_min_len(1024);
+    points.filter(|(o, _)| grid.mask[*o] != Mask::Empty).for_each(|(o, (indirect, visible))| {
+        let (radiance, direct) = (Vec3::from_array(grid.radiance[o]), Vec3::from_array(direct[o]));
+        let parts = Parts::new(scene, local_position(&scene.field, lattice, o), side, radiance, direct);
+        (*indirect, *visible) = (parts.indirect.to_array(), parts.visible.to_array());
+    });
+    split
 }
 
 /// The radiance at local position `p` with what was gathered there, in `halves`, replaced by what is `smoothed`; and
@@ -283,11 +328,19 @@ pub(super) struct BesideLight {
     common: f32,
     /// What was gathered.
     halves: Packed,
+    /// Irradiance straight from luminaires.
+    direct: Vec3,
 }
 
 impl BesideLight {
-    const NONE: Self =
-        Self { radiance: Vec3::ZERO, variance: -1.0, indirect_variance: 0.0, common: 0.0, halves: Packed::NONE };
+    const NONE: Self = Self {
+        radiance: Vec3::ZERO,
+        variance: -1.0,
+        indirect_variance: 0.0,
+        common: 0.0,
+        halves: Packed::NONE,
+        direct: Vec3::ZERO,
+    };
 }
 
 impl<'a> Beside<'a> {
@@ -353,9 +406,9 @@ impl<'a> Beside<'a> {
         let first = band.number * self.len().div_ceil(BLOCK);
         let sampled = sample_places(sampler, own.len(), &place, saved, first, tick);
         for (&n, s) in own.iter().zip(&sampled.samples) {
-            if let Some(RadianceSample { radiance, variance, indirect, indirect_variance, .. }) = *s {
+            if let Some(RadianceSample { radiance, variance, indirect, indirect_variance, direct, .. }) = *s {
                 let halves = Packed::new(indirect);
-                light[n as usize] = BesideLight { radiance, variance, indirect_variance, common: 0.0, halves };
+                light[n as usize] = BesideLight { radiance, variance, indirect_variance, common: 0.0, halves, direct };
             }
         }
         Counts::from(&sampled)
@@ -385,8 +438,14 @@ impl<'a> Beside<'a> {
     /// Gives the points without a level set of their own what makes interpolation come nearest to the light in the
     /// cells around them: between the points of a steep edge there may be none with one. Points around which no light
     /// was found stay empty, which viewers and [`IlluminationGrid::interpolate`] leave out. Points beside which are no
-    /// places stay as they are.
-    pub(super) fn fit(&self, mut grid: IlluminationGrid, light: &[BesideLight]) -> IlluminationGrid {
+    /// places stay as they are. Both parts of light that is split are fitted each on its own.
+    pub(super) fn fit(
+        &self,
+        scene: &Scene,
+        side: Side,
+        mut grid: IlluminationGrid,
+        light: &[BesideLight],
+    ) -> IlluminationGrid {
         let mut start = 0;
         for run in self.owners.chunk_by(|a, b| a == b) {
             let (mut sum, mut own, mut common, mut count) = (Vec3::ZERO, 0.0, 0.0, 0.0);
@@ -402,16 +461,56 @@ impl<'a> Beside<'a> {
             }
             start += run.len();
         }
+        let lit = |o: usize| grid.mask[o] == Mask::Filled && self.owners.binary_search(&(o as u64)).is_ok();
+        let free = NodeSet::new(self.lattice.len(), lit);
         let wishes: Vec<Wish> = self
             .positions
             .par_iter()
             .zip(light)
             .filter(|(_, l)| l.variance >= 0.0)
-            .map(|(&position, l)| Wish { position, radiance: l.radiance })
+            .map(|(&position, l)| Wish { position, light: l.radiance, weight: 1.0 })
             .collect();
-        let lit = |o: usize| grid.mask[o] == Mask::Filled && self.owners.binary_search(&(o as u64)).is_ok();
-        let free = NodeSet::new(self.lattice.len(), lit);
-        fit(self.field, self.lattice, &wishes, grid, &free, PULL, &|_| true)
+        grid.radiance = fit(self.field, self.lattice, &wishes, grid.radiance, &free, PULL, &|_| true);
+        grid.split = grid.split.map(|split| self.fit_parts(scene, side, split, light, &free));
+        grid
+    }
+
+    /// Fits both parts of light from their means at the places of each point. What is visible counts for as much as
+    /// could be seen.
+    fn fit_parts(&self, scene: &Scene, side: Side, split: Split, light: &[BesideLight], free: &NodeSet) -> Split {
+        let full = scene.reference_irradiance().max(f64::MIN_POSITIVE);
+        let places = self.positions.par_iter().zip(light).with_min_len(1024);
+        let parts: Vec<[Wish; 2]> = places
+            .map(|(&position, l)| {
+                let parts = Parts::new(scene, position.as_dvec3(), side, l.radiance, l.direct);
+                let lit = if l.variance >= 0.0 { 1.0 } else { 0.0 };
+                #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+                let counts = lit * (luminance(parts.open) / full).powi(2) as f32;
+                [(parts.indirect, lit), (parts.visible, counts)].map(|(light, weight)| Wish { position, light, weight })
+            })
+            .collect();
+        let Split { mut indirect, mut visible } = split;
+        let mut start = 0;
+        for run in self.owners.chunk_by(|a, b| a == b) {
+            let owner = usize::try_from(run[0]).expect("a point's number");
+            for (n, values) in [&mut indirect, &mut visible].into_iter().enumerate() {
+                let own = parts[start..start + run.len()].iter().map(|parts| parts[n]);
+                let (sum, weight) =
+                    own.fold((Vec3::ZERO, 0.0), |(sum, weight), w| (sum + w.weight * w.light, weight + w.weight));
+                if weight > 0.0 {
+                    values[owner] = (sum / weight).to_array();
+                }
+            }
+            start += run.len();
+        }
+        let fitted = |n: usize, start| {
+            let wishes: Vec<Wish> = parts.par_iter().map(|parts| parts[n]).filter(|w| w.weight > 0.0).collect();
+            fit(self.field, self.lattice, &wishes, start, free, PULL, &|_| true)
+        };
+        let (indirect, mut visible) = (fitted(0, indirect), fitted(1, visible));
+        let shares = visible.as_flattened_mut().par_iter_mut().with_min_len(1 << 14);
+        shares.for_each(|share| *share = share.min(MOST_VISIBLE));
+        Split { indirect, visible }
     }
 }
 

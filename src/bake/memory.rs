@@ -6,6 +6,7 @@ use super::{BakeSettings, Engine, Interpolation, MOST_BANDS, StrategyName};
 use crate::checkpoint;
 use crate::embree::{Device, GraphTracer};
 use crate::error::{Error, Result};
+use crate::fitted_grid::Wish;
 use crate::flat;
 use crate::flattened::Side;
 use crate::irradiance_caching;
@@ -46,11 +47,13 @@ const PLACE: u64 = 12 + 8 + 4;
 const BESIDE: u64 = size_of::<BesideLight>() as u64;
 
 /// Bytes of them while they are fitted: the wish, and sorted by cells with what cells say. Smoothing before takes 80.
-const WISH: u64 = 24;
+const WISH: u64 = size_of::<Wish>() as u64;
 const SORTED: u64 = 40 + 40 + 12;
 
-/// Bytes per point and side of a grid (radiance, standard error, mask), and of what gather rays find at a node.
+/// Bytes per point and side of a grid (radiance, standard error, mask), of light that is split, and the direct
+/// irradiance that it is split by, and of what gather rays find at a node.
 const GRID: u64 = 17;
+const SPLIT: u64 = 24 + 12;
 const CACHED: u64 = 12;
 
 /// Bytes of the sweep engine per grid point (h turned over, normals, one plane of a pass turned over, bits per block),
@@ -193,7 +196,9 @@ struct Parts {
     /// Counts: nodes of the volumes, of them those of the cache; points of the grids.
     voxels: u64,
     points: u64,
-    /// Grids of all stored sides, and what is kept of gathers to be smoothed.
+    /// Count: points of the grids of all stored sides.
+    sides: u64,
+    /// These grids, and what is kept of gathers to be smoothed.
     grids: u64,
     halves: u64,
     /// Smoothing's slices.
@@ -201,6 +206,8 @@ struct Parts {
     /// Counts: places beside points, and points with such.
     beside: u64,
     filled: u64,
+    /// What each place is fitted to.
+    wishes: u64,
     /// Samples of all sides.
     samples: u64,
     /// Scattered samples and their interpolation.
@@ -216,7 +223,7 @@ impl Parts {
     fn new(scene: &Scene, volumes: &[&Volume], settings: &BakeSettings, device: &Device) -> Result<Self> {
         let mut base = PROGRAM;
         // Of all fields; sides stored of any.
-        let (mut voxels, mut points, mut filled, mut samples, mut grids, mut stored) = (0, 0, 0, 0, 0, 0);
+        let (mut voxels, mut points, mut filled, mut samples, mut sides, mut stored) = (0, 0, 0, 0, 0, 0);
         let (mut halves, mut slices) = (0, 0);
         let smoothing = settings.smooths() && settings.strategy == StrategyName::Nodes;
         let mut all_masks = Vec::new();
@@ -235,7 +242,7 @@ impl Parts {
             let own = count(&lit);
             let own_filled = count(&|o| masks[o] != Mask::Empty) - own;
             drop(lit);
-            let sides = member.surface.stored_sides().len() as u64;
+            let stores = member.surface.stored_sides().len() as u64;
             let element = volume.samples().element_type().size() as u64;
             // Volume, field, the pyramid of min and max, the masks of volume and grid.
             base += own_voxels * (element + 4 + 1) + own_voxels * 33 / 16 + own_points;
@@ -245,14 +252,14 @@ impl Parts {
                 (_, Some(n)) => n,
                 (_, None) => ((own + own_filled) as f64 * settings.samples_per_point) as u64,
             };
-            grids += own_points * GRID * sides;
             if smoothing {
-                halves += own * PACKED * sides;
+                halves += own * PACKED * stores;
                 let [nx, ny, nz] = lattice.dims().map(|n| n as u64);
                 slices = slices.max(nx * ny * SLICES.min(nz * 112));
             }
             (voxels, points) = (voxels + own_voxels, points + own_points);
-            (filled, stored) = (filled + own_filled, sides.max(stored));
+            (filled, stored) = (filled + own_filled, stores.max(stored));
+            sides += own_points * stores;
             all_masks.push(masks);
         }
         let steps = if settings.engine == Engine::Photon { REACH } else { 0 };
@@ -262,11 +269,11 @@ impl Parts {
             Engine::Sweep => sweep::texels(scene, across, settings.wall_isovalues),
             Engine::Photon => flat::texels(scene, across, settings.wall_isovalues),
         } as u64;
-        let sides = sweep::swept_sides(scene).len() as u64;
+        let swept = sweep::swept_sides(scene).len() as u64;
         let settling = SETTLING_SIDE + if sweep::bright(scene) { LEVEL_SIDE } else { 0 };
-        let summed = 2 * stored * SPREAD_SIDE + sides * settling.max(2 * SUMMED_SIDE);
+        let summed = 2 * stored * SPREAD_SIDE + swept * settling.max(2 * SUMMED_SIDE);
         let reports = sweep::reports(scene, across, settings.wall_isovalues) as u64;
-        let swept = points * (SWEPT + sides * (SWEPT_SIDE + KEPT_SIDE) + summed) + reports;
+        let swept = points * (SWEPT + swept * (SWEPT_SIDE + KEPT_SIDE) + summed) + reports;
         let ([landings, lower, higher], gather) = match settings.engine {
             Engine::Photon => (landings(scene, settings, device)?, settings.gather_rays > 0),
             Engine::Sweep => ([0.0; 3], false),
@@ -295,7 +302,9 @@ impl Parts {
             levels,
             voxels,
             points,
-            grids,
+            sides,
+            grids: sides * (GRID + if settings.split { SPLIT } else { 0 }),
+            wishes: if settings.split { 3 * WISH } else { WISH },
             halves,
             slices,
             beside: if nodes { STAND_INS as u64 * filled } else { 0 },
@@ -321,7 +330,7 @@ impl Parts {
         let cache = 12 * if self.cached > 0 { stored } else { 0 };
         let sets = 4 * NodeSet::bytes(self.voxels) + NodeSet::bytes(2 * self.points);
         let Self { base, flats, photons, maps, grids, halves, beside, .. } = *self;
-        let fitting = beside * (WISH + SORTED) + self.filled * FITTED;
+        let fitting = beside * (self.wishes + SORTED) + self.filled * FITTED;
         let light = base + flats + grids + beside * (PLACE + BESIDE);
         let bands = bands.len() as u64;
         let waiting = checkpoint::MOST_WAITING as u64;
@@ -349,7 +358,7 @@ impl Parts {
                 (
                     "samples",
                     light
-                        + grids / GRID * (CACHED + DONE_SIDE)
+                        + self.sides * (CACHED + DONE_SIDE)
                         + self.points
                         + (beside * SAMPLE + fitting).max(self.points * CACHED),
                 ),

@@ -181,7 +181,7 @@ impl<'a> FieldLight<'a> {
         let sides = scene.surface.stored_sides().into_iter().map(|side| match &places {
             Places::Grid(points, beside, _) => SideLight {
                 side,
-                points: Some((points.dark(settings.smooths()), beside.dark())),
+                points: Some((points.dark(settings.smooths(), settings.split), beside.dark())),
                 scattered: Vec::new(),
             },
             Places::Scattered(at) => SideLight { side, points: None, scattered: vec![None; at.len()] },
@@ -263,7 +263,7 @@ impl<'a> FieldLight<'a> {
                     if settings.smooths() {
                         beside.smooth(scene, side, settings.tau, &mut at_beside, tick);
                     }
-                    beside.fit(grid.finish(scene, side, settings.tau, at_points, tick), &at_beside)
+                    beside.fit(scene, side, grid.finish(scene, side, settings.tau, at_points, tick), &at_beside)
                 }
                 _ => {
                     let samples: Vec<RadianceSample> = scattered.into_iter().flatten().collect();
@@ -274,11 +274,12 @@ impl<'a> FieldLight<'a> {
                             interpolate(scene, side, lattice, masks, &samples, settings.neighbours, tick)
                         }
                         Interpolation::Fit => {
-                            let grid = blended();
+                            let mut grid = blended();
                             let wishes: Vec<Wish> = samples.iter().map(Wish::from).collect();
                             drop(samples);
                             let free = NodeSet::new(lattice.len(), |o| grid.mask[o] != Mask::Empty);
-                            fit(&scene.field, lattice, &wishes, grid, &free, PULL, tick)
+                            grid.radiance = fit(&scene.field, lattice, &wishes, grid.radiance, &free, PULL, tick);
+                            grid
                         }
                     }
                 }

@@ -3,7 +3,7 @@
 
 use super::bands::Band;
 use super::contacts::{Contacts, Wedge};
-use super::grid_points::{Beside, Counts, STAND_INS, rays_beside};
+use super::grid_points::{Beside, Counts, STAND_INS, rays_beside, split};
 use super::photon_engine::{Job, STAGES};
 use super::{BakeSettings, Lit, stages};
 use crate::brdf::reflected;
@@ -104,9 +104,12 @@ pub(super) fn light(
             if let Some(sample) = sample {
                 grid.radiance[o] = sample.radiance.to_array();
                 grid.std_error[o] = sample.variance.sqrt();
+                s.direct.get_mut(o).into_iter().for_each(|d| *d = sample.direct.to_array());
             }
         }
-        sides.push((s.side, beside.fit(grid, &light)));
+        grid.split = settings.split.then(|| split(scene, lattice, s.side, &grid, &s.direct));
+        drop(s.direct);
+        sides.push((s.side, beside.fit(scene, s.side, grid, &light)));
     }
     lit.fields.push(sides);
     lit.spend(clock, |s| &mut s.samples);
@@ -176,5 +179,5 @@ fn swept_grid(
     std_error.resize(mask.len(), 0.0);
     let points = radiance.par_iter_mut().zip(&mut std_error).zip(&mask).with_min_len(1 << 14);
     points.filter(|(_, m)| **m == Mask::Empty).for_each(|((r, e), _)| (*r, *e) = ([0.0; 3], 0.0));
-    IlluminationGrid { radiance, std_error, mask }
+    IlluminationGrid { radiance, std_error, mask, split: None }
 }

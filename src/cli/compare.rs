@@ -139,14 +139,16 @@ impl Compare {
         } else {
             // Along long voxels first.
             let long = baked.lattice() == scene.lattice() && GridSize::Cubic.of(baked.lattice()) != GridSize::OWN;
-            print!("{}", everywhere(&found, if long { "--grid cubic" } else { "a finer --grid" }));
+            let finer = if long { "--grid cubic" } else { "a finer --grid" };
+            print!("{}", everywhere(&found, finer, grid.split.is_some()));
         }
         Ok(())
     }
 }
 
-/// A survey's numbers, a line each, and that a `finer` grid lowers what interpolation costs.
-fn everywhere(s: &Survey, finer: &str) -> String {
+/// A survey's numbers, a line each, and that a `finer` grid lowers what interpolation costs, as does a bake that is
+/// `split`.
+fn everywhere(s: &Survey, finer: &str, split: bool) -> String {
     let interval = |[lo, hi]: [f64; 2]| format!("(95 % confidence {lo:.3} … {hi:.3})");
     let parts: String = s
         .parts
@@ -162,11 +164,20 @@ fn everywhere(s: &Survey, finer: &str) -> String {
         0 => format!("{:>8}   (none holds light of its own level set)", "–"),
         _ => format!("{:8.3}   {}", s.percent_rms_grid_points, interval(s.confidence_grid_points)),
     };
+    let texture = match s.percent_rms_texture == s.percent_rms {
+        true => String::new(),
+        false => {
+            format!("  radiance alone   {:8.3}   (as a 3D texture, direct light included)\n", s.percent_rms_texture)
+        }
+    };
     let between = s.grid_points > 0 && 2.0 * s.percent_rms_grid_points.powi(2) < s.percent_rms.powi(2);
-    let advice =
-        if between { format!("most of it lies between grid points: {finer} lowers it\n") } else { String::new() };
+    let splitting = if split { "" } else { ", and --split in pictures, meshes and pages" };
+    let advice = match between {
+        true => format!("most of it lies between grid points: {finer} lowers it{splitting}\n"),
+        false => String::new(),
+    };
     format!(
-        "percent RMS       {:8.3}   {}\n  per channel, /√3 {:8.3}\n{parts}at grid points    {at_points}\n\
+        "percent RMS       {:8.3}   {}\n{texture}  per channel, /√3 {:8.3}\n{parts}at grid points    {at_points}\n\
          bias              {:+8.3}\npoints            {:8}   (2 × {} paths each; {} left out)\n{advice}",
         s.percent_rms,
         interval(s.confidence),

@@ -15,6 +15,7 @@ use crate::mask::Mask;
 use crate::polygon::Polygon;
 use crate::reflectance::Reflectance;
 use crate::scene::{Boundary, Member, Policy, Scene, Surface};
+use crate::split::Split;
 use crate::volume::vti::{self, VtiArray, VtiFile, VtiWriter};
 use crate::volume::{Lattice, Samples, Volume};
 use glam::DVec3;
@@ -187,9 +188,9 @@ pub fn field_file(path: &Path, name: &str) -> PathBuf {
 
 /// Writes a bake. Point data: `value` (source units, active scalars; in f64 where f32 is too coarse for the sweep, or
 /// does not hold all samples), `radiance` (linear RGB), `rgb` (exposed, clamped, sRGB-encoded), `std_error` (of
-/// luminance), `mask` ([`Mask`]); with both sides also `radiance_inside` and so on. Field data: `wall_<name>` radiance
-/// over (u, v, isovalue), `context` the same of all context geometry, exposure, every number of the report, and all of
-/// it as JSON.
+/// luminance), `mask` ([`Mask`]), of a split bake `indirect` and `visible` ([`Split`]); with both sides also
+/// `radiance_inside` and so on. Field data: `wall_<name>` radiance over (u, v, isovalue), `context` the same of all
+/// context geometry, exposure, every number of the report, and all of it as JSON.
 ///
 /// # Errors
 /// `Io` if the file cannot be written.
@@ -278,6 +279,9 @@ fn completed(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
     for (i, (_, grid)) in bake.sides.iter().enumerate() {
         let s = suffix(i);
         let radiance = grid.radiance.as_flattened();
+        for (name, part) in grid.split.iter().flat_map(|s| [("indirect", &s.indirect), ("visible", &s.visible)]) {
+            writer = writer.point_data(&format!("{name}{s}"), 3, part.as_flattened());
+        }
         writer = writer
             .point_data(&format!("radiance{s}"), 3, radiance)
             .computed(&format!("rgb{s}"), 3, move |i| srgb_encode((radiance[i] * exposure).clamp(0.0, 1.0)))
@@ -325,6 +329,11 @@ fn flat_name(scene: &Scene, n: usize) -> String {
         Some(p) => p.name.clone(),
         None => format!("cap_{}", n - scene.polygons().len()),
     }
+}
+
+/// The grid's size, as a report says it.
+fn grid_size(report: &serde_json::Value) -> Option<GridSize> {
+    report.pointer("/settings/grid")?.as_str()?.parse().ok()
 }
 
 /// A bake read back.
@@ -431,7 +440,15 @@ impl BakedVolume {
                 Samples::U8(v) if v.len() == points => v,
                 _ => return Err(Error::Invalid(format!("the array 'mask{s}' does not hold a byte per point"))),
             };
+            let split = match file.point_data.iter().any(|a| a.name == format!("visible{s}")) {
+                true => Some(Split {
+                    indirect: triples(floats(&file.point_data, &format!("indirect{s}"), 3 * points)?),
+                    visible: triples(floats(&file.point_data, &format!("visible{s}"), 3 * points)?),
+                }),
+                false => None,
+            };
             let grid = IlluminationGrid {
+                split,
                 radiance: triples(floats(&file.point_data, &format!("radiance{s}"), 3 * points)?),
                 std_error: floats(&file.point_data, &format!("std_error{s}"), points)?,
                 mask: mask
@@ -450,7 +467,13 @@ impl BakedVolume {
             _ => Samples::F32(floats(&file.point_data, "value", points)?),
         };
         let volume = Volume::new(path.display().to_string(), file.lattice, values)?;
-        let field = Field::new(&volume, Sweep::new(d.isovalues[0], d.isovalues[1])?)?;
+        let mut field = Field::new(&volume, Sweep::new(d.isovalues[0], d.isovalues[1])?)?;
+        // Light is for the normals of the volume that was baked.
+        if let Some(GridSize::Factors(factors)) = grid_size(&d.report).filter(|size| *size != GridSize::OWN)
+            && let Some(coarse) = field.coarsened(factors)
+        {
+            field = field.with_normals_of(coarse);
+        }
         let polygons = d
             .polygons
             .into_iter()
@@ -540,8 +563,7 @@ impl BakedVolume {
     /// # Errors
     /// `Invalid` if the file says nothing of its grid.
     pub fn source(&self) -> Result<Option<Scene>> {
-        let grid = self.report.pointer("/settings/grid").and_then(serde_json::Value::as_str);
-        let Some(size) = grid.and_then(|g| g.parse().ok()) else {
+        let Some(size) = grid_size(&self.report) else {
             return Err(Error::Invalid("its report names no grid; bake anew".into()));
         };
         let GridSize::Factors(factors) = size else { return Ok(None) };
@@ -555,9 +577,9 @@ impl BakedVolume {
     }
 
     /// Radiance of `side` at local `p`: trilinear over the points of the cell that hold something, as a 3D texture
-    /// would give it; `None` if the side is not stored.
+    /// would give it; of a bake that is split, with direct light of the very place. `None` if the side is not stored.
     pub fn radiance(&self, side: Side, p: DVec3) -> Option<DVec3> {
         let (_, grid) = self.sides.iter().find(|(s, _)| *s == side)?;
-        Some(grid.interpolate(self.lattice(), p))
+        Some(grid.radiance_at(&self.scene, self.lattice(), p, side))
     }
 }

@@ -154,6 +154,7 @@ fn reference_picture(study: &Study, scene: &Scene, isovalue: f32) -> Result<f64>
 fn noise(bake: &Bake, reference: &ReferenceMesh) -> f64 {
     let grid = &bake.sides[0].1;
     let errors = IlluminationGrid {
+        split: None,
         radiance: grid.std_error.iter().map(|&e| [e * e; 3]).collect(),
         std_error: Vec::new(),
         mask: grid.mask.clone(),

@@ -180,9 +180,14 @@ impl Totals {
     }
 
     /// What `done` replicates gave at the nodes that are lit, gathered light in focus; of fewer than all the direct
-    /// light of all that were lit, as it is, since borders of shadows would ring.
+    /// light of all that were lit, as it is, since borders of shadows would ring; `apart`: that on its own, too.
     #[allow(clippy::cast_possible_truncation, reason = "a factor of at most 1")]
-    pub(super) fn finish<L: Fn(usize) -> bool + Sync>(self, focus: &Focus<L>, done: usize) -> Vec<SweptSide> {
+    pub(super) fn finish<L: Fn(usize) -> bool + Sync>(
+        self,
+        focus: &Focus<L>,
+        done: usize,
+        apart: bool,
+    ) -> Vec<SweptSide> {
         let scale = 1.0 / done.max(1) as f32;
         let together = together(&self.parts[..done.min(self.parts.len())]) as f32;
         let mut indirect = self.light.into_iter();
@@ -199,7 +204,9 @@ impl Totals {
             let error = |roots: Vec<bf16>| -> Vec<f32> {
                 nodes().map(|(i, lit)| if lit { factor * roots[i].to_f32() } else { 0.0 }).collect()
             };
-            SweptSide { side, irradiance, std_error: spread.next().map(error).unwrap_or_default() }
+            let own = |(i, lit)| if lit { [0, 1, 2].map(|c| direct.at(c, i)) } else { [0.0; 3] };
+            let direct = if apart { nodes().map(own).collect() } else { Vec::new() };
+            SweptSide { side, irradiance, direct, std_error: spread.next().map(error).unwrap_or_default() }
         };
         self.sides.iter().take(self.stored).zip(self.direct).map(side).collect()
     }

@@ -41,10 +41,56 @@ void main() {
 const VOLUME_FRAGMENT = COMMON + `
 in vec3 v_direction;
 out vec4 colour;
-uniform sampler3D u_light, u_other, u_blocks;
+uniform sampler3D u_light, u_other, u_blocks, u_visible, u_other_visible;
 uniform ivec3 u_block_count;
-uniform int u_most_steps;
+uniform int u_most_steps, u_luminaires;
 uniform bool u_capped, u_both, u_outside_lower, u_clipped;
+uniform mat3 u_axes;
+uniform vec3 u_steps, u_corners[64], u_facing[8], u_power[8];
+uniform vec2 u_ranges[8];
+uniform float u_most;
+
+// Central differences between the samples that normals come from.
+vec3 rising(vec3 p) {
+  vec3 far = u_dims - 1.0, g;
+  for (int a = 0; a < 3; ++a) {
+    vec3 e = vec3(0.0);
+    e[a] = u_steps[a];
+    vec3 high = min(p + e, far), low = max(p - e, vec3(0.0));
+    if (hole(high)) high = p;
+    if (hole(low)) low = p;
+    g[a] = (value(high) - value(low)) / max(high[a] - low[a], 1e-3);
+  }
+  return normalize(transpose(u_inverse) * g + vec3(0.0, 0.0, 1e-20));
+}
+
+// Lambert's closed form for the part of a polygon above the horizon (luminaire.rs).
+float edge(vec3 a, vec3 b, vec3 n) {
+  vec3 c = cross(a, b);
+  float sine = length(c);
+  return sine > 0.0 ? atan(sine, dot(a, b)) * dot(n, c) / sine : 0.0;
+}
+float open(int l, vec3 x, vec3 n) {
+  int begin = int(u_ranges[l].x), count = int(u_ranges[l].y);
+  if (dot(x - u_corners[begin], u_facing[l]) <= 0.0) return 0.0;
+  vec3 first = vec3(0.0), last = vec3(0.0);
+  bool any = false;
+  float sum = 0.0;
+  for (int i = 0; i < count; ++i) {
+    vec3 a = u_corners[begin + i] - x, b = u_corners[begin + (i + 1) % count] - x;
+    float ha = dot(a, n), hb = dot(b, n);
+    vec3 taken[2] = vec3[2](a, mix(a, b, ha / (ha - hb)));
+    bool takes[2] = bool[2](ha >= 0.0, (ha >= 0.0) != (hb >= 0.0));
+    for (int k = 0; k < 2; ++k) {
+      if (!takes[k]) continue;
+      if (any) sum += edge(last, taken[k], n); else first = taken[k];
+      any = true;
+      last = taken[k];
+    }
+  }
+  if (any) sum += edge(last, first, n);
+  return max(-0.5 * sum, 0.0);
+}
 
 vec3 shade(vec3 p, bool lower, vec3 direction) {
   bool outside = lower == u_outside_lower;
@@ -53,20 +99,16 @@ vec3 shade(vec3 p, bool lower, vec3 direction) {
     vec3 at = (p + 0.5) / u_dims;
     vec4 light = outside ? texture(u_light, at) : texture(u_other, at);
     // Points that hold nothing have weight 0.
-    return light.a > 0.0 ? u_scale * light.rgb / light.a : vec3(0.0);
+    if (light.a <= 0.0) return vec3(0.0);
+    vec3 shown = u_scale * light.rgb / light.a, direct = vec3(0.0);
+    if (u_luminaires == 0) return shown;
+    vec3 x = u_origin + u_axes * p, n = (lower ? -1.0 : 1.0) * rising(p);
+    for (int l = 0; l < u_luminaires; ++l) direct += open(l, x, n) * u_power[l];
+    vec3 visible = u_most * (outside ? texture(u_visible, at) : texture(u_other_visible, at)).rgb / light.a;
+    return shown + u_albedo / 3.14159265 * visible * direct;
   }
   if (!u_local && !u_clipped) return vec3(0.0);
-  vec3 far = u_dims - 1.0, g;
-  for (int a = 0; a < 3; ++a) {
-    vec3 e = vec3(0.0);
-    e[a] = 1.0;
-    vec3 high = min(p + e, far), low = max(p - e, vec3(0.0));
-    if (hole(high)) high = p;
-    if (hole(low)) low = p;
-    g[a] = (value(high) - value(low)) / max(high[a] - low[a], 1e-3);
-  }
-  vec3 normal = normalize(transpose(u_inverse) * g + vec3(0.0, 0.0, 1e-20));
-  return u_albedo * headlight(dot(normal, direction)) * (u_local ? 1.0 : 0.3);
+  return u_albedo * headlight(dot(rising(p), direction)) * (u_local ? 1.0 : 0.3);
 }
 
 void main() {

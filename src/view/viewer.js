@@ -149,6 +149,7 @@ function upload(bytes) {
     return texture(size, gl.SRGB8_ALPHA8, gl.RGBA, gl.UNSIGNED_BYTE, data, filter);
   };
   textures.lights = scene.lights.map((offset) => colours(offset, dims, 4, gl.LINEAR));
+  textures.visible = scene.split.visible.map((offset) => colours(offset, dims, 3, gl.LINEAR));
   const none = texture([1, 1, 1], gl.SRGB8_ALPHA8, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4), gl.NEAREST);
   flats = scene.flats.map((f) => {
     const vertices = gl.createVertexArray();
@@ -160,6 +161,7 @@ function upload(bytes) {
     const wall = f.texture ? colours(f.texture.offset, f.texture.dims, 3, gl.NEAREST) : none;
     return { ...f, vertex_array: vertices, count: f.vertices.length, wall };
   });
+  if (!textures.visible.length) textures.visible.push(none);
   textures.empty = gl.createVertexArray();
   programs = { volume: program(VOLUME_VERTEX, VOLUME_FRAGMENT), flat: program(FLAT_VERTEX, FLAT_FRAGMENT) };
   const error = gl.getError();
@@ -188,6 +190,16 @@ function clipPlane() {
   n[axis] = sign;
   const [lo, hi] = scene.bounds;
   return [...n, sign * (lo[axis] + state.cut * (hi[axis] - lo[axis]))];
+}
+
+/// What direct light of a split bake is computed from.
+function direct() {
+  const { luminaires, most, steps } = scene.split, ranges = [];
+  luminaires.reduce((begin, { corners }) => { ranges.push(begin, corners.length); return begin + corners.length; }, 0);
+  const all = (key) => luminaires.flatMap((l) => l[key]).flat(), lists = luminaires.length ? {
+    "u_corners[0]": all("corners"), "u_facing[0]": all("normal"), "u_power[0]": all("power"), "u_ranges[0]": ranges,
+  } : {};
+  return { u_luminaires: luminaires.length, u_most: most, u_steps: steps, u_axes: scene.axes.flat(), ...lists };
 }
 
 function draw() {
@@ -227,10 +239,13 @@ function draw() {
   bind(1, textures.lights[0]);
   bind(2, textures.lights.at(-1));
   bind(3, textures.blocks);
+  bind(4, textures.visible[0]);
+  bind(5, textures.visible.at(-1));
   programs.volume.set({
     ...common, u_light: 1, u_other: 2, u_blocks: 3, u_block_count: textures.count, u_albedo: albedo(scene.albedo),
     u_most_steps: 2 * (scene.dims[0] + scene.dims[1] + scene.dims[2]) + 64, u_capped: scene.capped ? 1 : 0,
     u_both: textures.lights.length > 1 ? 1 : 0, u_outside_lower: scene.outside_lower ? 1 : 0,
+    u_visible: 4, u_other_visible: 5, ...direct(),
   });
   gl.drawArrays(gl.TRIANGLES, 0, 3);
 }

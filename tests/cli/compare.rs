@@ -185,6 +185,14 @@ fn finer_grids_are_compared_on_the_volume_they_are_of() {
             continue;
         };
         assert!(own && scene.lattice().dims() == [9; 3]);
+        // Pictures and meshes see the same ones.
+        let fine = BakedVolume::read(&dir.join("lit.vti")).unwrap().scene;
+        let scale = fine.lattice().far() / scene.lattice().far();
+        for n in 0..50 {
+            let p = DVec3::splat(8.0) * (DVec3::new(0.37, 0.61, 0.83) * f64::from(n) + 0.1).fract();
+            let [a, b] = [fine.normal(p * scale, fine.surface.outside), scene.normal(p, scene.surface.outside)];
+            assert!((a.unwrap() - b.unwrap()).length() < 1e-4, "{grid} {p}: {a:?} {b:?}");
+        }
         let volume = Volume::open(dir.join("b.vti")).unwrap();
         let exact = (0..volume.samples().len()).map(|o| scene.field.sweep().isovalue(volume.value(o)));
         assert!(scene.field.samples().iter().zip(exact).all(|(a, b)| (a - b).abs() < 1e-6));

@@ -12,6 +12,7 @@ mod engines;
 mod outputs;
 mod pictures;
 mod reproducibility;
+mod split;
 mod volumes;
 
 fn isolume(dir: &Path, args: &[&str]) -> Output {

@@ -74,6 +74,7 @@ fn settled_light_misses_what_it_says() {
                 target,
                 seed: 1,
                 flat_resolution: (16, 16),
+                direct: false,
             };
             run(&scene, settings)
         };
