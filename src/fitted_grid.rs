@@ -17,8 +17,10 @@ use rayon::prelude::*;
 /// Strength of the pull towards the start, in units of the mean weight that samples put on a node, for samples as bakes
 /// have them: noise of theirs that it holds back outweighs what it blurs. 0.01 lets noise through, 1 blurs.
 pub const PULL: f32 = 0.2;
-/// Conjugate-gradient steps: the residual falls below the samples' noise well before.
+/// Conjugate-gradient steps at most, and the share of the residual's square (as preconditioned) at which they end:
+/// the samples' noise is far above.
 const STEPS: usize = 16;
+const SETTLED: f64 = 1e-5;
 
 /// What a place of the lattice should look like.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -109,8 +111,9 @@ pub fn fit(
     let mut z = precondition(&r);
     let mut p = z.clone();
     let mut rz = dot(&r, &z);
+    let first = rz;
     for _ in 0..STEPS {
-        if !tick(0) || rz.max_element() <= 0.0 {
+        if !tick(0) || !rz.cmpgt(SETTLED * first).any() {
             break;
         }
         let q = apply(&p);
