@@ -286,6 +286,9 @@ mod tests {
         for o in 1..5 {
             assert_eq!((grid.radiance[o], grid.std_error[o], grid.mask[o]), ([0.0; 3], 0.0, Mask::Empty), "point {o}");
         }
+        let split = grid.split.unwrap();
+        assert_eq!((split.indirect[0], split.visible[0]), (light[0], [0.5; 3]));
+        assert_eq!((&split.indirect[1..], &split.visible[1..]), (&[[0.0; 3]; 4][..], &[[0.0; 3]; 4][..]));
     }
 
     #[test]
