@@ -14,6 +14,7 @@ use crate::linear_fit::{Moments, Sums};
 use crate::mask::{Mask, local_position};
 use crate::radiance::RadianceSample;
 use crate::scene::Scene;
+use crate::split::share;
 use crate::volume::Lattice;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
@@ -87,7 +88,7 @@ impl Known {
         Self {
             place: (scene.lattice().axes() * p).as_vec3(),
             normal: normal.as_vec3(),
-            share: sample.direct / open.as_vec3().max(Vec3::splat(f32::MIN_POSITIVE)),
+            share: share(sample.direct, open).as_vec3(),
             open: luminance(open) as f32,
             direct: sample.direct,
             indirect: 0.5 * (a + b),

@@ -51,11 +51,16 @@ impl Parts {
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     pub fn new(scene: &Scene, p: DVec3, side: Side, radiance: Vec3, direct: Vec3) -> Self {
         let Some(open) = open(scene, p, side) else { return Self { indirect: radiance, ..Self::default() } };
-        let share = DVec3::select(open.cmpgt(DVec3::ZERO), direct.as_dvec3() / open, DVec3::ZERO);
-        let visible = share.clamp(DVec3::ZERO, DVec3::ONE);
+        let visible = share(direct, open).clamp(DVec3::ZERO, DVec3::ONE);
         let indirect = radiance - lit(scene, p, visible * open).as_vec3();
         Self { indirect, visible: visible.as_vec3(), open }
     }
+}
+
+/// The share of `open` irradiance that arrives as `direct`, by channel; 0 where none could. Of several luminaires that
+/// light a channel one share stands for all.
+pub fn share(direct: Vec3, open: DVec3) -> DVec3 {
+    DVec3::select(open.cmpgt(DVec3::ZERO), direct.as_dvec3() / open, DVec3::ZERO)
 }
 
 /// The radiance of local position `p` on `side`, from both parts as they are interpolated there: not negative.

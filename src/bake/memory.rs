@@ -197,7 +197,7 @@ struct Parts {
     voxels: u64,
     points: u64,
     /// Count: points of the grids of all stored sides.
-    sides: u64,
+    side_points: u64,
     /// These grids, and what is kept of gathers to be smoothed.
     grids: u64,
     halves: u64,
@@ -223,7 +223,7 @@ impl Parts {
     fn new(scene: &Scene, volumes: &[&Volume], settings: &BakeSettings, device: &Device) -> Result<Self> {
         let mut base = PROGRAM;
         // Of all fields; sides stored of any.
-        let (mut voxels, mut points, mut filled, mut samples, mut sides, mut stored) = (0, 0, 0, 0, 0, 0);
+        let (mut voxels, mut points, mut filled, mut samples, mut side_points, mut stored) = (0, 0, 0, 0, 0, 0);
         let (mut halves, mut slices) = (0, 0);
         let smoothing = settings.smooths() && settings.strategy == StrategyName::Nodes;
         let mut all_masks = Vec::new();
@@ -242,7 +242,7 @@ impl Parts {
             let own = count(&lit);
             let own_filled = count(&|o| masks[o] != Mask::Empty) - own;
             drop(lit);
-            let stores = member.surface.stored_sides().len() as u64;
+            let sides = member.surface.stored_sides().len() as u64;
             let element = volume.samples().element_type().size() as u64;
             // Volume, field, the pyramid of min and max, the masks of volume and grid.
             base += own_voxels * (element + 4 + 1) + own_voxels * 33 / 16 + own_points;
@@ -253,13 +253,13 @@ impl Parts {
                 (_, None) => ((own + own_filled) as f64 * settings.samples_per_point) as u64,
             };
             if smoothing {
-                halves += own * PACKED * stores;
+                halves += own * PACKED * sides;
                 let [nx, ny, nz] = lattice.dims().map(|n| n as u64);
                 slices = slices.max(nx * ny * SLICES.min(nz * 112));
             }
             (voxels, points) = (voxels + own_voxels, points + own_points);
-            (filled, stored) = (filled + own_filled, stores.max(stored));
-            sides += own_points * stores;
+            (filled, stored) = (filled + own_filled, sides.max(stored));
+            side_points += own_points * sides;
             all_masks.push(masks);
         }
         let steps = if settings.engine == Engine::Photon { REACH } else { 0 };
@@ -269,11 +269,11 @@ impl Parts {
             Engine::Sweep => sweep::texels(scene, across, settings.wall_isovalues),
             Engine::Photon => flat::texels(scene, across, settings.wall_isovalues),
         } as u64;
-        let swept = sweep::swept_sides(scene).len() as u64;
+        let sides = sweep::swept_sides(scene).len() as u64;
         let settling = SETTLING_SIDE + if sweep::bright(scene) { LEVEL_SIDE } else { 0 };
-        let summed = 2 * stored * SPREAD_SIDE + swept * settling.max(2 * SUMMED_SIDE);
+        let summed = 2 * stored * SPREAD_SIDE + sides * settling.max(2 * SUMMED_SIDE);
         let reports = sweep::reports(scene, across, settings.wall_isovalues) as u64;
-        let swept = points * (SWEPT + swept * (SWEPT_SIDE + KEPT_SIDE) + summed) + reports;
+        let swept = points * (SWEPT + sides * (SWEPT_SIDE + KEPT_SIDE) + summed) + reports;
         let ([landings, lower, higher], gather) = match settings.engine {
             Engine::Photon => (landings(scene, settings, device)?, settings.gather_rays > 0),
             Engine::Sweep => ([0.0; 3], false),
@@ -302,8 +302,8 @@ impl Parts {
             levels,
             voxels,
             points,
-            sides,
-            grids: sides * (GRID + if settings.split { SPLIT } else { 0 }),
+            side_points,
+            grids: side_points * (GRID + if settings.split { SPLIT } else { 0 }),
             wishes: if settings.split { 3 * WISH } else { WISH },
             halves,
             slices,
@@ -358,7 +358,7 @@ impl Parts {
                 (
                     "samples",
                     light
-                        + self.sides * (CACHED + DONE_SIDE)
+                        + self.side_points * (CACHED + DONE_SIDE)
                         + self.points
                         + (beside * SAMPLE + fitting).max(self.points * CACHED),
                 ),

@@ -149,7 +149,7 @@ pub struct BakeOptions {
     #[arg(long, value_name = "N")]
     pub wall_resolution: Option<usize>,
     /// Also write `indirect` light and the `visible` share of the luminaires, so that pictures, meshes, pages and
-    /// compare need not interpolate direct light, which takes off a tenth to a third of the error on data (default:
+    /// compare need not interpolate direct light, which takes off a tenth to a half of the error on data (default:
     /// false)
     #[arg(long, value_name = "BOOL", num_args = 0..=1, require_equals = true, default_missing_value = "true")]
     pub split: Option<bool>,

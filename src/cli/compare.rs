@@ -140,15 +140,17 @@ impl Compare {
             // Along long voxels first.
             let long = baked.lattice() == scene.lattice() && GridSize::Cubic.of(baked.lattice()) != GridSize::OWN;
             let finer = if long { "--grid cubic" } else { "a finer --grid" };
-            print!("{}", everywhere(&found, finer, grid.split.is_some()));
+            // Scattered samples cannot be split.
+            let nodes = baked.report.pointer("/settings/strategy").is_some_and(|s| s == "nodes");
+            print!("{}", everywhere(&found, finer, grid.split.is_none() && nodes));
         }
         Ok(())
     }
 }
 
-/// A survey's numbers, a line each, and that a `finer` grid lowers what interpolation costs, as does a bake that is
-/// `split`.
-fn everywhere(s: &Survey, finer: &str, split: bool) -> String {
+/// A survey's numbers, a line each, and that a `finer` grid lowers what interpolation costs, as it would if the bake
+/// were split, if it `can_split`.
+fn everywhere(s: &Survey, finer: &str, can_split: bool) -> String {
     let interval = |[lo, hi]: [f64; 2]| format!("(95 % confidence {lo:.3} … {hi:.3})");
     let parts: String = s
         .parts
@@ -171,7 +173,7 @@ fn everywhere(s: &Survey, finer: &str, split: bool) -> String {
         }
     };
     let between = s.grid_points > 0 && 2.0 * s.percent_rms_grid_points.powi(2) < s.percent_rms.powi(2);
-    let splitting = if split { "" } else { ", and --split in pictures, meshes and pages" };
+    let splitting = if can_split { ", and --split in pictures, meshes and pages" } else { "" };
     let advice = match between {
         true => format!("most of it lies between grid points: {finer} lowers it{splitting}\n"),
         false => String::new(),

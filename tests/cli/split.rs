@@ -108,6 +108,10 @@ fn scattered_samples_are_not_split() {
     let given = ["bake", "b.vti", "--isovalues", "3.6", "95", "-o", "lit.vti", "--split"];
     refused(dir, &[&given[..], &["--strategy", "uniform"]].concat(), &["split", "scattered", "strategy"]);
     refused(dir, &[&given[..], &["--samples", "1000"]].concat(), &["split", "samples"]);
+    // Nor is it advised.
+    bake(dir, &["--samples", "2000", "--gather", "4"]);
+    let said = text(&ok(dir, &["compare", "lit.vti", "--points", "300", "--paths", "16", "-q"]).stdout);
+    assert!(!said.contains("--split"), "{said}");
     let said = text(&ok(dir, &[&given[..], &["--dry-run"]].concat()).stderr);
     assert!(said.contains("engine  sweep"), "{said}");
 }
