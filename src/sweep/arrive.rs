@@ -1,6 +1,7 @@
 //! What lines bring to walls and caps: from a wall's point one line sees every isovalue at once, a staircase of the
 //! running maximum of h.
 
+use super::directions::Layout;
 use super::ends::Ends;
 use super::flats::{Arrivals, Flats, Stop, below, fill_column, shapes, sinks};
 use super::gaps::Crossing;
@@ -10,6 +11,7 @@ use super::pack::{LANES, OUTSIDE, Pack, Plan};
 use crate::flattened::Side;
 use crate::rng::{Rng, Stage};
 use crate::scene::Scene;
+use crate::volume::Lattice;
 use glam::DVec3;
 
 /// Lines per texel edge that report to walls. Each reports to four texels, so that one reaches every texel from every
@@ -23,14 +25,20 @@ const MOST_STRIDE: f64 = 8.0;
 /// until it is told to the walls.
 const MOST_REPORTING: f64 = 131_072.0;
 
-/// Strides, in lines, of those that report near Ω and past it, to texels of these areas, of a family of so many lines.
-fn strides(scene: &Scene, sinks: impl Iterator<Item = f64>, family: f64) -> [f64; 2] {
-    let voxel = LINES_PER_TEXEL * scene.lattice().spacing().max_element();
-    let lines = |area: f64| (area.sqrt() / voxel).floor().max(1.0);
+/// Strides, in lines along u and v, of those that report near Ω and past it, to texels of these areas, of a family of
+/// so many lines across slices of `axis`. Walls along that axis see lines as far apart as slices are.
+fn strides(lattice: &Lattice, axis: usize, sinks: impl Iterator<Item = f64>, family: f64) -> [[f64; 2]; 2] {
+    let spacing = lattice.spacing();
+    let voxels = Layout::new(lattice.dims(), axis).axes.map(|a| LINES_PER_TEXEL * spacing[a].max(spacing[axis]));
     let (least, most) = sinks.fold((f64::INFINITY, 0.0f64), |(lo, hi), area| (lo.min(area), hi.max(area)));
-    let lines = lines(least).max((family / MOST_REPORTING).sqrt().ceil().min(lines(most)));
+    let many = (family / MOST_REPORTING).sqrt().ceil();
+    let lines = [voxels[0], voxels[1]].map(|voxel| {
+        let [least, most] = [least, most].map(|area| (area.sqrt() / voxel).floor().max(1.0));
+        least.max(many.min(most))
+    });
     // Two lines per texel edge where texels are large: one has 2 % more error.
-    [lines.min(MOST_STRIDE), lines.min(MOST_STRIDE.max(0.5 * lines).min(f64::from(1 << 20)))]
+    let past = |lines: f64| lines.min(MOST_STRIDE.max(0.5 * lines).min(f64::from(1 << 20)));
+    [lines.map(|lines| lines.min(MOST_STRIDE)), lines.map(past)]
 }
 
 /// Bytes of what the lines of two families bring to walls of so many texels across, about at most: one is told to the
@@ -38,14 +46,17 @@ fn strides(scene: &Scene, sinks: impl Iterator<Item = f64>, family: f64) -> [f64
 pub(crate) fn reports(scene: &Scene, across: usize, isovalues: usize) -> f64 {
     let [lo, hi] = local_bounds(scene);
     let far = scene.lattice().far();
-    // Lines through a box, along the axis that gives most, at slopes of a half.
+    // Lines through a box, along the axis of most that report, at slopes of a half.
     let lines = |e: DVec3, c: usize| (e[(c + 1) % 3] + 0.5 * e[c]) * (e[(c + 2) % 3] + 0.5 * e[c]);
-    let [volume, all] = [far, hi - lo].map(|e| (0..3).map(|c| lines(e + 1.0, c)).fold(0.0, f64::max));
     let areas = || {
         shapes(scene, across).flatten().map(|(flat, dims)| flat.area() / sinks(dims).iter().product::<usize>() as f64)
     };
-    let [near, past] = strides(scene, areas(), all);
-    let reporting = volume / (near * near) + (all - volume) / (past * past);
+    let reporting = |c: usize| {
+        let [volume, all] = [far, hi - lo].map(|e| lines(e + 1.0, c));
+        let [near, past] = strides(scene.lattice(), c, areas(), all).map(|[u, v]| u * v);
+        volume / near + (all - volume) / past
+    };
+    let reporting = (0..3).map(reporting).fold(0.0, f64::max);
     // At either end of a line may be a wall; RGB of each isovalue in f32, and where it ends.
     let ends = areas().count().min(2) as f64;
     2.0 * reporting * ends * (12 * isovalues + 40) as f64
@@ -74,31 +85,31 @@ fn rows(pack: &Pack, span: [f64; 2], (from, to): (f64, f64)) -> impl Iterator<It
     (0..count).map(row).filter(move |row| (lo..hi).contains(row))
 }
 
-/// Which lines report: every `stride`-th along u and v, from `phase` on; none with a stride of 0.
+/// Which lines report: every so many along u and v, from `phase` on; none with strides of 0.
 #[derive(Clone, Copy)]
 struct Reporting {
-    stride: isize,
+    strides: [isize; 2],
     phase: [isize; 2],
     weight: f32,
 }
 
 impl Reporting {
     #[allow(clippy::cast_possible_truncation, reason = "below the stride, and a weight")]
-    fn new(stride: isize, phase: [f64; 2], line: f64) -> Self {
-        let phase = phase.map(|u| (u * stride as f64) as isize);
-        Self { stride, phase, weight: (line * (stride * stride) as f64) as f32 }
+    fn new(strides: [isize; 2], phase: [f64; 2], line: f64) -> Self {
+        let phase = [0, 1].map(|a| (phase[a] * strides[a] as f64) as isize);
+        Self { strides, phase, weight: (line * (strides[0] * strides[1]) as f64) as f32 }
     }
 
     /// Those of the rows, or with `axis` 0 of the lines of a row, from one to another; none if that is before it.
     fn along(&self, axis: usize, (first, last): (isize, isize)) -> impl Iterator<Item = isize> + use<> {
-        let stride = self.stride.max(1);
-        let any = self.stride > 0 && first <= last;
+        let stride = self.strides[axis].max(1);
+        let any = self.strides[axis] > 0 && first <= last;
         let start = if any { first + (self.phase[axis] - first).rem_euclid(stride) } else { 0 };
         (start..=if any { last } else { -1 }).step_by(stride.unsigned_abs())
     }
 
     fn row(&self, q: isize) -> bool {
-        self.stride > 0 && (q - self.phase[1]).rem_euclid(self.stride) == 0
+        self.strides[1] > 0 && (q - self.phase[1]).rem_euclid(self.strides[1]) == 0
     }
 }
 
@@ -155,10 +166,11 @@ impl<'a> Walls<'a> {
         // Only ratios of weights count.
         let area = shear.area / pass.scene.lattice().unit().powi(2);
         let line = 4.0 * std::f64::consts::PI / (2 * families) as f64 * area;
-        let every = |stride: f64| Reporting::new(if none { 0 } else { stride as isize }, phase, line);
+        let every = |strides: [f64; 2]| Reporting::new(strides.map(|s| if none { 0 } else { s as isize }), phase, line);
         let (rows, columns) = (range(1), range(0));
         let [across, along] = [rows, columns].map(|(least, most)| (most - least + 1) as f64);
-        let [near, past] = strides(pass.scene, flats.textures.iter().flatten().map(|t| t.sink_area), across * along);
+        let areas = flats.textures.iter().flatten().map(|t| t.sink_area);
+        let [near, past] = strides(pass.scene.lattice(), axes[2], areas, across * along);
         Self {
             plan,
             ends,
@@ -435,6 +447,7 @@ mod tests {
     use crate::polygon::Polygon;
     use crate::scene::{Boundary, Surface, cornell_box};
     use crate::volume::generate::Generator;
+    use glam::DMat3;
 
     fn scene(walls: impl Fn(&Field) -> Vec<Polygon>) -> Scene {
         let volume = Generator::from_name("bumps").and_then(|g| g.sample([24; 3])).unwrap();
@@ -473,15 +486,27 @@ mod tests {
     #[test]
     fn walls_of_one_fineness_keep_their_lines() {
         let scene = scene(|field| cornell_box(field.lattice(), 0.0).unwrap());
-        let voxel = scene.lattice().spacing().max_element();
+        let lattice = scene.lattice();
+        let voxel = lattice.spacing().max_element();
         for texel in [0.4, 1.0, 3.5, 20.0] {
             let area = (texel * voxel).powi(2);
             let lines = texel.floor().max(1.0);
-            let [near, past] = strides(&scene, [area; 6].into_iter(), 1e9);
-            assert_eq!((near, past), (lines.min(8.0), lines.min(10.0)), "{texel}");
+            let all = [[lines.min(8.0); 2], [lines.min(10.0); 2]];
+            assert_eq!(strides(lattice, 0, [area; 6].into_iter(), 1e9), all, "{texel}");
         }
         let voxels = |n: f64| (n * voxel).powi(2);
-        assert_eq!(strides(&scene, [voxels(1.0), voxels(40.5)].into_iter(), 1e8), [8.0, 14.0]);
-        assert_eq!(strides(&scene, [voxels(1.0), voxels(40.5)].into_iter(), 1e5), [1.0, 1.0]);
+        assert_eq!(strides(lattice, 1, [voxels(1.0), voxels(40.5)].into_iter(), 1e8), [[8.0; 2], [14.0; 2]]);
+        assert_eq!(strides(lattice, 2, [voxels(1.0), voxels(40.5)].into_iter(), 1e5), [[1.0; 2]; 2]);
+    }
+
+    /// Slices four times as far apart as the nodes in them: lines along x or y report for every texel of six nodes once
+    /// along the slices and at every one across them, lines along z as often as slices meet walls.
+    #[test]
+    fn lines_report_by_their_own_distances() {
+        let axes = DMat3::from_diagonal(DVec3::new(1.0, 1.0, -4.0));
+        let lattice = Lattice::new([64, 64, 16], DVec3::ZERO, axes).unwrap();
+        for (axis, near) in [(0, [6.0, 1.0]), (1, [6.0, 1.0]), (2, [1.0, 1.0])] {
+            assert_eq!(strides(&lattice, axis, [36.0; 6].into_iter(), 1e4), [near; 2], "{axis}");
+        }
     }
 }
