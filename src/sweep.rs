@@ -26,6 +26,7 @@ mod gaps;
 mod gather;
 mod grid;
 mod half;
+mod lit_rows;
 mod near;
 mod normals;
 mod open_share;
@@ -245,7 +246,7 @@ pub fn sweep_resumable(
     let sides = swept_sides(scene);
     let replicates = settings.replicates.max(1);
     let mut flats = Flats::new(scene, settings.flat_resolution.0.max(2), settings.flat_resolution.1.max(2));
-    let mut state = State::new(&sides, stored.len(), geometry.h.len(), replicates);
+    let mut state = State::new(&sides, stored.len(), [geometry.h.len(), geometry.places()], replicates);
     let mut passes = saved.read(0, |bytes| state.restore(bytes, sides.len(), &mut flats)).flatten();
     if state.counts.valid == 0 {
         let nodes = geometry.h.len();
@@ -275,7 +276,7 @@ pub fn sweep_resumable(
         let (indirect, complete) = run.replicate(&mut state, passes.take(), &mut flats, &progress);
         stopped = !complete;
         if complete {
-            state.add(&indirect, &flats, (scene, &focus));
+            state.add(&indirect, &flats, (scene, geometry.lit_rows(), &focus));
             spare.keep(indirect.into_iter().flatten());
         }
     }
@@ -284,8 +285,7 @@ pub fn sweep_resumable(
         // What there is.
         state.flats = flats.textures.iter().map(|t| t.as_ref().map(|t| t.radiance.clone())).collect();
     }
-    let lit = geometry.all_lit();
-    drop(geometry);
+    let (lit, rows) = (geometry.all_lit(), geometry.into_lit_rows());
     if !stopped {
         saved.save(0, || state.bytes(None, &flats));
     }
@@ -297,7 +297,7 @@ pub fn sweep_resumable(
         })
     });
     let flats = flats.collect();
-    let mut sides = total.finish(&Focus { dims, lit: |at| lit[at] }, done, settings.direct);
+    let mut sides = total.finish(&rows, &Focus { dims, lit: |at| lit[at] }, done, settings.direct);
     let world = |o: usize| scene.lattice().to_world(DVec3::from_array(scene.lattice().ijk(o).map(|i| i as f64)));
     let dark = slits.hidden.iter().map(|hidden| hidden.0).filter(|&o| scene.covers(world(o)));
     for o in dark {
@@ -371,7 +371,8 @@ impl Run<'_> {
             }
             // Of the first one what there is.
             if complete || number == 0 {
-                self.spare.keep(state.total.add_direct(direct, self.scene).into_iter().flatten());
+                self.spare
+                    .keep(state.total.add_direct(direct, self.scene, self.geometry.lit_rows()).into_iter().flatten());
             }
         }
         if first < replicates {

@@ -43,10 +43,9 @@ pub(super) fn direct(
     part: Points,
     tick: &mut dyn FnMut() -> bool,
 ) -> (Vec<Planes>, bool) {
-    let n = geometry.h.len();
-    let lattice = scene.lattice();
+    let (lit, lattice) = (geometry.lit_rows(), scene.lattice());
     let unit = lattice.unit();
-    let mut planes: Vec<Planes> = sides.iter().map(|_| spare.black(n)).collect();
+    let mut planes: Vec<Planes> = sides.iter().map(|_| spare.black(geometry.places())).collect();
     let [nx, ny, _] = geometry.dims;
     let corners: Vec<DVec3> = (0..8)
         .map(|c| lattice.to_world(lattice.far() * DVec3::from_array([c & 1, c >> 1 & 1, c >> 2].map(f64::from))))
@@ -61,10 +60,9 @@ pub(super) fn direct(
         let light = &scene.polygons()[number as usize];
         let points = part.on(light, number);
         let blockers = Blockers::new(scene, number, &corners);
-        // Σ V g and Σ g of every node and side, whatever factor all g of one have. Where nothing is lit no memory is
-        // touched.
+        // Σ V g and Σ g of every side at every place of planes, whatever factor all g of one have.
         let per = sides.len();
-        let mut sums = vec![[0f32; 2]; per * n];
+        let mut sums = vec![[0f32; 2]; per * lit.len()];
         let place = [Side::Lower, Side::Higher].map(|s| sides.iter().position(|x| *x == s).unwrap_or(0));
         let mut fans = Fans::default();
         for &world in &points {
@@ -91,21 +89,26 @@ pub(super) fn direct(
                 wanted,
                 place,
             };
-            sums.par_chunks_mut(per * nx).enumerate().with_max_len(32).for_each(|(row, sums)| {
+            let rows = lit.split(&mut sums, per).into_par_iter().enumerate().with_max_len(32);
+            rows.filter(|(_, sums)| !sums.is_empty()).for_each(|(row, sums)| {
                 let (j, k) = (row % ny, row / ny);
+                let (first, run) = lit.run(row);
                 let begin = DVec3::new(0.0, j as f64, k as f64);
                 let to = ((world - lattice.to_world(begin)) / unit).as_vec3().to_array();
                 geometry.lit_vectors(row, |a, b| {
-                    let normals = &geometry.normals[row * nx + a..row * nx + b];
-                    isa.receive(&emitter, [a, j, k], to, normals, &mut sums[per * a..per * b]);
+                    let [from, to_end] = [a, b].map(|i| i - first);
+                    let normals = &geometry.normals[run.start + from..run.start + to_end];
+                    isa.receive(&emitter, [a, j, k], to, normals, &mut sums[per * from..per * to_end]);
                 });
             });
         }
         drop(fans);
         if !open.whole() {
-            sums.par_chunks_mut(per * nx).enumerate().with_min_len(ROWS).for_each(|(row, sums)| {
+            let rows = lit.split(&mut sums, per).into_par_iter().enumerate().with_min_len(ROWS);
+            rows.for_each(|(row, sums)| {
+                let (first, _) = lit.run(row);
                 geometry.lit_nodes(row, |i| {
-                    for (side, sum) in sides.iter().zip(&mut sums[i * per..]) {
+                    for (side, sum) in sides.iter().zip(&mut sums[(i - first) * per..]) {
                         if sum[0] > 0.0 {
                             sum[0] *= open.correction(*side, geometry.h[row * nx + i]) as f32;
                         }
@@ -115,19 +118,19 @@ pub(super) fn direct(
         }
         near::look((scene, geometry, isa), (number, &blockers), sides, part, &mut sums);
         for (s, (side, planes)) in sides.iter().zip(&mut planes).enumerate() {
-            let [r, g, b] = planes;
-            let rows = (r.par_chunks_mut(nx), g.par_chunks_mut(nx), b.par_chunks_mut(nx)).into_par_iter();
-            rows.enumerate().with_min_len(ROWS).for_each(|(row, (r, g, b))| {
+            let rows: (Vec<_>, Vec<_>, Vec<_>) = planes.each_mut().map(|plane| lit.split(plane, 1)).into();
+            rows.into_par_iter().enumerate().with_min_len(ROWS).for_each(|(row, (r, g, b))| {
                 let [y, z] = [row % ny, row / ny].map(|x| x as f64);
+                let (first, run) = lit.run(row);
                 geometry.lit_nodes(row, |i| {
-                    let at = row * nx + i;
-                    let [seen, all] = sums[at * per + s];
+                    let (at, place) = (row * nx + i, i - first);
+                    let [seen, all] = sums[(run.start + place) * per + s];
                     if seen > 0.0 {
                         let normal = geometry.normal(at).expect("only nodes with a normal were lit");
                         let normal = if *side == Side::Lower { normal } else { -normal };
                         let e = unoccluded(light, lattice.to_world(DVec3::new(i as f64, y, z)), normal);
                         let e = (light.emission * (e * f64::from((seen / all).min(1.0)))).as_vec3();
-                        (r[i], g[i], b[i]) = (r[i] + e.x, g[i] + e.y, b[i] + e.z);
+                        (r[place], g[place], b[place]) = (r[place] + e.x, g[place] + e.y, b[place] + e.z);
                     }
                 });
             });

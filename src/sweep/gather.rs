@@ -9,6 +9,7 @@ use super::flats::{Arrivals, Flats, Incoming, capped};
 use super::gaps::Around;
 use super::grid::{Geometry, Source};
 use super::half::Half4;
+use super::lit_rows::LitRows;
 use super::normals::decode;
 use super::pack::{LANES, Pack, Plan};
 use super::planes::{Planes, Spare};
@@ -44,7 +45,7 @@ type RowLight = [Vec<f32>; 3];
 /// Lines of a row without a sample, a bit each: [slice][pack]. Empty where all samples are finite.
 type RowGaps = Vec<u16>;
 
-/// The irradiance of a row of nodes, a slice per channel.
+/// The irradiance of a row's run of nodes, a slice per channel.
 type Row<'a> = [&'a mut [f32]; 3];
 
 /// Rows of nodes in memory, each of which one row of lines of a family adds to.
@@ -100,7 +101,7 @@ impl Pass<'_> {
         incoming: &mut Incoming,
         tick: &mut dyn FnMut() -> bool,
     ) -> (Planes, bool) {
-        let mut e = self.spare.black(b[0].len());
+        let mut e = self.spare.black(self.geometry.places());
         let touched = self.touching.now(self.geometry, flats);
         let split = lines.partition_point(|s| !s.layout.transposed);
         let mut complete = true;
@@ -111,7 +112,7 @@ impl Pass<'_> {
             let Some(any) = some.first() else { continue };
             let turned = transposed.then(|| self.geometry.transposed_normals(self.spare));
             let normals = turned.as_ref().unwrap_or(&self.geometry.normals);
-            let rows = node_rows(&mut e, any.layout.dims[0]);
+            let rows = node_rows(&mut e, self.geometry.lit_rows_of(&any.layout));
             for shear in some {
                 complete = complete && tick();
                 if complete {
@@ -136,12 +137,12 @@ impl Pass<'_> {
         let omega: Vec<[f32; 3]> = lines.iter().map(|s| s.omega.as_vec3().to_array()).collect();
         // Σ|ω·N| · 4π/(2·lines) against π; N's length falls out.
         let half = 0.5 * lines.len() as f32;
-        let [e0, e1, e2] = e;
+        let [e0, e1, e2] = e.each_mut().map(|e| &mut e[..self.geometry.normals.len()]);
         (e0.par_chunks_mut(COSINES), e1.par_chunks_mut(COSINES), e2.par_chunks_mut(COSINES))
             .into_par_iter()
             .enumerate()
-            .for_each(|(row, (e0, e1, e2))| {
-                let normals = &self.geometry.normals[row * COSINES..][..e0.len()];
+            .for_each(|(chunk, (e0, e1, e2))| {
+                let normals = &self.geometry.normals[chunk * COSINES..][..e0.len()];
                 if normals.iter().all(|n| *n == 0) {
                     return;
                 }
@@ -312,10 +313,8 @@ impl Pass<'_> {
         let at = k * layout.stride[1] + j * layout.stride[0];
         let nu = layout.dims[0];
         let row = rows[at / nu].lock().expect("no thread panics");
-        if let Some((a, b)) = self.geometry.lit_blocks(layout).span(at / nu, nu) {
-            row.iter().for_each(|e| prefetch(&e[a..b]));
-            prefetch(&family.normals[at + a..at + b]);
-        }
+        row.iter().for_each(|e| prefetch(e));
+        prefetch(&family.normals[self.geometry.lit_rows_of(layout).run(at / nu).1]);
         row
     }
 
@@ -339,7 +338,9 @@ impl Pass<'_> {
         let light: [[&[f32]; 3]; 2] =
             light.map(|light| std::array::from_fn(|c| &light[c][k * plan.width..][..plan.width]));
         let at = k * layout.stride[1] + j * layout.stride[0];
-        let n = &family.normals[at..][..nu];
+        // Normals and light of the row's run, from its first node on.
+        let (first, run) = self.geometry.lit_rows_of(layout).run(at / nu);
+        let n = &family.normals[run];
         let gaps = gaps.map(|gaps| gaps.get(k * plan.width / LANES..).unwrap_or_default());
         let rims = self.geometry.rims(layout);
         let lit = self.geometry.lit_blocks(layout);
@@ -357,7 +358,7 @@ impl Pass<'_> {
             touched: family.touched,
         };
         let h = &self.geometry.h(layout)[at..][..nu];
-        let lines = Lines { rows: light, first: line0, shift: [fu, fv], omega: family.omega };
+        let lines = Lines { rows: light, first: line0 + first, shift: [fu, fv], omega: family.omega };
         let mut bits = lit.rows[at / nu];
         while bits != 0 {
             // Runs of lit blocks.
@@ -367,11 +368,11 @@ impl Pass<'_> {
             let (a, b) = (a * lit.size, ((a + run) * lit.size).min(nu));
             let mut some = |a: usize, b: usize| {
                 let mut single = |i: usize| {
-                    let [x, y, z] = decode(n[i]);
+                    let [x, y, z] = decode(n[i - first]);
                     let cos = family.omega[0] * x + family.omega[1] * y + family.omega[2] * z;
                     let light = sides.radiance(i, h[i], (cos > 0.0) != family.way.strict);
-                    (e0[i], e1[i], e2[i]) =
-                        (e0[i] + cos.abs() * light[0], e1[i] + cos.abs() * light[1], e2[i] + cos.abs() * light[2]);
+                    let e = [&mut e0[i - first], &mut e1[i - first], &mut e2[i - first]];
+                    e.into_iter().zip(light).for_each(|(e, light)| *e += cos.abs() * light);
                 };
                 if on_side(j, nv) {
                     (a..b).for_each(single);
@@ -381,7 +382,8 @@ impl Pass<'_> {
                 ends.for_each(&mut single);
                 let (a, b) = (a.max(1), b.min(nu - 1));
                 if a < b {
-                    self.isa.accumulate(&lines, n, &mut [&mut e0[..], &mut e1[..], &mut e2[..]], (a, b));
+                    let e = &mut [&mut e0[..], &mut e1[..], &mut e2[..]];
+                    self.isa.accumulate(&lines, n, e, (a - first, b - first));
                 }
             };
             let mut from = a;
@@ -394,20 +396,19 @@ impl Pass<'_> {
         }
         for &i in rims.map_or(&[][..], |rims| rims.within(at / nu, 0, nu)) {
             let i = i as usize;
-            let cos = cosine(family.omega, n[i]);
+            let cos = cosine(family.omega, n[i - first]);
             let lines = Around::new((i, nu), line0, [fu, fv], family.goes_on);
             for (c, e) in [&mut e0[..], &mut e1[..], &mut e2[..]].into_iter().enumerate() {
-                e[i] += cos * lines.mean([light[0][c], light[1][c]], gaps);
+                e[i - first] += cos * lines.mean([light[0][c], light[1][c]], gaps);
             }
         }
     }
 }
 
-/// Planes as rows of `nu` nodes.
-fn node_rows(e: &mut Planes, nu: usize) -> Rows<'_> {
-    let [e0, e1, e2] = e;
-    let rows = e0.chunks_exact_mut(nu).zip(e1.chunks_exact_mut(nu)).zip(e2.chunks_exact_mut(nu));
-    rows.map(|((e0, e1), e2)| Mutex::new([e0, e1, e2])).collect()
+/// Planes by rows of nodes.
+fn node_rows<'e>([e0, e1, e2]: &'e mut Planes, lit: &LitRows) -> Rows<'e> {
+    let [e0, e1, e2] = [e0, e1, e2].map(|e| lit.split(e, 1));
+    e0.into_iter().zip(e1).zip(e2).map(|((e0, e1), e2)| Mutex::new([e0, e1, e2])).collect()
 }
 
 /// Nodes whose cosines are summed at a time.

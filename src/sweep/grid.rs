@@ -4,9 +4,10 @@
 use super::directions::Layout;
 use super::gaps::Rims;
 use super::half::{Half4, decode, encode};
+use super::lit_rows::{LitRows, transpose, untranspose};
 use super::normals;
 use super::pack::LANES;
-use super::planes::{Planes, Spare, transpose, transposed};
+use super::planes::{Planes, Spare, transposed};
 use crate::field::{Field, FieldRows, GradientRow};
 use crate::flattened::Side;
 use crate::mask::{lights_itself, may_light_itself};
@@ -22,13 +23,14 @@ pub(super) struct Geometry<'a> {
     pub dims: [usize; 3],
     pub h: &'a [f32],
     h_transposed: Vec<f32>,
-    /// Of lit nodes; the others have none.
+    /// Of lit nodes, as planes of light keep them; the others have none.
     pub normals: Vec<u32>,
     rings: Vec<Vec<u32>>,
     /// Per memory order, the lit nodes beside samples that are not finite; `None` if all are.
     rims: Option<[Rims; 2]>,
     /// Per memory order, the blocks of lit nodes.
     lit_blocks: [Blocks; 2],
+    lit_rows: [LitRows; 2],
     /// Per side and memory order, the blocks of nodes within one node of those that reach the sweep.
     awake: [[Blocks; 2]; 2],
 }
@@ -50,7 +52,12 @@ impl Blocks {
 
     /// The blocks of nodes that `is` holds, in rows of `nu`; those of neighbours along the row, up to `reach`, count
     /// too.
-    fn along(nu: usize, rows: usize, (size, reach): (usize, usize), is: impl Fn(usize) -> bool + Sync) -> Self {
+    pub(super) fn along(
+        nu: usize,
+        rows: usize,
+        (size, reach): (usize, usize),
+        is: impl Fn(usize) -> bool + Sync,
+    ) -> Self {
         let holds = |row: usize, block: usize| {
             let (a, b) = ((block * size).saturating_sub(reach), ((block + 1) * size + reach).min(nu));
             // No early end: vectors look at many nodes at a time.
@@ -179,8 +186,6 @@ impl<'a> Geometry<'a> {
         let near = |at: &u32| normals[*at as usize] != 0 && lights_itself(field, field.lattice(), *at as usize);
         let near: Vec<u32> = ring(dims, &lit).into_par_iter().with_min_len(256).filter(near).collect();
         near.into_iter().for_each(|at| lit[at as usize] = true);
-        // Nodes that are not lit take no light whatever lines bring.
-        normals.par_iter_mut().zip(&lit).with_min_len(1 << 14).filter(|(_, lit)| !**lit).for_each(|(n, _)| *n = 0);
         let rings = rings(dims, &lit);
         let rims = field.has_gaps().then(|| Rims::both(dims, h, |at| lit[at]));
         let h_transposed = transposed(h, dims);
@@ -188,6 +193,14 @@ impl<'a> Geometry<'a> {
         let whole = |n: usize| (n.div_ceil(64).next_multiple_of(16), 0);
         let lit_blocks =
             [Blocks::along(nx, ny * nz, whole(nx), |at| lit[at]), Blocks::across(dims, whole(ny), |at| lit[at])];
+        let lit_rows = [LitRows::new(nx, &lit_blocks[0]), LitRows::new(ny, &lit_blocks[1])];
+        // Nodes that are not lit take no light whatever lines bring.
+        let mut kept = vec![0; lit_rows[0].len()];
+        lit_rows[0].for_each_run(&mut kept, |first, run| {
+            let nodes = normals[first..].iter().zip(&lit[first..]);
+            run.iter_mut().zip(nodes).filter(|(_, (_, lit))| **lit).for_each(|(kept, (n, _))| *kept = *n);
+        });
+        drop(normals);
         let fine = |n: usize| (n.div_ceil(64), 1);
         let awake = [Side::Lower, Side::Higher].map(|side| {
             let reaches = |at: usize| if side == Side::Lower { !(h[at] < 0.0) } else { !(h[at] > 1.0) };
@@ -196,13 +209,39 @@ impl<'a> Geometry<'a> {
                 Blocks::across(dims, fine(ny), reaches).joined(nz),
             ]
         });
-        Self { dims, h, h_transposed, normals, rings, rims, lit_blocks, awake }
+        Self { dims, h, h_transposed, normals: kept, rings, rims, lit_blocks, lit_rows, awake }
     }
 
     /// Whether a node is lit.
     #[inline(always)]
     pub(super) fn lit(&self, at: usize) -> bool {
-        self.normals[at] != 0
+        self.packed_normal(at) != 0
+    }
+
+    #[inline(always)]
+    fn packed_normal(&self, at: usize) -> u32 {
+        self.lit_rows[0].place_of(at).map_or(0, |place| self.normals[place])
+    }
+
+    /// Numbers of a plane of light, in either memory order.
+    pub(super) fn places(&self) -> usize {
+        self.lit_rows[0].len().max(self.lit_rows[1].len())
+    }
+
+    /// Where planes in x, y, z order keep what.
+    pub(super) fn lit_rows(&self) -> &LitRows {
+        &self.lit_rows[0]
+    }
+
+    /// Where planes in the memory order of `layout` keep what.
+    pub(super) fn lit_rows_of(&self, layout: &Layout) -> &LitRows {
+        &self.lit_rows[usize::from(layout.transposed)]
+    }
+
+    /// The same in x, y, z order, for those who need nothing else.
+    pub(super) fn into_lit_rows(self) -> LitRows {
+        let [rows, _] = self.lit_rows;
+        rows
     }
 
     /// Whether a node holds a surface of the sweep.
@@ -213,13 +252,20 @@ impl<'a> Geometry<'a> {
 
     /// [`Self::lit`] of all nodes.
     pub(super) fn all_lit(&self) -> Vec<bool> {
-        self.normals.par_iter().with_min_len(1 << 14).map(|n| *n != 0).collect()
+        let mut lit = vec![false; self.h.len()];
+        let nx = self.dims[0];
+        lit.par_chunks_exact_mut(nx).enumerate().with_min_len(64).for_each(|(row, lit)| {
+            let (first, run) = self.lit_rows[0].run(row);
+            lit[first..].iter_mut().zip(&self.normals[run]).for_each(|(lit, n)| *lit = *n != 0);
+        });
+        lit
     }
 
     /// The normals in y, z, x order.
     pub(super) fn transposed_normals(&self, spare: &Spare) -> Vec<u32> {
-        let mut to = spare.numbers(self.normals.len());
-        transpose(&self.normals, self.dims, |row| self.lit_blocks[0].rows[row] != 0, &mut to);
+        let mut to = spare.numbers(self.places());
+        let [rows, turned] = &self.lit_rows;
+        transpose([rows, turned], self.dims, &self.normals, &mut to);
         to
     }
 
@@ -252,42 +298,22 @@ impl<'a> Geometry<'a> {
 
     /// Light of the lit nodes from y, z, x order back to x, y, z; the others are black.
     pub(super) fn untransposed(&self, planes: Planes, spare: &Spare) -> Planes {
+        let ([rows, turned], [_, ny, nz]) = (&self.lit_rows, self.dims);
         planes.map(|from| {
             let mut to = spare.plane(from.len());
-            self.untranspose(&from, &mut to);
+            untranspose([turned, rows], [ny, nz], &from, &mut to);
             spare.keep([from]);
             to
         })
     }
 
-    /// As [`Self::untransposed`], into black.
-    fn untranspose(&self, from: &[f32], to: &mut [f32]) {
-        let [nx, ny, nz] = self.dims;
-        let blocks = &self.lit_blocks[0];
-        // Columns of as many rows as a cache line holds are read whole.
-        const ROWS: usize = 64;
-        to.par_chunks_mut(ROWS * nx).enumerate().for_each(|(chunk, out)| {
-            let first = chunk * ROWS;
-            let rows = out.len() / nx;
-            let mut bits = blocks.rows[first..first + rows].iter().fold(0, |all, bits| all | bits);
-            while bits != 0 {
-                let a = bits.trailing_zeros() as usize * blocks.size;
-                bits &= bits - 1;
-                for x in a..(a + blocks.size).min(nx) {
-                    let column = &from[x * ny * nz + first..][..rows];
-                    out.chunks_exact_mut(nx).zip(column).for_each(|(line, value)| line[x] = *value);
-                }
-            }
-        });
-    }
-
     /// Calls `visit` with the lit nodes of a row along x.
     #[inline(always)]
     pub(super) fn lit_nodes(&self, row: usize, mut visit: impl FnMut(usize)) {
-        let blocks = &self.lit_blocks[0];
-        let nx = self.dims[0];
-        for (a, b) in blocks.each(row, nx) {
-            let nodes = self.normals[row * nx + a..row * nx + b].iter().zip(a..b);
+        let (first, run) = self.lit_rows[0].run(row);
+        let normals = &self.normals[run];
+        for (a, b) in self.lit_blocks[0].each(row, self.dims[0]) {
+            let nodes = normals[a - first..b - first].iter().zip(a..b);
             nodes.filter(|(normal, _)| **normal != 0).for_each(|(_, i)| visit(i));
         }
     }
@@ -303,7 +329,7 @@ impl<'a> Geometry<'a> {
     /// A vector of any length along the normal of a lit node towards the lower side.
     #[inline(always)]
     pub(super) fn along_normal(&self, at: usize) -> Vec3 {
-        Vec3::from_array(normals::decode(self.normals[at]))
+        Vec3::from_array(normals::decode(self.packed_normal(at)))
     }
 
     /// The lit nodes of rows in the memory order of `layout`.
@@ -494,15 +520,29 @@ mod tests {
         let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
         let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
         let geometry = Geometry::new(&field);
-        let from: Vec<f32> = (0..lattice.len()).map(|o| if geometry.lit(o) { 1.0 + o as f32 } else { 0.0 }).collect();
-        assert!(from.iter().filter(|x| **x != 0.0).count() > 200);
-        let to = transposed(&from, dims);
+        let lit = (0..lattice.len()).filter(|&o| geometry.lit(o)).count();
+        assert!(lit > 200);
         // (x, y, z) = (2, 3, 4).
-        assert_eq!(to[(2 * 11 + 4) * 9 + 3], from[(4 * 9 + 3) * 67 + 2]);
+        assert_eq!(transposed(geometry.h, dims)[(2 * 11 + 4) * 9 + 3], geometry.h[(4 * 9 + 3) * 67 + 2]);
+        let [rows, turned] = &geometry.lit_rows;
+        let places = geometry.places();
+        // Dark nodes beside lit ones have places, and none at the other end of their row; some have one in one order.
+        assert!(lit < places && places < lattice.len() / 2, "{lit} {places}");
         let spare = Spare::default();
-        // What a plane held before is forgotten.
-        spare.keep(std::array::from_fn::<_, 3, _>(|_| vec![3.0; from.len()]));
+        // What planes held before is forgotten.
+        spare.keep(std::array::from_fn::<_, 7, _>(|_| vec![3.0; places]));
+        let mut plane = vec![0.0; places];
+        for o in (0..lattice.len()).filter(|&o| geometry.lit(o)) {
+            plane[rows.place_of(o).unwrap()] = 1.0 + o as f32;
+        }
+        let mut to = spare.plane(places);
+        transpose([rows, turned], dims, &plane, &mut to);
+        for o in 0..lattice.len() {
+            let [x, y, z] = lattice.ijk(o);
+            let expected = if geometry.lit(o) { 1.0 + o as f32 } else { 0.0 };
+            assert_eq!(turned.place(x * 11 + z, y).map_or(0.0, |place| to[place]), expected, "{x} {y} {z}");
+        }
         let got = geometry.untransposed(std::array::from_fn(|_| to.clone()), &spare);
-        got.iter().for_each(|plane| assert_eq!(plane, &from));
+        got.iter().for_each(|got| assert_eq!(got, &plane));
     }
 }

@@ -18,8 +18,8 @@ use crate::scene::Scene;
 use glam::DVec3;
 use rayon::prelude::*;
 
-/// Replaces \[Σ V g, Σ g\] of the nodes near luminaire `number` (`sums`: per node, per side) by those of points of
-/// their own: as many as a replicate has.
+/// Replaces \[Σ V g, Σ g\] of the nodes near luminaire `number` (`sums`: per place of planes, per side) by those of
+/// points of their own: as many as a replicate has.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice; sums are f32")]
 pub(super) fn look(
     (scene, geometry, isa): (&Scene, &Geometry, Isa),
@@ -35,11 +35,13 @@ pub(super) fn look(
     let [nx, ny, _] = geometry.dims;
     let per = sides.len();
     let (lo, hi) = bounds(scene, number, reach);
-    sums.par_chunks_mut(per * nx).enumerate().with_max_len(8).for_each(|(row, sums)| {
+    let lit = geometry.lit_rows();
+    lit.split(sums, per).into_par_iter().enumerate().with_max_len(8).for_each(|(row, sums)| {
         let (j, k) = ((row % ny) as f64, (row / ny) as f64);
         if !(lo.y..=hi.y).contains(&j) || !(lo.z..=hi.z).contains(&k) {
             return;
         }
+        let (first, _) = lit.run(row);
         let mut looks =
             Looks { isa, h: geometry.h, sums, segments: Segments::NONE, taken: 0, looks: [Look::NONE; LANES] };
         geometry.lit_nodes(row, |i| {
@@ -50,9 +52,9 @@ pub(super) fn look(
             }
             let at = row * nx + i;
             let Some(normal) = geometry.normal(at) else { return };
-            let h = geometry.h[at];
+            let (h, place) = (geometry.h[at], (i - first) * per);
             for (s, &side) in sides.iter().enumerate() {
-                looks.sums[i * per + s] = [0.0; 2];
+                looks.sums[place + s] = [0.0; 2];
                 let normal = if side == Side::Lower { normal } else { -normal };
                 let open = unoccluded(light, world, normal);
                 let Some(aim) = (if open > 0.0 { Aim::best(light, world, normal, open) } else { None }) else {
@@ -62,12 +64,12 @@ pub(super) fn look(
                 let set = Sobol::set(seed, Stage::Sweep, key);
                 for n in replicate * count..(replicate + 1) * count {
                     let (y, g) = aim.sample(set.point2(n as u32, 0));
-                    looks.sums[i * per + s][1] += g as f32;
+                    looks.sums[place + s][1] += g as f32;
                     let y = lattice.to_index(y);
                     // Caps let no light into solids.
                     let closed = side == Side::Higher && capped(scene) && y.clamp(DVec3::ZERO, lattice.far()) != y;
                     if g > 0.0 && !closed && !blockers.block(number, None, y, x) {
-                        looks.add(&scene.field, [y, x], Look { place: i * per + s, side, h, g: g as f32 });
+                        looks.add(&scene.field, [y, x], Look { place: place + s, side, h, g: g as f32 });
                     }
                 }
             }

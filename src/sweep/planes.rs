@@ -1,4 +1,5 @@
-//! Planes of light, a number per node each: memory for them, their kept form in half precision, and transposition.
+//! Planes of light, a number each per node that [`LitRows`] keeps: memory for them, and their kept form in half
+//! precision; and h in another order.
 
 use super::half::{decode, encode, scale};
 use ::half::bf16;
@@ -88,16 +89,16 @@ impl HalfPlanes {
         Self { planes, unit }
     }
 
-    /// The light of a node in one channel.
+    /// The light at a place in one channel.
     #[inline(always)]
-    pub(super) fn at(&self, c: usize, node: usize) -> f32 {
-        decode(self.planes[c][node]) / self.unit
+    pub(super) fn at(&self, c: usize, place: usize) -> f32 {
+        decode(self.planes[c][place]) / self.unit
     }
 
-    /// The light of a node.
+    /// The light at a place.
     #[inline(always)]
-    pub(super) fn all(&self, node: usize) -> [f32; 3] {
-        std::array::from_fn(|c| self.at(c, node))
+    pub(super) fn all(&self, place: usize) -> [f32; 3] {
+        std::array::from_fn(|c| self.at(c, place))
     }
 
     /// `light` less this, in its memory.
@@ -157,7 +158,7 @@ impl NodeLight<'_> {
         }
     }
 
-    /// Adds `factor` times the light of the nodes from `first` on to `to`.
+    /// Adds `factor` times the light from place `first` of planes on to `to`.
     #[inline(always)]
     pub(super) fn add(self, (side, c): (usize, usize), factor: f32, first: usize, to: &mut [f32]) {
         match self {
@@ -190,28 +191,19 @@ const STRIP: usize = 16;
 
 /// x, y, z order to y, z, x.
 pub(super) fn transposed(from: &[f32], dims: [usize; 3]) -> Vec<f32> {
+    let [nx, ny, nz] = dims;
     let mut to = vec![0.0; from.len()];
-    transpose(from, dims, |_| true, &mut to);
-    to
-}
-
-/// The same of the rows along x that `some` picks; the others are left as they are.
-pub(super) fn transpose<T: Copy + Send + Sync>(
-    from: &[T],
-    [nx, ny, nz]: [usize; 3],
-    some: impl Fn(usize) -> bool + Sync,
-    to: &mut [T],
-) {
     to.par_chunks_mut(STRIP * ny * nz).enumerate().for_each(|(strip, out)| {
         let x0 = strip * STRIP;
         let width = STRIP.min(nx - x0);
-        for (row, line) in from.chunks_exact(nx).enumerate().filter(|(row, _)| some(*row)) {
+        for (row, line) in from.chunks_exact(nx).enumerate() {
             // Row (y, z) in memory order has number z·ny + y in both orders.
             for (x, &value) in line[x0..x0 + width].iter().enumerate() {
                 out[x * ny * nz + row] = value;
             }
         }
     });
+    to
 }
 
 #[cfg(test)]

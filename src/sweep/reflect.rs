@@ -3,6 +3,7 @@
 use super::flats::Flats;
 use super::grid::Geometry;
 use super::half::{self, Half4};
+use super::lit_rows::LitRows;
 use super::planes::NodeLight;
 use super::settling::Sums;
 use super::slits::Slits;
@@ -56,7 +57,10 @@ impl<'a> Mirror<'a> {
         let nx = self.geometry.dims[0];
         let nodes = row * nx..(row + 1) * nx;
         to.clear();
-        to.extend(self.geometry.normals[nodes.clone()].iter().map(|n| if *n != 0 { 1.0 } else { 0.0 }));
+        to.resize(nx, 0.0);
+        let (first, run) = self.geometry.lit_rows().run(row);
+        let normals = &self.geometry.normals[run];
+        to[first..].iter_mut().zip(normals).for_each(|(to, n)| *to = if *n != 0 { 1.0 } else { 0.0 });
         let hidden = &self.slits.hidden;
         let first = hidden.partition_point(|h| h.0 < nodes.start);
         hidden[first..].iter().take_while(|h| h.0 < nodes.end).for_each(|h| to[h.0 - nodes.start] = 0.0);
@@ -100,6 +104,7 @@ impl<'a> Mirror<'a> {
         let n = nx * ny * nz;
         let job = Job {
             light,
+            lit: self.geometry.lit_rows(),
             emission: emission.map(|e| unit * e),
             over_pi: greatest.map(|rho| unit * rho),
             by_node: by_node.as_deref(),
@@ -171,6 +176,7 @@ pub(super) struct Rows {
 /// What is done to every row of nodes.
 pub(super) struct Job<'a> {
     light: &'a [(NodeLight<'a>, f32)],
+    lit: &'a LitRows,
     /// Times the unit.
     emission: [f32; 3],
     /// ρ/π, times the unit; where it differs from node to node, as it is.
@@ -197,7 +203,9 @@ pub(super) fn reflect_row(job: &Job, s: usize, beside: [Option<usize>; 5], rows:
             to.clear();
             if let Some(row) = row {
                 to.resize(nx, 0.0);
-                job.light.iter().for_each(|(light, scale)| light.add((s, c), *scale, row * nx, to));
+                let (first, run) = job.lit.run(row);
+                let to = &mut to[first..first + run.len()];
+                job.light.iter().for_each(|(light, scale)| light.add((s, c), *scale, run.start, to));
             }
         }
         sharpen(light, shown, laplacian, job.sharpening);
@@ -297,6 +305,7 @@ fn sharpen(light: &mut Cross, shown: &Cross, laplacian: &mut Vec<f32>, sharpenin
 mod tests {
     use super::*;
     use crate::rng::{Rng, Stage};
+    use crate::sweep::grid::Blocks;
     use crate::sweep::planes::HalfPlanes;
 
     /// Of a field whose second differences are known: read as lines do, for a node that takes four lines, it is itself
@@ -380,8 +389,10 @@ mod tests {
         let packed = |x: Vec<f32>| x.iter().map(|x| [half::encode(*x), half::encode(0.3 * x), 0, 0]).collect();
         let old = Reflected { b: vec![packed(random(nx * rows))], unit: 2.0 };
         let before: Vec<Half4> = packed(random(nx));
+        let lit = LitRows::new(nx, &Blocks::along(nx, rows, (16, 0), |_| true));
         for (by_node, omega) in [(None, None), (None, Some([1.2, 1.1, 1.0])), (Some(&albedo[..]), Some([1.0; 3]))] {
             let job = Job {
+                lit: &lit,
                 light: &[
                     (NodeLight::Full(&planes), 1.0),
                     (NodeLight::Half(&half), 0.5),

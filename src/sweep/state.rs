@@ -3,6 +3,7 @@
 use super::SweepCounts;
 use super::flats::Flats;
 use super::half::Half4;
+use super::lit_rows::LitRows;
 use super::planes::{HalfPlanes, Planes, SignedPlanes};
 use super::reflect::Reflected;
 use super::settling::Settling;
@@ -43,10 +44,11 @@ pub(super) struct Passes {
 }
 
 impl State {
-    pub(super) fn new(sides: &[Side], stored: usize, nodes: usize, replicates: usize) -> Self {
+    /// Of so many nodes with so many places in planes.
+    pub(super) fn new(sides: &[Side], stored: usize, size: [usize; 2], replicates: usize) -> Self {
         Self {
             done: 0,
-            total: Totals::new(sides, stored, nodes, replicates),
+            total: Totals::new(sides, stored, size, replicates),
             flats: Vec::new(),
             bounces: 0,
             residual: 0.0,
@@ -59,9 +61,9 @@ impl State {
         &mut self,
         indirect: &[Planes],
         flats: &Flats,
-        (scene, focus): (&Scene, &Focus<L>),
+        (scene, rows, focus): (&Scene, &LitRows, &Focus<L>),
     ) {
-        self.total.add(indirect, scene, focus);
+        self.total.add(indirect, (scene, rows), focus);
         let radiance = || flats.textures.iter().map(|t| t.as_ref().map(|t| &t.radiance));
         if self.done == 0 {
             self.flats = radiance().map(Option::<&Vec<f32>>::cloned).collect();
@@ -93,11 +95,11 @@ impl State {
     /// Everything as bytes, with the passes of a replicate that is under way.
     pub(super) fn bytes(&self, passes: Option<&Passes>, flats: &Flats) -> Vec<u8> {
         let Totals { lighting, direct, light, spread, parts, .. } = &self.total;
-        // If all nodes are lit.
+        let [_, places] = self.total.size();
         let numbers = 12 * lighting.len() + 6 * (direct.len() + light.len()) + 3 * spread.len();
         let under_way = passes.map_or(0, |p| 6 * (p.light.b.len() + p.before.b.len() + p.defect.len()));
         // The flats are small beside it.
-        let mut out = Writer { bytes: Vec::with_capacity(self.total.nodes() * (numbers + under_way) + (1 << 16)) };
+        let mut out = Writer { bytes: Vec::with_capacity(places * (numbers + under_way) + (1 << 16)) };
         out.count(self.done);
         out.count(self.bounces);
         out.real(self.residual);
@@ -166,9 +168,9 @@ impl State {
 
     fn parse(&self, bytes: &[u8], sides: usize, flats: &Flats) -> Option<Parsed> {
         let mut from = Reader { bytes };
-        let nodes = self.total.nodes();
+        let [nodes, places] = self.total.size();
         let replicates = if self.total.spread.is_empty() { 1 } else { 2 };
-        let mut state = Self::new(self.total.sides(), self.total.stored(), nodes, replicates);
+        let mut state = Self::new(self.total.sides(), self.total.stored(), [nodes, places], replicates);
         state.done = from.count()?;
         state.total.count = state.done;
         state.bounces = from.count()?;
@@ -187,12 +189,12 @@ impl State {
         if state.total.lit > 0 {
             let lighting = from.count()?;
             if lighting > 0 {
-                state.total.lighting = from.planes(sides, nodes)?;
+                state.total.lighting = from.planes(sides, places)?;
             } else {
-                state.total.direct = from.half_planes(sides, nodes)?;
+                state.total.direct = from.half_planes(sides, places)?;
             }
             for spread in &mut state.total.spread {
-                *spread = from.halves(nodes)?.into_iter().map(bf16::from_bits).collect();
+                *spread = from.halves(places)?.into_iter().map(bf16::from_bits).collect();
             }
             let parts = if state.total.spread.is_empty() { 0 } else { state.total.lit };
             let each = state.total.spread.len() * nodes.div_ceil(stride(nodes));
@@ -203,7 +205,7 @@ impl State {
         }
         let bounced = from.count()?;
         if state.done > 0 {
-            state.total.light = from.half_planes(bounced.min(sides), nodes)?;
+            state.total.light = from.half_planes(bounced.min(sides), places)?;
             for (sum, texture) in state.flats.iter_mut().zip(&flats.textures) {
                 if let Some(t) = texture {
                     *sum = Some(from.numbers(t.radiance.len())?);
@@ -225,7 +227,7 @@ impl State {
                 *three = from.three()?;
             }
             let (corrected, defects) = (from.count()? == 1, from.count()?.min(sides));
-            let mut three = || Some([from.halves(nodes)?, from.halves(nodes)?, from.halves(nodes)?]);
+            let mut three = || Some([from.halves(places)?, from.halves(places)?, from.halves(places)?]);
             let defect = (0..defects).map(|_| three()).collect::<Option<_>>()?;
             let mut textures = Vec::new();
             for t in flats.textures.iter().flatten() {
@@ -347,16 +349,16 @@ impl Reader<'_> {
         Some(r.into_iter().zip(g).zip(b).map(|((r, g), b)| [r, g, b, 0]).collect())
     }
 
-    fn half_planes(&mut self, sides: usize, nodes: usize) -> Option<Vec<HalfPlanes>> {
+    fn half_planes(&mut self, sides: usize, places: usize) -> Option<Vec<HalfPlanes>> {
         let mut side = || {
             let [unit] = self.numbers(1)?.try_into().ok()?;
-            Some(HalfPlanes { planes: [self.halves(nodes)?, self.halves(nodes)?, self.halves(nodes)?], unit })
+            Some(HalfPlanes { planes: [self.halves(places)?, self.halves(places)?, self.halves(places)?], unit })
         };
         (0..sides).map(|_| side()).collect()
     }
 
-    fn planes(&mut self, sides: usize, nodes: usize) -> Option<Vec<Planes>> {
-        (0..sides).map(|_| Some([self.numbers(nodes)?, self.numbers(nodes)?, self.numbers(nodes)?])).collect()
+    fn planes(&mut self, sides: usize, places: usize) -> Option<Vec<Planes>> {
+        (0..sides).map(|_| Some([self.numbers(places)?, self.numbers(places)?, self.numbers(places)?])).collect()
     }
 }
 

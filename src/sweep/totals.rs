@@ -1,6 +1,7 @@
 //! Sums over the replicates of a sweep, and their spread.
 
 use super::SweptSide;
+use super::lit_rows::LitRows;
 use super::planes::{HalfPlanes, Planes};
 use super::reflect::RECEIVING;
 use crate::flattened::Side;
@@ -36,12 +37,14 @@ impl<L: Fn(usize) -> bool> Focus<L> {
     }
 }
 
-/// Sums over replicates.
+/// Sums over replicates, as planes keep light.
 pub(super) struct Totals {
     /// The swept sides, the stored ones first.
     sides: Vec<Side>,
     stored: usize,
+    /// Nodes, and numbers of a plane.
     nodes: usize,
+    places: usize,
     /// Sum of the direct irradiance of all swept sides over the replicates so far; gone once it is that of all.
     pub(super) lighting: Vec<Planes>,
     /// Replicates whose direct light is known.
@@ -60,10 +63,11 @@ pub(super) struct Totals {
 }
 
 impl Totals {
-    pub(super) fn new(sides: &[Side], stored: usize, n: usize, replicates: usize) -> Self {
-        let spread = if replicates > 1 { vec![vec![bf16::ZERO; n]; stored] } else { Vec::new() };
+    /// Of so many nodes with so many places in planes.
+    pub(super) fn new(sides: &[Side], stored: usize, [nodes, places]: [usize; 2], replicates: usize) -> Self {
+        let spread = if replicates > 1 { vec![vec![bf16::ZERO; places]; stored] } else { Vec::new() };
         let (lighting, direct, light, parts) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-        Self { sides: sides.to_vec(), stored, nodes: n, lighting, lit: 0, direct, light, spread, parts, count: 0 }
+        Self { sides: sides.to_vec(), stored, nodes, places, lighting, lit: 0, direct, light, spread, parts, count: 0 }
     }
 
     pub(super) fn stored(&self) -> usize {
@@ -74,17 +78,18 @@ impl Totals {
         &self.sides
     }
 
-    pub(super) fn nodes(&self) -> usize {
-        self.nodes
+    /// Nodes, and numbers of a plane.
+    pub(super) fn size(&self) -> [usize; 2] {
+        [self.nodes, self.places]
     }
 
     /// Takes the direct irradiance of a replicate. Returns the planes it does not keep.
-    pub(super) fn add_direct(&mut self, new: Vec<Planes>, scene: &Scene) -> Vec<Planes> {
+    pub(super) fn add_direct(&mut self, new: Vec<Planes>, scene: &Scene, rows: &LitRows) -> Vec<Planes> {
         self.lit += 1;
         let before = 1.0 / (self.lit - 1) as f32;
         let lighting = std::mem::take(&mut self.lighting);
         let mean = |s: usize, i: usize| [0, 1, 2].map(|c| before * lighting[s][c][i]);
-        self.deviate(scene, &new, self.lit, mean, None::<&Focus<fn(usize) -> bool>>);
+        self.deviate((scene, rows), &new, self.lit, mean, None::<&Focus<fn(usize) -> bool>>);
         self.lighting = lighting;
         if self.lighting.is_empty() {
             self.lighting = new;
@@ -104,7 +109,12 @@ impl Totals {
     }
 
     /// Takes the indirect irradiance of a replicate, or nothing if there is none.
-    pub(super) fn add<L: Fn(usize) -> bool + Sync>(&mut self, new: &[Planes], scene: &Scene, focus: &Focus<L>) {
+    pub(super) fn add<L: Fn(usize) -> bool + Sync>(
+        &mut self,
+        new: &[Planes],
+        (scene, rows): (&Scene, &LitRows),
+        focus: &Focus<L>,
+    ) {
         self.count += 1;
         if new.is_empty() {
             return;
@@ -112,17 +122,17 @@ impl Totals {
         let before = 1.0 / (self.count - 1) as f32;
         let light = std::mem::take(&mut self.light);
         let mean = |s: usize, i: usize| light[s].all(i).map(|x| before * x);
-        self.deviate(scene, new, self.count, mean, Some(focus));
+        self.deviate((scene, rows), new, self.count, mean, Some(focus));
         let mut old = light.into_iter();
         self.light = new.iter().map(|new| HalfPlanes::new(new, 1.0, old.next())).collect();
     }
 
-    /// Adds the deviations of the light of the replicate that is the `count`th of its kind, where `mean` (side, node)
+    /// Adds the deviations of the light of the replicate that is the `count`th of its kind, where `mean` (side, place)
     /// is that of those before; in `focus`, if it will be.
     #[allow(clippy::cast_possible_truncation, reason = "albedo")]
     fn deviate<L: Fn(usize) -> bool + Sync>(
         &mut self,
-        scene: &Scene,
+        (scene, rows): (&Scene, &LitRows),
         new: &[Planes],
         count: usize,
         mean: impl Fn(usize, usize) -> [f32; 3] + Sync,
@@ -136,17 +146,19 @@ impl Totals {
         };
         let (albedo, h) = (&scene.surface.albedo, scene.field.samples());
         let same = (albedo.stops().len() == 1).then(|| luminance(albedo.at(0.0)));
-        let luminance = |i: usize, light: [f32; 3]| -> f32 {
-            let luminance = same.unwrap_or_else(|| luminance(albedo.at(f64::from(h[i]))));
+        let luminance = |node: usize, light: [f32; 3]| -> f32 {
+            let luminance = same.unwrap_or_else(|| luminance(albedo.at(f64::from(h[node]))));
             (0..3).map(|c| luminance[c] * light[c]).sum()
         };
-        let all = |planes: &Planes, i: usize| [0, 1, 2].map(|c| planes[c][i]);
-        let at = |planes: &Planes, i: usize| match focus.filter(|focus| (focus.lit)(i)) {
-            Some(focus) => luminance(i, focus.focused(i, |i| all(planes, i))),
-            None => luminance(i, all(planes, i)),
+        // Those that are lit have a place.
+        let place = |node: usize| rows.place_of(node).unwrap_or(0);
+        let all = |planes: &Planes, place: usize| [0, 1, 2].map(|c| planes[c][place]);
+        let at = |planes: &Planes, node: usize| match focus.filter(|focus| (focus.lit)(node)) {
+            Some(focus) => luminance(node, focus.focused(node, |node| all(planes, place(node)))),
+            None => rows.place_of(node).map_or(0.0, |place| luminance(node, all(planes, place))),
         };
         let nodes = (0..self.nodes).step_by(stride(self.nodes));
-        let part = new[..self.stored].iter().flat_map(|planes| nodes.clone().map(|i| at(planes, i)));
+        let part = new[..self.stored].iter().flat_map(|planes| nodes.clone().map(|node| at(planes, node)));
         match self.parts.get_mut(count - 1) {
             // Its direct light is there.
             Some(sum) => sum.iter_mut().zip(part).for_each(|(sum, x)| *sum += x),
@@ -158,22 +170,34 @@ impl Totals {
         // (x − mean of those before)² (n − 1)/n.
         let share = (count - 1) as f32 / count as f32;
         for (s, (spread, new)) in self.spread.iter_mut().zip(new).enumerate() {
-            let deviation = |i: usize| {
-                let (new, mean) = (all(new, i), mean(s, i));
-                luminance(i, [0, 1, 2].map(|c| new[c] - mean[c]))
+            let deviation = |node: usize, place: usize| {
+                let (new, mean) = (all(new, place), mean(s, place));
+                luminance(node, [0, 1, 2].map(|c| new[c] - mean[c]))
             };
             // Known beforehand where a node's is put in focus by those beside it.
-            let nodes = || (0..self.nodes).into_par_iter().with_min_len(1 << 12);
-            let known = focus.map(|focus| (focus, nodes().map(deviation).collect::<Vec<f32>>()));
-            spread.par_iter_mut().enumerate().with_min_len(1 << 12).for_each(|(i, root)| {
-                let d = match &known {
-                    Some((focus, known)) if (focus.lit)(i) => focus.focused(i, |i| [known[i]])[0],
-                    Some((_, known)) => known[i],
-                    None => deviation(i),
-                };
-                let before = root.to_f32();
-                if d != 0.0 {
-                    *root = bf16::from_f32((before * before + share * d * d).sqrt());
+            let known = focus.map(|focus| {
+                let mut known = vec![0f32; rows.len()];
+                rows.for_each_run(&mut known, |first, run| {
+                    let start = place(first);
+                    run.iter_mut().enumerate().for_each(|(i, d)| *d = deviation(first + i, start + i));
+                });
+                (focus, known)
+            });
+            rows.for_each_run(&mut spread[..rows.len()], |first, run| {
+                let start = place(first);
+                for (i, root) in run.iter_mut().enumerate() {
+                    let node = first + i;
+                    let d = match &known {
+                        Some((focus, known)) if (focus.lit)(node) => {
+                            focus.focused(node, |node| [known[place(node)]])[0]
+                        }
+                        Some((_, known)) => known[start + i],
+                        None => deviation(node, start + i),
+                    };
+                    let before = root.to_f32();
+                    if d != 0.0 {
+                        *root = bf16::from_f32((before * before + share * d * d).sqrt());
+                    }
                 }
             });
         }
@@ -184,6 +208,7 @@ impl Totals {
     #[allow(clippy::cast_possible_truncation, reason = "a factor of at most 1")]
     pub(super) fn finish<L: Fn(usize) -> bool + Sync>(
         self,
+        rows: &LitRows,
         focus: &Focus<L>,
         done: usize,
         apart: bool,
@@ -192,24 +217,46 @@ impl Totals {
         let together = together(&self.parts[..done.min(self.parts.len())]) as f32;
         let mut indirect = self.light.into_iter();
         let mut spread = self.spread.into_iter().filter(|_| done > 1);
-        let nodes = || (0..self.nodes).into_par_iter().with_min_len(1 << 12).map(|i| (i, (focus.lit)(i)));
         let side = |(&side, direct): (&Side, HalfPlanes)| {
             let light = indirect.next();
-            let node = |i: usize| -> [f32; 3] {
-                let gathered = light.as_ref().map_or([0.0; 3], |light| focus.focused(i, |i| light.all(i)));
-                std::array::from_fn(|c| direct.at(c, i) + scale * gathered[c].max(0.0))
-            };
-            let irradiance = nodes().map(|(i, lit)| if lit { node(i) } else { [0.0; 3] }).collect();
+            let own = |place: usize| [0, 1, 2].map(|c| direct.at(c, place));
+            let irradiance = all_nodes(self.nodes, rows, focus, |node, place| {
+                let gathered = |light: &HalfPlanes| {
+                    focus.focused(node, |node| light.all(rows.place_of(node).expect("those that are lit have a place")))
+                };
+                let (direct, gathered) = (own(place), light.as_ref().map_or([0.0; 3], gathered));
+                std::array::from_fn(|c| direct[c] + scale * gathered[c].max(0.0))
+            });
             let factor = (together * scale / (done.max(2) - 1) as f32).sqrt();
             let error = |roots: Vec<bf16>| -> Vec<f32> {
-                nodes().map(|(i, lit)| if lit { factor * roots[i].to_f32() } else { 0.0 }).collect()
+                all_nodes(self.nodes, rows, focus, |_, place| factor * roots[place].to_f32())
             };
-            let own = |(i, lit)| if lit { [0, 1, 2].map(|c| direct.at(c, i)) } else { [0.0; 3] };
-            let direct = if apart { nodes().map(own).collect() } else { Vec::new() };
+            let direct = if apart { all_nodes(self.nodes, rows, focus, |_, place| own(place)) } else { Vec::new() };
             SweptSide { side, irradiance, direct, std_error: spread.next().map(error).unwrap_or_default() }
         };
         self.sides.iter().take(self.stored).zip(self.direct).map(side).collect()
     }
+}
+
+/// What `value` (node, place in planes) says of the nodes that are lit, in an array of all `nodes`; 0 at the others.
+fn all_nodes<T: Clone + Default + Send, L: Fn(usize) -> bool + Sync>(
+    nodes: usize,
+    rows: &LitRows,
+    focus: &Focus<L>,
+    value: impl Fn(usize, usize) -> T + Sync,
+) -> Vec<T> {
+    let mut all = vec![T::default(); nodes];
+    let nx = focus.dims[0];
+    all.par_chunks_exact_mut(nx).enumerate().with_min_len(64).for_each(|(row, all)| {
+        let (first, run) = rows.run(row);
+        for ((i, to), place) in all.iter_mut().enumerate().skip(first).zip(run) {
+            let node = row * nx + i;
+            if (focus.lit)(node) {
+                *to = value(node, place);
+            }
+        }
+    });
+    all
 }
 
 /// The variance of the mean of replicates over that of as many independent ones; 1 unless they are 4, 8, 16 …
