@@ -189,7 +189,8 @@ fn main() {
         (
             "cache",
             Box::new(|| {
-                let mut cache = RadianceCache::from_parts([None, None], scene.lattice().dims(), Vec::new());
+                let nowhere = NodeSet::all(scene.lattice().len());
+                let mut cache = RadianceCache::from_parts([None, None], nowhere, scene.lattice().dims(), Vec::new());
                 filled(&mut cache);
             }),
         ),

@@ -202,11 +202,8 @@ impl RadianceCache {
         let rays = AtomicU64::new(0);
         let (points, dims) = (scene.lattice().len(), scene.lattice().dims());
         let [looked_at, filled] = source.needed(&scene.field, &band);
-        // Of a whole sweep most nodes are filled as a rule; a band is to be small.
-        let stored = match whole(&band) && 2 * filled.len() > points {
-            true => NodeSet::all(points),
-            false => filled.clone(),
-        };
+        // A band is to be small.
+        let stored = if whole(&band) { room(points, &filled) } else { filled.clone() };
         let mut old = self.nodes[scene.number()].take();
         if let Some(old) = &mut old {
             old.sides = Nodes::default();
@@ -235,13 +232,17 @@ impl RadianceCache {
         self.nodes.iter_mut().for_each(|n| *n = None);
     }
 
-    /// A cache of light known already: per side (lower, higher) irradiance / π at the nodes of the scene's lattice, of
-    /// `dims` nodes along x, y and z (or it panics), NaN where unknown, and the flats' radiance.
-    pub fn from_parts(nodes: Nodes, dims: [usize; 3], flats: Vec<Option<FlatTexture>>) -> Self {
-        let all = NodeSet::all(dims.iter().product());
+    /// Which of `points` nodes to store if those are known that `known` picks: these, or all.
+    pub fn room(points: usize, known: impl Fn(usize) -> bool + Sync) -> NodeSet {
+        room(points, &NodeSet::new(points, known))
+    }
+
+    /// A cache of light known already: per side (lower, higher) irradiance / π at those nodes of the scene's lattice,
+    /// of `dims` nodes along x, y and z, that are `stored` (or it panics), NaN where unknown, and the flats' radiance.
+    pub fn from_parts(nodes: Nodes, stored: NodeSet, dims: [usize; 3], flats: Vec<Option<FlatTexture>>) -> Self {
         let known = nodes.iter().any(Option::is_some);
-        let sides = nodes.map(|side| Some(sharpen(&all, &side?, &all, dims, SHARPENING)));
-        let nodes = known.then(|| FieldNodes { stored: all, filled: Nodes::default(), sides });
+        let sides = nodes.map(|side| Some(sharpen(&stored, &side?, &stored, dims, SHARPENING)));
+        let nodes = known.then(|| FieldNodes { stored, filled: Nodes::default(), sides });
         let within = vec![None; flats.len()];
         Self { nodes: vec![nodes], flats, within, shown: None, rays: 0 }
     }
@@ -478,6 +479,11 @@ impl<T: Tracer> Fill<'_, T> {
     }
 }
 
+/// The nodes to store if `known` ones are: of a whole sweep most are known as a rule, and all are looked up faster.
+fn room(points: usize, known: &NodeSet) -> NodeSet {
+    if 2 * known.len() > points { NodeSet::all(points) } else { known.clone() }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -546,7 +552,8 @@ mod tests {
         let mut nodes = vec![[f32::NAN; 3]; lattice.len()];
         nodes[lattice.offset(9, 1, 1)] = [1.0; 3];
         nodes[lattice.offset(9, 2, 1)] = [3.0; 3];
-        let cache = RadianceCache::from_parts([Some(nodes), None], scene.lattice().dims(), Vec::new());
+        let stored = NodeSet::all(nodes.len());
+        let cache = RadianceCache::from_parts([Some(nodes), None], stored, scene.lattice().dims(), Vec::new());
         let look = |x: f64| {
             let mut misses = 0;
             let at = DVec3::new(x, 0.5, 0.5);

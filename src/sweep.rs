@@ -57,6 +57,7 @@ use flats::Flats;
 pub(crate) use flats::texels;
 use glam::DVec3;
 use grid::Geometry;
+use lit_rows::LitRows;
 use planes::Spare;
 use points::Points;
 use rayon::prelude::*;
@@ -209,6 +210,13 @@ pub fn lit_within_solids(scene: &Scene) -> bool {
     let inside = ends::inside(scene);
     let lamp = scene.luminaires().iter().any(|&number| inside[number as usize]);
     lamp || scene.surface.emission != DVec3::ZERO || scene.field.has_gaps()
+}
+
+/// Numbers of a plane of light, on a lattice of `dims` whose lit nodes are these.
+pub(crate) fn places(dims: [usize; 3], lit: &(impl Fn(usize) -> bool + Sync)) -> usize {
+    let [nx, ny, nz] = dims;
+    let lit: Vec<bool> = (0..nx * ny * nz).into_par_iter().with_min_len(1 << 14).map(lit).collect();
+    grid::lit_rows(dims, &lit).1.iter().map(LitRows::len).max().unwrap_or(0)
 }
 
 /// Whether 31 bits number all points, and those that the sixteen lines of a pack would meet beyond the last.

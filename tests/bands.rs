@@ -126,12 +126,14 @@ fn memory_that_is_allowed_decides_the_bands() {
     let all = ["bake", "b.vti", "-o", "o.vti", "--isovalues", "-20", "120", "--smoothing", "false"];
     let few = ["--wall-resolution", "8", "--photons", "2000", "--gather", "2", "--shadow-rays", "1"];
     let bake = |more: &[&str]| run(&[&all[..], &few, more].concat());
+    let about = |text: &str| -> f64 {
+        text.split("about ").nth(1).unwrap().split_whitespace().next().unwrap().parse().unwrap()
+    };
     // What the estimate says of one band and of many.
     let estimate = |bands: &str| {
         let (code, text) = bake(&["--dry-run", "--bands", bands]);
         assert_eq!(code, Some(0), "{text}");
-        let about = text.split("about ").nth(1).unwrap().split_whitespace().next().unwrap();
-        about.parse::<f64>().unwrap()
+        about(&text)
     };
     let (one, many) = (estimate("1"), estimate("64"));
     assert!(many < 0.9 * one, "{one} {many}");
@@ -161,20 +163,23 @@ fn memory_that_is_allowed_decides_the_bands() {
     let (code, text) = bake(&["--engine", "sweep", "--bands", "2"]);
     assert!(code == Some(2) && text.contains("bands") && text.lines().count() == 1, "{text}");
 
-    // Sweeps know no bands: too large for the memory, they leave the work to photons, unless they were asked for.
-    let dry = |more: &[&str]| {
-        run(&[&["bake", "b.vti", "-o", "o.vti", "--isovalues", "3.6", "95", "--preset", "preview", "--dry-run"], more]
-            .concat())
+    // Sweeps know no bands: too large for the memory, they leave the work to photons, unless they were asked for. Of a
+    // smaller volume, one side of which is wanted, they need less than photons in any number of bands.
+    assert_eq!(run(&["generate", "bumps", "--size", "200", "-o", "l.vti", "-q"]).0, Some(0));
+    let dry = |volume: &str, more: &[&str]| {
+        let bake = ["bake", volume, "-o", "o.vti", "--isovalues", "3.6", "95", "--preset", "preview", "--dry-run"];
+        run(&[&bake, more].concat())
     };
-    let needed = |more: &[&str]| {
-        let text = dry(more).1;
-        text.split("about ").nth(1).unwrap().split_whitespace().next().unwrap().parse::<f64>().unwrap()
-    };
-    let (sweep, photon) = (needed(&["--engine", "sweep"]), needed(&["--engine", "photon", "--bands", "64"]));
+    let both = |more: &[&str]| dry("l.vti", &[&["--sides", "both"], more].concat());
+    let engines = [&["--engine", "sweep"][..], &["--engine", "photon", "--bands", "64"]];
+    let [sweep, photon] = engines.map(|engine| about(&both(engine).1));
+    assert!(photon < sweep, "{sweep} {photon}");
     let limit = format!("{}", ((0.1 * sweep + 0.9 * photon) * 1e6) as u64);
-    let (code, text) = dry(&["--max-memory", &limit]);
+    let (code, text) = both(&["--max-memory", &limit]);
     assert!(code == Some(0) && text.contains("engine  photon") && text.contains("of isovalues"), "{text}");
-    let (code, text) = dry(&["--max-memory", "64G"]);
+    let (code, text) = both(&["--max-memory", "64G"]);
     assert!(code == Some(0) && text.contains("engine  sweep"), "{text}");
-    assert_eq!(dry(&["--max-memory", &limit, "--engine", "sweep"]).0, Some(2));
+    assert_eq!(both(&["--max-memory", &limit, "--engine", "sweep"]).0, Some(2));
+    let [sweep, photon] = engines.map(|engine| about(&dry("b.vti", engine).1));
+    assert!(sweep < photon, "{sweep} {photon}");
 }

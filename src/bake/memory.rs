@@ -56,20 +56,25 @@ const GRID: u64 = 17;
 const SPLIT: u64 = 24 + 12;
 const CACHED: u64 = 12;
 
-/// Bytes of the sweep engine per grid point (h turned over, normals, one plane of a pass turned over, bits per block),
-/// per point and swept side (direct light, what lines read, what a pass gathers; and sums over replicates), and per
-/// point and stored side (their spread, while it is written). Direct light takes less: 44 and what its lines see.
-const SWEPT: u64 = 13;
-const SWEPT_SIDE: u64 = 26;
+/// Bytes of the sweep engine per grid point (h turned over, bits per block), and per point and swept side (what lines
+/// read; the same of a pass before while light settles).
+const SWEPT: u64 = 5;
+const SWEPT_SIDE: u64 = 8;
+const SETTLING_SIDE: u64 = 8;
+/// Bytes per place of its planes (normals, one plane of a pass turned over), per place and swept side (direct light,
+/// what a pass gathers; and sums over replicates), and per place and stored side (their spread, while it is written).
+/// Direct light takes less: planes of sums, and what its lines see.
+const PLACED: u64 = 8;
+const PLACED_SIDE: u64 = 18;
 const SUMMED_SIDE: u64 = 6;
 const SPREAD_SIDE: u64 = 3;
-/// Per point and swept side while light settles, before there are such sums: what lines read a pass before, here and in
-/// a checkpoint.
-const SETTLING_SIDE: u64 = 14;
+/// Per place and swept side while light settles, before there are such sums: what lines read a pass before, in a
+/// checkpoint.
+const BEFORE_SIDE: u64 = 6;
 /// The same where the level of light may be corrected: what few directions lack, here and in a checkpoint.
 const LEVEL_SIDE: u64 = 12;
 
-/// Bytes per point and side that its checkpoint holds while a replicate is under way, besides the sums; and per stored
+/// Bytes per place and side that its checkpoint holds while a replicate is under way, besides the sums; and per stored
 /// side, when all are done.
 const KEPT_SIDE: u64 = 12;
 const DONE_SIDE: u64 = 15;
@@ -77,7 +82,8 @@ const DONE_SIDE: u64 = 15;
 /// Bytes per fitted point: seven vectors of conjugate gradients.
 const FITTED: u64 = 84;
 
-/// Bytes that writing holds at most: two batches of packed blocks, and raw ones.
+/// Bytes that writing holds at most: two batches of packed blocks, and raw ones. Of points without light little is left
+/// when they are packed.
 const WRITER: u64 = 40 << 20;
 
 /// Estimated peak memory of a bake, stage by stage, everything that lives then included.
@@ -196,8 +202,6 @@ struct Parts {
     /// Counts: nodes of the volumes, of them those of the cache; points of the grids.
     voxels: u64,
     points: u64,
-    /// Count: points of the grids of all stored sides.
-    side_points: u64,
     /// These grids, and what is kept of gathers to be smoothed.
     grids: u64,
     halves: u64,
@@ -213,8 +217,9 @@ struct Parts {
     /// Scattered samples and their interpolation.
     scattered: u64,
     scattering: u64,
-    /// The sweep engine's own.
+    /// The sweep engine's own, and what is left of it while rays are cast.
     swept: u64,
+    gathered: u64,
     export: u64,
 }
 
@@ -225,6 +230,7 @@ impl Parts {
         // Of all fields; sides stored of any.
         let (mut voxels, mut points, mut filled, mut samples, mut side_points, mut stored) = (0, 0, 0, 0, 0, 0);
         let (mut halves, mut slices) = (0, 0);
+        let (mut shown, mut places, mut known) = (0, 0, 0);
         let smoothing = settings.smooths() && settings.strategy == StrategyName::Nodes;
         let mut all_masks = Vec::new();
         let members = scene.members();
@@ -241,6 +247,12 @@ impl Parts {
             };
             let own = count(&lit);
             let own_filled = count(&|o| masks[o] != Mask::Empty) - own;
+            if settings.engine == Engine::Sweep {
+                let share = sweep::places(member.field.lattice().dims(), &lit) as f64 / own_voxels as f64;
+                places += (share * own_points as f64) as u64;
+                known += if 2 * (own + own_filled) > own_points { own_points } else { own + own_filled };
+            }
+            shown += own + own_filled;
             drop(lit);
             let sides = member.surface.stored_sides().len() as u64;
             let element = volume.samples().element_type().size() as u64;
@@ -270,10 +282,14 @@ impl Parts {
             Engine::Photon => flat::texels(scene, across, settings.wall_isovalues),
         } as u64;
         let sides = sweep::swept_sides(scene).len() as u64;
-        let settling = SETTLING_SIDE + if sweep::bright(scene) { LEVEL_SIDE } else { 0 };
-        let summed = 2 * stored * SPREAD_SIDE + sides * settling.max(2 * SUMMED_SIDE);
+        let settling = BEFORE_SIDE + if sweep::bright(scene) { LEVEL_SIDE } else { 0 };
+        let summed = PLACED + 2 * stored * SPREAD_SIDE + sides * (PLACED_SIDE + KEPT_SIDE);
+        let swept = points * SWEPT
+            + sides * points * SWEPT_SIDE
+            + places * summed
+            + sides * (points * SETTLING_SIDE + places * settling).max(places * 2 * SUMMED_SIDE);
         let reports = sweep::reports(scene, across, settings.wall_isovalues) as u64;
-        let swept = points * (SWEPT + sides * (SWEPT_SIDE + KEPT_SIDE) + summed) + reports;
+        let swept = swept + reports;
         let ([landings, lower, higher], gather) = match settings.engine {
             Engine::Photon => (landings(scene, settings, device)?, settings.gather_rays > 0),
             Engine::Sweep => ([0.0; 3], false),
@@ -302,9 +318,9 @@ impl Parts {
             levels,
             voxels,
             points,
-            side_points,
             grids: side_points * (GRID + if settings.split { SPLIT } else { 0 }),
             wishes: if settings.split { 3 * WISH } else { WISH },
+            gathered: stored * (known * CACHED + places * DONE_SIDE) + known * CACHED,
             halves,
             slices,
             beside: if nodes { STAND_INS as u64 * filled } else { 0 },
@@ -313,7 +329,7 @@ impl Parts {
             scattered,
             scattering,
             swept,
-            export: WRITER.min(points * (5 + 29 * stored) * 2),
+            export: WRITER.min((points + shown) * (5 + 29 * stored)),
         })
     }
 
@@ -355,13 +371,7 @@ impl Parts {
             Engine::Sweep => vec![
                 ("sweep", base + self.swept + flats * 4),
                 // What rays gather, which points are lit, and the sweep's light that waits to be written.
-                (
-                    "samples",
-                    light
-                        + self.side_points * (CACHED + DONE_SIDE)
-                        + self.points
-                        + (beside * SAMPLE + fitting).max(self.points * CACHED),
-                ),
+                ("samples", light + self.points + self.gathered + beside * SAMPLE + fitting),
             ],
         };
         let export = ("export", base + grids + flats + self.export);

@@ -14,6 +14,7 @@ use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, local_position};
 use crate::neighbourhood::neighbourhood;
+use crate::node_set::NodeSet;
 use crate::polygon::Polygon;
 use crate::progress::{Clock, Progress};
 use crate::radiance::{Indirect, Sampler, sample_places};
@@ -75,8 +76,10 @@ pub(super) fn light(
     let contacts = Contacts::new(scene, scene.lattice(), |o| masks[o] == Mask::Valid && own[o]);
     // What the sweep knows is what rays from these points gather.
     let gathered = |side| swept.iter().find(|s| s.side == side && beside.len() + near.len() + contacts.len() > 0);
-    let nodes = [Side::Lower, Side::Higher].map(|side| Some(widened(lattice, masks, &gathered(side)?.irradiance)));
-    let cache = RadianceCache::from_parts(nodes, lattice.dims(), flats);
+    let stored = RadianceCache::room(lattice.len(), |o| own[o] || masks[o] == Mask::Filled);
+    let nodes = [Side::Lower, Side::Higher]
+        .map(|side| Some(widened(lattice, &stored, (&own, masks), &gathered(side)?.irradiance)));
+    let cache = RadianceCache::from_parts(nodes, stored, lattice.dims(), flats);
     let mut sides = Vec::new();
     for mut s in swept {
         let stage = progress.stage("samples", (beside.len() + near.len() + contacts.len()) as u64);
@@ -98,8 +101,7 @@ pub(super) fn light(
         let wedge = Wedge::new(&tracer, &cache, settings);
         lit.count(contacts.solve(s.side, &wedge, (&mut s.irradiance, &mut s.std_error), &|n| stage.tick(n)));
         stage.end()?;
-        let mask = |o: usize| if own[o] { masks[o] } else { Mask::Empty };
-        let mut grid = swept_grid(mask, outgoing(scene, s.irradiance), s.std_error);
+        let mut grid = swept_grid((&own, masks), outgoing(scene, &own, s.irradiance), s.std_error);
         for (&o, sample) in near.iter().zip(&sampled.samples) {
             if let Some(sample) = sample {
                 grid.radiance[o] = sample.radiance.to_array();
@@ -118,10 +120,11 @@ pub(super) fn light(
     Ok(lit)
 }
 
-/// Outgoing radiance at nodes of which `white` tells what a white surface would reflect.
-fn outgoing(scene: &Scene, mut white: Vec<[f32; 3]>) -> Vec<[f32; 3]> {
+/// Outgoing radiance at lit nodes, of which `white` tells what a white surface would reflect.
+fn outgoing(scene: &Scene, lit: &[bool], mut white: Vec<[f32; 3]>) -> Vec<[f32; 3]> {
     let Surface { albedo, emission, .. } = &scene.surface;
-    white.par_iter_mut().zip(scene.field.samples()).with_min_len(1 << 14).for_each(|(x, &h)| {
+    let nodes = white.par_iter_mut().zip(scene.field.samples()).zip(lit).with_min_len(1 << 14);
+    nodes.filter(|(_, lit)| **lit).for_each(|((x, &h), _)| {
         let radiance = albedo.at(f64::from(h)) * DVec3::from_array(x.map(f64::from)) + emission;
         *x = radiance.as_vec3().to_array();
     });
@@ -142,42 +145,48 @@ fn beside_luminaires(scene: &Scene, masks: &[Mask]) -> Vec<usize> {
     (0..masks.len()).into_par_iter().with_min_len(1 << 12).filter(near).collect()
 }
 
-/// Turns irradiance into what a white surface would reflect at lit nodes, NaN elsewhere.
+/// Turns irradiance into what a white surface would reflect at lit nodes.
 fn whiten(lit: &[bool], irradiance: &mut [[f32; 3]]) {
     let white = |e: [f32; 3]| reflected(DVec3::ONE, DVec3::from_array(e.map(f64::from))).as_vec3().to_array();
     let nodes = irradiance.par_iter_mut().zip(lit).with_min_len(1 << 14);
-    nodes.for_each(|(e, &lit)| *e = if lit { white(*e) } else { [f32::NAN; 3] });
+    nodes.filter(|(_, lit)| **lit).for_each(|(e, _)| *e = white(*e));
 }
 
-/// Unknown nodes beside known ones become their mean, so that lookups in cells at the sweep's ends find something.
-fn widened(lattice: &Lattice, masks: &[Mask], nodes: &[[f32; 3]]) -> Vec<[f32; 3]> {
-    (0..nodes.len())
-        .into_par_iter()
-        .map(|o| {
-            if masks[o] != Mask::Filled || !nodes[o][0].is_nan() {
-                return nodes[o];
-            }
-            let (mut sum, mut n) = (Vec3::ZERO, 0.0);
-            for run in neighbourhood(lattice.dims(), o) {
-                for v in nodes[run].iter().filter(|v| !v[0].is_nan()) {
-                    (sum, n) = (sum + Vec3::from_array(*v), n + 1.0);
-                }
-            }
-            if n > 0.0 { (sum / n).to_array() } else { [f32::NAN; 3] }
-        })
-        .collect()
+/// What a white surface would reflect at the nodes of `stored`: that of lit nodes; the mean of those around at others
+/// that are filled, so that lookups in cells at the sweep's ends find something; NaN if there is none, and elsewhere.
+fn widened(lattice: &Lattice, stored: &NodeSet, (lit, masks): (&[bool], &[Mask]), white: &[[f32; 3]]) -> Vec<[f32; 3]> {
+    /// Nodes that a thread takes at a time.
+    const RUN: usize = 1 << 12;
+    let value = |o: usize| {
+        if lit[o] || masks[o] != Mask::Filled {
+            return if lit[o] { white[o] } else { [f32::NAN; 3] };
+        }
+        let (mut sum, mut n) = (Vec3::ZERO, 0.0);
+        for o in neighbourhood(lattice.dims(), o).flatten().filter(|&o| lit[o]) {
+            (sum, n) = (sum + Vec3::from_array(white[o]), n + 1.0);
+        }
+        if n > 0.0 { (sum / n).to_array() } else { [f32::NAN; 3] }
+    };
+    let mut values = vec![[f32::NAN; 3]; stored.len()];
+    stored.split(&mut values, RUN).into_par_iter().enumerate().for_each(|(run, values)| {
+        let nodes = stored.members(run * RUN..lattice.len().min((run + 1) * RUN));
+        values.iter_mut().zip(nodes).for_each(|(v, o)| *v = value(o));
+    });
+    values
 }
 
-/// A grid of the points that are not empty by `own`.
+/// A grid of the points that are lit and that `masks` do not call empty; the others are dark as they come.
 fn swept_grid(
-    own: impl Fn(usize) -> Mask + Sync,
+    (lit, masks): (&[bool], &[Mask]),
     mut radiance: Vec<[f32; 3]>,
     mut std_error: Vec<f32>,
 ) -> IlluminationGrid {
-    let mask: Vec<Mask> = (0..radiance.len()).into_par_iter().with_min_len(1 << 14).map(&own).collect();
+    let own = |(&lit, &mask): (&bool, &Mask)| if lit { mask } else { Mask::Empty };
+    let mask: Vec<Mask> = lit.par_iter().zip(masks).with_min_len(1 << 14).map(own).collect();
     // There is none of fewer than two replicates.
     std_error.resize(mask.len(), 0.0);
-    let points = radiance.par_iter_mut().zip(&mut std_error).zip(&mask).with_min_len(1 << 14);
-    points.filter(|(_, m)| **m == Mask::Empty).for_each(|((r, e), _)| (*r, *e) = ([0.0; 3], 0.0));
+    let points = radiance.par_iter_mut().zip(&mut std_error).zip(lit.par_iter().zip(masks)).with_min_len(1 << 14);
+    let empty = points.filter(|(_, (lit, mask))| **lit && **mask == Mask::Empty);
+    empty.for_each(|((r, e), _)| (*r, *e) = ([0.0; 3], 0.0));
     IlluminationGrid { radiance, std_error, mask, split: None }
 }

@@ -11,6 +11,7 @@ use crate::illumination_grid::GridSize;
 use crate::isovalue_axis::IsovalueAxis;
 use crate::mask::{Mask, masks};
 use crate::nearest::Neighbours;
+use crate::node_set::NodeSet;
 use crate::photon::{PhotonSettings, Photons, trace_photons};
 use crate::photon_map::PhotonMap;
 use crate::radiance::{Indirect, sample_radiance};
@@ -302,7 +303,8 @@ fn field_seconds(
     let nodes = if settings.gather_rays > 0 { sides * needed } else { 0.0 };
 
     let begun = Instant::now();
-    let empty = RadianceCache::from_parts([None, None], scene.lattice().dims(), vec![None; flat::count(scene)]);
+    let (nowhere, dims) = (NodeSet::new(0, |_| false), scene.lattice().dims());
+    let empty = RadianceCache::from_parts([None, None], nowhere, dims, vec![None; flat::count(scene)]);
     let indirect = match settings.gather_rays {
         0 => Indirect::Map(&map),
         rays => Indirect::Gather(&empty, rays),

@@ -26,6 +26,8 @@ pub(super) struct Geometry<'a> {
     /// Of lit nodes, as planes of light keep them; the others have none.
     pub normals: Vec<u32>,
     rings: Vec<Vec<u32>>,
+    /// Whether a row along x holds nodes of `rings`.
+    ringed: Vec<bool>,
     /// Per memory order, the lit nodes beside samples that are not finite; `None` if all are.
     rims: Option<[Rims; 2]>,
     /// Per memory order, the blocks of lit nodes.
@@ -187,13 +189,11 @@ impl<'a> Geometry<'a> {
         let near: Vec<u32> = ring(dims, &lit).into_par_iter().with_min_len(256).filter(near).collect();
         near.into_iter().for_each(|at| lit[at as usize] = true);
         let rings = rings(dims, &lit);
+        let mut ringed = vec![false; ny * nz];
+        rings.iter().flatten().for_each(|&at| ringed[at as usize / nx] = true);
         let rims = field.has_gaps().then(|| Rims::both(dims, h, |at| lit[at]));
         let h_transposed = transposed(h, dims);
-        // Whole vectors are accumulated; packs of lines start anywhere.
-        let whole = |n: usize| (n.div_ceil(64).next_multiple_of(16), 0);
-        let lit_blocks =
-            [Blocks::along(nx, ny * nz, whole(nx), |at| lit[at]), Blocks::across(dims, whole(ny), |at| lit[at])];
-        let lit_rows = [LitRows::new(nx, &lit_blocks[0]), LitRows::new(ny, &lit_blocks[1])];
+        let (lit_blocks, lit_rows) = lit_rows(dims, &lit);
         // Nodes that are not lit take no light whatever lines bring.
         let mut kept = vec![0; lit_rows[0].len()];
         lit_rows[0].for_each_run(&mut kept, |first, run| {
@@ -209,7 +209,7 @@ impl<'a> Geometry<'a> {
                 Blocks::across(dims, fine(ny), reaches).joined(nz),
             ]
         });
-        Self { dims, h, h_transposed, normals: kept, rings, rims, lit_blocks, lit_rows, awake }
+        Self { dims, h, h_transposed, normals: kept, rings, ringed, rims, lit_blocks, lit_rows, awake }
     }
 
     /// Whether a node is lit.
@@ -221,6 +221,11 @@ impl<'a> Geometry<'a> {
     #[inline(always)]
     fn packed_normal(&self, at: usize) -> u32 {
         self.lit_rows[0].place_of(at).map_or(0, |place| self.normals[place])
+    }
+
+    /// Whether nodes of a row along x may hold what is reflected: lit ones, or some that [`Self::fill`] fills.
+    pub(super) fn shows(&self, row: usize) -> bool {
+        self.ringed[row] || !self.lit_rows[0].run(row).1.is_empty()
     }
 
     /// Numbers of a plane of light, in either memory order.
@@ -385,6 +390,16 @@ impl<'a> Geometry<'a> {
             ring.iter().for_each(|&at| known[at as usize] = true);
         }
     }
+}
+
+/// Per memory order, the blocks of lit nodes, and where planes keep their light.
+pub(super) fn lit_rows(dims: [usize; 3], lit: &[bool]) -> ([Blocks; 2], [LitRows; 2]) {
+    let [nx, ny, nz] = dims;
+    // Whole vectors are accumulated; packs of lines start anywhere.
+    let whole = |n: usize| (n.div_ceil(64).next_multiple_of(16), 0);
+    let blocks = [Blocks::along(nx, ny * nz, whole(nx), |at| lit[at]), Blocks::across(dims, whole(ny), |at| lit[at])];
+    let rows = [LitRows::new(nx, &blocks[0]), LitRows::new(ny, &blocks[1])];
+    (blocks, rows)
 }
 
 /// Nodes that are not known but share a cell with one that is.

@@ -117,11 +117,14 @@ impl<'a> Mirror<'a> {
         let mut memory = memory.b.into_iter();
         let mut sums = Sums::default();
         let b = (0..sides).map(|s| {
-            // New memory is black, and stays untouched where nothing is shown.
+            // Memory is black where nothing is ever shown, and stays untouched.
             let old = memory.next();
             let new = old.is_none();
             let mut b = old.unwrap_or_else(|| vec![[0; 4]; n]);
             let rows = b.par_chunks_mut(nx).enumerate().with_max_len(64).map_init(Rows::default, |rows, (row, b)| {
+                if !self.geometry.shows(row) {
+                    return Sums::default();
+                }
                 let (j, k) = (row % ny, row / ny);
                 let beside = [
                     Some(row),
