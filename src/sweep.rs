@@ -15,6 +15,7 @@
 mod accumulate;
 mod arrive;
 mod blockers;
+mod blocks;
 mod clearance;
 mod direct;
 mod directions;

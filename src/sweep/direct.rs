@@ -96,9 +96,9 @@ pub(super) fn direct(
                 let begin = DVec3::new(0.0, j as f64, k as f64);
                 let to = ((world - lattice.to_world(begin)) / unit).as_vec3().to_array();
                 geometry.lit_vectors(row, |a, b| {
-                    let [from, to_end] = [a, b].map(|i| i - first);
-                    let normals = &geometry.normals[run.start + from..run.start + to_end];
-                    isa.receive(&emitter, [a, j, k], to, normals, &mut sums[per * from..per * to_end]);
+                    let sums = &mut sums[per * (a - first)..per * (b - first)];
+                    let normals = &geometry.normals[run.clone()][a - first..b - first];
+                    isa.receive(&emitter, [a, j, k], to, normals, sums);
                 });
             });
         }

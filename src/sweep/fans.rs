@@ -1,9 +1,10 @@
 //! Fans of lines from a luminaire's point through every slice of the lattice: along each the running extrema of h tell
 //! which samples see the point on their own level set.
 
+use super::blocks::Blocks;
 use super::directions::Layout;
 use super::gaps::Hidden;
-use super::grid::{Blocks, Geometry};
+use super::grid::Geometry;
 use crate::flattened::Side;
 use crate::isa::Isa;
 use glam::DVec3;

@@ -1,7 +1,7 @@
 //! Where planes of light keep that of a row of nodes: the run that holds all lit ones, and nothing of what is dark
 //! before and behind it. Of many volumes a small part is lit.
 
-use super::grid::Blocks;
+use super::blocks::Blocks;
 use super::pack::LANES;
 use rayon::prelude::*;
 use std::ops::Range;
@@ -58,6 +58,12 @@ impl LitRows {
         self.place(node / self.nu, node % self.nu)
     }
 
+    /// The same of a lit one.
+    #[inline]
+    pub(super) fn place_of_lit(&self, node: usize) -> usize {
+        self.place_of(node).expect("the run of a row holds its lit nodes")
+    }
+
     /// What a plane with `per` numbers a node holds of every row.
     pub(super) fn split<'p, T>(&self, mut plane: &'p mut [T], per: usize) -> Vec<&'p mut [T]> {
         let length = |row: usize| per * (self.starts[row + 1] - self.starts[row]) as usize;
@@ -71,7 +77,7 @@ impl LitRows {
     }
 }
 
-/// x, y, z order to y, z, x, of the numbers that are not 0 and have a place in both: `to` is 0.
+/// Turns a plane in x, y, z order over to y, z, x, into one of zeros: numbers that are not 0 and have a place in both.
 pub(super) fn transpose<T: Copy + Default + PartialEq + Send + Sync>(
     [from_rows, to_rows]: [&LitRows; 2],
     [nx, ny, nz]: [usize; 3],
@@ -99,7 +105,7 @@ pub(super) fn transpose<T: Copy + Default + PartialEq + Send + Sync>(
     });
 }
 
-/// As [`transpose`], back again.
+/// Turns it back to x, y, z order, into a plane of zeros.
 pub(super) fn untranspose<T: Copy + Send + Sync>(
     [from_rows, to_rows]: [&LitRows; 2],
     [ny, nz]: [usize; 2],

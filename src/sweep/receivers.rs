@@ -357,7 +357,7 @@ mod tests {
                 let (side, g) = (usize::from(cos_x < 0.0), cos_x.abs() * cos_y / to.length_squared().powi(2));
                 (expected[side][0], expected[side][1]) = (0.5 + g * v[side], 0.5 + g);
             }
-            let place = geometry.lit_rows().place_of(at).unwrap();
+            let place = geometry.lit_rows().place_of_lit(at);
             for (sum, expected) in all[2 * place..][..2].as_flattened().iter().zip(expected.as_flattened()) {
                 assert!((sum - expected).abs() < 1e-4 * expected.abs().max(0.5), "{i} {j} {k}: {sum} {expected}");
             }

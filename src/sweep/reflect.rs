@@ -308,7 +308,7 @@ fn sharpen(light: &mut Cross, shown: &Cross, laplacian: &mut Vec<f32>, sharpenin
 mod tests {
     use super::*;
     use crate::rng::{Rng, Stage};
-    use crate::sweep::grid::Blocks;
+    use crate::sweep::blocks::Blocks;
     use crate::sweep::planes::HalfPlanes;
 
     /// Of a field whose second differences are known: read as lines do, for a node that takes four lines, it is itself

@@ -150,11 +150,9 @@ impl Totals {
             let luminance = same.unwrap_or_else(|| luminance(albedo.at(f64::from(h[node]))));
             (0..3).map(|c| luminance[c] * light[c]).sum()
         };
-        // Those that are lit have a place.
-        let place = |node: usize| rows.place_of(node).unwrap_or(0);
         let all = |planes: &Planes, place: usize| [0, 1, 2].map(|c| planes[c][place]);
         let at = |planes: &Planes, node: usize| match focus.filter(|focus| (focus.lit)(node)) {
-            Some(focus) => luminance(node, focus.focused(node, |node| all(planes, place(node)))),
+            Some(focus) => luminance(node, focus.focused(node, |node| all(planes, rows.place_of_lit(node)))),
             None => rows.place_of(node).map_or(0.0, |place| luminance(node, all(planes, place))),
         };
         let nodes = (0..self.nodes).step_by(stride(self.nodes));
@@ -178,18 +176,18 @@ impl Totals {
             let known = focus.map(|focus| {
                 let mut known = vec![0f32; rows.len()];
                 rows.for_each_run(&mut known, |first, run| {
-                    let start = place(first);
+                    let start = rows.place_of_lit(first);
                     run.iter_mut().enumerate().for_each(|(i, d)| *d = deviation(first + i, start + i));
                 });
                 (focus, known)
             });
             rows.for_each_run(&mut spread[..rows.len()], |first, run| {
-                let start = place(first);
+                let start = rows.place_of_lit(first);
                 for (i, root) in run.iter_mut().enumerate() {
                     let node = first + i;
                     let d = match &known {
                         Some((focus, known)) if (focus.lit)(node) => {
-                            focus.focused(node, |node| [known[place(node)]])[0]
+                            focus.focused(node, |node| [known[rows.place_of_lit(node)]])[0]
                         }
                         Some((_, known)) => known[start + i],
                         None => deviation(node, start + i),
@@ -221,9 +219,7 @@ impl Totals {
             let light = indirect.next();
             let own = |place: usize| [0, 1, 2].map(|c| direct.at(c, place));
             let irradiance = all_nodes(self.nodes, rows, focus, |node, place| {
-                let gathered = |light: &HalfPlanes| {
-                    focus.focused(node, |node| light.all(rows.place_of(node).expect("those that are lit have a place")))
-                };
+                let gathered = |light: &HalfPlanes| focus.focused(node, |node| light.all(rows.place_of_lit(node)));
                 let (direct, gathered) = (own(place), light.as_ref().map_or([0.0; 3], gathered));
                 std::array::from_fn(|c| direct[c] + scale * gathered[c].max(0.0))
             });
