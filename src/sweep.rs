@@ -214,10 +214,8 @@ pub fn lit_within_solids(scene: &Scene) -> bool {
 }
 
 /// Numbers of a plane of light, on a lattice of `dims` whose lit nodes are these.
-pub(crate) fn places(dims: [usize; 3], lit: &(impl Fn(usize) -> bool + Sync)) -> usize {
-    let [nx, ny, nz] = dims;
-    let lit: Vec<bool> = (0..nx * ny * nz).into_par_iter().with_min_len(1 << 14).map(lit).collect();
-    grid::lit_rows(dims, &lit).1.iter().map(LitRows::len).max().unwrap_or(0)
+pub(crate) fn places(dims: [usize; 3], lit: &[bool]) -> usize {
+    grid::lit_rows(dims, lit).1.iter().map(LitRows::len).max().unwrap_or(0)
 }
 
 /// Whether 31 bits number all points, and those that the sixteen lines of a pack would meet beyond the last.
@@ -380,8 +378,8 @@ impl Run<'_> {
             }
             // Of the first one what there is.
             if complete || number == 0 {
-                self.spare
-                    .keep(state.total.add_direct(direct, self.scene, self.geometry.lit_rows()).into_iter().flatten());
+                let rest = state.total.add_direct(direct, self.scene, self.geometry.lit_rows());
+                self.spare.keep(rest.into_iter().flatten());
             }
         }
         if first < replicates {

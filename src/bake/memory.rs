@@ -240,12 +240,13 @@ impl Parts {
             // On the volume's own lattice: a finer one needs about the same share of its points.
             let masks = masks(&member.field, member.field.lattice());
             let beyond = settings.engine == Engine::Sweep || settings.gather_rays > 0;
-            let lit = own_light(&member.field, member.field.lattice(), &masks, beyond);
+            let own_light = own_light(&member.field, member.field.lattice(), &masks, beyond);
+            let lit: Vec<bool> = (0..masks.len()).into_par_iter().with_min_len(1 << 12).map(own_light).collect();
             let count = |is: &(dyn Fn(usize) -> bool + Sync)| {
                 let count = (0..masks.len()).into_par_iter().filter(|&o| is(o)).count();
                 (count as f64 / own_voxels as f64 * own_points as f64) as u64
             };
-            let own = count(&lit);
+            let own = count(&|o| lit[o]);
             let own_filled = count(&|o| masks[o] != Mask::Empty) - own;
             if settings.engine == Engine::Sweep {
                 let share = sweep::places(member.field.lattice().dims(), &lit) as f64 / own_voxels as f64;
@@ -287,9 +288,8 @@ impl Parts {
         let swept = points * SWEPT
             + sides * points * SWEPT_SIDE
             + places * summed
-            + sides * (points * SETTLING_SIDE + places * settling).max(places * 2 * SUMMED_SIDE);
-        let reports = sweep::reports(scene, across, settings.wall_isovalues) as u64;
-        let swept = swept + reports;
+            + sides * (points * SETTLING_SIDE + places * settling).max(places * 2 * SUMMED_SIDE)
+            + sweep::reports(scene, across, settings.wall_isovalues) as u64;
         let ([landings, lower, higher], gather) = match settings.engine {
             Engine::Photon => (landings(scene, settings, device)?, settings.gather_rays > 0),
             Engine::Sweep => ([0.0; 3], false),

@@ -508,5 +508,10 @@ mod tests {
         for (axis, near) in [(0, [6.0, 1.0]), (1, [6.0, 1.0]), (2, [1.0, 1.0])] {
             assert_eq!(strides(&lattice, axis, [36.0; 6].into_iter(), 1e4), [near; 2], "{axis}");
         }
+        let reporting = Reporting::new([6, 2], [0.5, 0.5], 1.0);
+        assert_eq!(reporting.along(0, (-4, 12)).collect::<Vec<_>>(), [-3, 3, 9]);
+        let rows: Vec<isize> = (-2..5).filter(|&q| reporting.row(q)).collect();
+        assert_eq!((&rows[..], reporting.weight), (&[-1, 1, 3][..], 12.0));
+        assert_eq!(reporting.along(1, (-2, 4)).collect::<Vec<_>>(), rows);
     }
 }

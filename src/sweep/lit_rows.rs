@@ -106,12 +106,7 @@ pub(super) fn transpose<T: Copy + Default + PartialEq + Send + Sync>(
 }
 
 /// Turns it back to x, y, z order, into a plane of zeros.
-pub(super) fn untranspose<T: Copy + Send + Sync>(
-    [from_rows, to_rows]: [&LitRows; 2],
-    [ny, nz]: [usize; 2],
-    from: &[T],
-    to: &mut [T],
-) {
+pub(super) fn untranspose([from_rows, to_rows]: [&LitRows; 2], [ny, nz]: [usize; 2], from: &[f32], to: &mut [f32]) {
     /// Columns of as many rows as a cache line holds are read whole.
     const ROWS: usize = 64;
     to_rows.split(to, 1).par_chunks_mut(ROWS).enumerate().for_each(|(chunk, rows)| {
