@@ -1,0 +1,209 @@
+//! `isolume render`: a picture of one isosurface.
+
+use super::extract::open_bake;
+use super::reference::picture;
+use super::{device, expect_extension, outputs};
+use crate::error::{Error, Result};
+use crate::export::bake_file::BakedVolume;
+use crate::field::Shortest;
+use crate::progress::{Progress, say};
+use crate::render::{Camera, Rendered, Shading, render};
+use crate::scene::{Policy, Scene};
+use crate::scene_file::{Inputs, SceneOptions, load};
+use glam::DVec3;
+use std::path::PathBuf;
+use std::time::Instant;
+
+#[derive(clap::Args, Debug)]
+#[command(after_help = "\
+The picture holds the walls too. A .png is exposed so that a surface at the box's centre that faces the luminaire is white; an
+.exr holds linear radiance and every setting. Parts of the surface that show their inside are black unless the bake stored it
+(--sides both).
+
+Examples:
+  isolume render lit.vti --isovalue 80 -o lit.png
+  isolume render lit.vti --isovalue 80 -o local.png --local            the same view as other tools would light it
+  isolume render lit.vti --isovalue 80 -o side.exr --eye 90,-300,120 --target 90,108,90
+  isolume render lit.vti --isovalue 80 -o truth.png --reference --samples 256")]
+pub(super) struct Render {
+    /// A bake (.vti, .vtm); with --reference or --local also a volume or scene file
+    file: PathBuf,
+    /// The isosurface to draw, in the volume's units
+    #[arg(long, value_name = "C", allow_negative_numbers = true)]
+    isovalue: f64,
+    /// Of several volumes, the one that --isovalue speaks of: its name (default: the first). The others are drawn at
+    /// the same share of their own ranges
+    #[arg(long, value_name = "NAME")]
+    field: Option<String>,
+    /// Output: .png (exposed, sRGB) or .exr (linear radiance)
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// Plain local shading of the same view, for comparison
+    #[arg(long)]
+    local: bool,
+    /// Path-trace the isosurface's triangles instead of using the bake's light
+    #[arg(long, conflicts_with = "local")]
+    reference: bool,
+    /// Path-trace the trilinear surface itself instead of triangles, caps included
+    #[arg(long, requires = "reference")]
+    trilinear: bool,
+    /// Pixels from top to bottom
+    #[arg(long, default_value_t = 600, value_name = "PIXELS")]
+    height: usize,
+    /// Pixels across (default: by the box's aspect)
+    #[arg(long, value_name = "PIXELS")]
+    width: Option<usize>,
+    /// Rays per pixel
+    #[arg(long, default_value_t = 16, value_name = "N")]
+    samples: u32,
+    /// Camera position in the world (default: in front of the box)
+    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true)]
+    eye: Option<Vec<f64>>,
+    /// Point the camera looks at (default: the box's centre if --eye is given)
+    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true)]
+    target: Option<Vec<f64>>,
+    /// Up direction (default: 0,0,1)
+    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true)]
+    up: Option<Vec<f64>>,
+    /// Vertical field of view in degrees
+    #[arg(long, default_value_t = 40.0, value_name = "DEGREES")]
+    fov: f64,
+    /// Brightness: multiplies the bake's exposure
+    #[arg(long, default_value_t = 1.0, value_name = "FACTOR")]
+    exposure: f64,
+    #[command(flatten)]
+    scene: SceneOptions,
+}
+
+fn triple(values: Option<&Vec<f64>>, name: &str) -> Result<Option<DVec3>> {
+    match values.map(Vec::as_slice) {
+        None => Ok(None),
+        Some(&[x, y, z]) => Ok(Some(DVec3::new(x, y, z))),
+        Some(v) => Err(Error::Invalid(format!("--{name}: needs three numbers X,Y,Z, found {}", v.len()))),
+    }
+}
+
+/// The isovalue of a scene's first volume where the one named `name` has `isovalue`.
+fn first_isovalue(scene: &Scene, name: &str, isovalue: f64) -> Result<f64> {
+    let member = scene.members().swap_remove(scene.field_named(name)?);
+    let sweep = member.field.sweep();
+    if !(sweep.lo()..=sweep.hi()).contains(&isovalue) {
+        let isovalue = Shortest(isovalue);
+        return Err(Error::Invalid(format!("--isovalue {isovalue}: outside the range of '{name}', {sweep}")));
+    }
+    Ok(scene.field.sweep().from_unit(sweep.to_unit(isovalue)))
+}
+
+impl Render {
+    pub(super) fn run(self, progress: Progress) -> Result<()> {
+        expect_extension(&self.output, &["png", "exr"])?;
+        outputs([&*self.output], &Inputs::of(&self.file, &self.scene)?)?;
+        let begun = Instant::now();
+        if !(1..=16384).contains(&self.height) || self.width.is_some_and(|w| !(1..=16384).contains(&w)) {
+            return Err(Error::Invalid("--height, --width: 1 to 16384 pixels".into()));
+        }
+        if !(1..=1 << 16).contains(&self.samples) {
+            return Err(Error::Invalid("--samples: 1 to 65536 rays per pixel".into()));
+        }
+        if !(self.exposure > 0.0 && self.exposure.is_finite()) {
+            return Err(Error::Invalid(format!("--exposure {}: must be a positive finite number", self.exposure)));
+        }
+        let baked = match open_bake(&self.file, &self.scene)? {
+            None if !self.reference && !self.local => Some(BakedVolume::read(&self.file)?),
+            found => found,
+        };
+        let loaded = match baked {
+            Some(_) => None,
+            None => Some(load(&self.file, &self.scene)?.scene),
+        };
+        let scene = baked.as_ref().map(|b| &b.scene).or(loaded.as_ref()).expect("one of the two was read");
+        let isovalue = match &self.field {
+            None => self.isovalue,
+            Some(name) => first_isovalue(scene, name, self.isovalue).map_err(|e| e.in_file(&self.file))?,
+        };
+        let mut camera = Camera::facing(scene, self.height);
+        camera.fov = self.fov;
+        if let Some(width) = self.width {
+            camera.size[0] = width;
+        }
+        if let Some(up) = triple(self.up.as_ref(), "up")? {
+            camera.up = up;
+        }
+        let [lo, hi] = scene.bounds();
+        if let Some(eye) = triple(self.eye.as_ref(), "eye")? {
+            (camera.eye, camera.target) = (eye, 0.5 * (lo + hi));
+        }
+        if let Some(target) = triple(self.target.as_ref(), "target")? {
+            camera.target = target;
+        }
+        let exposure = baked.as_ref().map_or_else(|| scene.exposure(), |b| b.exposure);
+        let exr = self.output.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr"));
+        #[allow(clippy::cast_possible_truncation, reason = "a brightness")]
+        let brightness = (exposure * self.exposure) as f32;
+        let storable = exr || (brightness > 0.0 && brightness.is_finite());
+        if !storable {
+            return Err(Error::Invalid(format!(
+                "--exposure {:?}: times {exposure:?}, the exposure of {}, it is no brightness that a .png can have; give \
+                 another",
+                self.exposure,
+                self.file.display()
+            )));
+        }
+        if self.reference && scene.fields() > 1 && scene.policy() == Policy::Independent {
+            return Err(Error::not_supported(
+                &self.file,
+                "policy = \"independent\": paths see all volumes; a picture of one needs a scene of one",
+            ));
+        }
+        let rendered = if self.reference {
+            baked.as_ref().map_or(Ok(()), BakedVolume::whole).map_err(|e| e.in_file(&self.file))?;
+            let picture = picture(scene, isovalue, &camera, self.samples, self.trilinear, &device()?, progress)?;
+            Rendered { picture, unbaked: 0.0 }
+        } else {
+            let shading = match &baked {
+                Some(baked) if !self.local => Shading::Baked(baked),
+                _ => Shading::Local(exposure),
+            };
+            render(scene, isovalue, &camera, shading, self.samples, &device()?, progress)?
+        };
+        let exposure = exposure * self.exposure;
+        if exr {
+            let shading = match () {
+                () if self.trilinear => "path traced, trilinear",
+                () if self.reference => "path traced",
+                () if self.local || baked.is_none() => "local",
+                () => "baked",
+            };
+            let vector = |v: DVec3| format!("{:?},{:?},{:?}", v.x, v.y, v.z);
+            let attributes = [
+                ("isolume".to_owned(), format!("{} ({})", env!("CARGO_PKG_VERSION"), env!("ISOLUME_COMMIT"))),
+                ("source".to_owned(), self.file.display().to_string()),
+                ("isovalue".to_owned(), self.isovalue.to_string()),
+                ("field".to_owned(), self.field.clone().unwrap_or_else(|| scene.name.clone())),
+                ("shading".to_owned(), shading.to_owned()),
+                ("eye".to_owned(), vector(camera.eye)),
+                ("target".to_owned(), vector(camera.target)),
+                ("up".to_owned(), vector(camera.up)),
+                ("fov".to_owned(), camera.fov.to_string()),
+                ("exposure".to_owned(), exposure.to_string()),
+                ("samplesPerPixel".to_owned(), self.samples.to_string()),
+                ("renderTimeSeconds".to_owned(), begun.elapsed().as_secs_f64().to_string()),
+                ("report".to_owned(), baked.as_ref().map_or_else(|| "null".into(), |b| b.report.to_string())),
+            ];
+            rendered.picture.write_exr(&self.output, &attributes)?;
+        } else {
+            rendered.picture.write_png(&self.output, brightness)?;
+        }
+        if progress == Progress::Shown {
+            let seconds = begun.elapsed().as_secs_f64();
+            say!("{}: {}×{} in {seconds:.2} s", self.output.display(), camera.size[0], camera.size[1]);
+        }
+        if rendered.unbaked > 0.001 {
+            say!(
+                "warning: {:.1} % of the picture shows the surface's inside, which was not baked; use --sides both",
+                100.0 * rendered.unbaked
+            );
+        }
+        Ok(())
+    }
+}
