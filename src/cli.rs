@@ -5,6 +5,7 @@ mod compare;
 mod documentation;
 mod export;
 mod extract;
+mod final_gather;
 mod flatland;
 mod generate;
 mod init;

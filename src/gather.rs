@@ -1,5 +1,5 @@
-//! Final gather: one bounce of rays into the radiance cache, more where surfaces of several fields cross and within
-//! capped solids. \[Jensen01; Christensen99\]
+//! Final gather: one bounce of rays into light that is known, as a radiance cache holds it, more where surfaces of
+//! several fields cross, within capped solids, and where none is known. \[Jensen01; Christensen99\]
 
 use crate::direct::{Estimate, Receiver, direct_once, luminance};
 use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target};
@@ -12,6 +12,41 @@ use crate::tracer::Tracer;
 use crate::warp::{Frame, cosine_hemisphere};
 use glam::DVec3;
 use std::f64::consts::PI;
+
+/// Light that is known where gather rays land.
+pub trait KnownLight: Sync {
+    /// What hits nearer than this (cells of the scene's lattice) find is found by paths instead; 0 trusts all.
+    #[inline]
+    fn least_distance(&self) -> f32 {
+        0.0
+    }
+
+    /// Outgoing radiance where a ray of hyperplane `isovalue` landed, local frame, without what luminaires emit; `None`
+    /// if that is not known. `within`: whether the ray comes from within a solid, where flats have light of their own.
+    /// Counts up `misses` where there should be some but is not.
+    fn radiance(
+        &self,
+        scene: &Scene,
+        landed: (Target, bool),
+        position: DVec3,
+        isovalue: f32,
+        misses: &mut u64,
+    ) -> Option<DVec3>;
+}
+
+impl KnownLight for RadianceCache {
+    #[inline]
+    fn radiance(
+        &self,
+        scene: &Scene,
+        landed: (Target, bool),
+        position: DVec3,
+        isovalue: f32,
+        misses: &mut u64,
+    ) -> Option<DVec3> {
+        Some(self.lookup(scene, landed, position, isovalue, misses))
+    }
+}
 
 /// A gathered irradiance and its two halves.
 #[derive(Clone, Copy, Debug, Default)]
@@ -38,11 +73,12 @@ const PILOT: u32 = 16;
 
 /// Indirect irradiance at `receiver`: π/M Σ L over `rays` cosine-distributed directions. Luminaires count 0, since
 /// direct light is counted apart; what leaves everything carries nothing. \[BB09 Eq. 2\] A receiver that sees nothing
-/// but dark surfaces all around, as inside another field's solid, is known to be dark after a quarter of its rays.
-pub fn gathered_irradiance<T: Tracer>(
+/// but dark surfaces all around, as inside another field's solid, is known to be dark after a quarter of its rays, if
+/// all `light` is trusted: paths find none now and then where there is some.
+pub fn gathered_irradiance<T: Tracer, L: KnownLight>(
     scene: &Scene,
     tracer: &T,
-    cache: &RadianceCache,
+    light: &L,
     receiver: &Receiver,
     rays: u32,
     (seed, index): (u64, u64),
@@ -56,9 +92,10 @@ pub fn gathered_irradiance<T: Tracer>(
     // Rays that landed, and of them those that found any light.
     let (mut landed, mut lit) = (0, 0);
     let turn = Rng::stream(seed, Stage::Gather, index << 20 ^ 0xF_FFFF).bits();
-    let mut corners = Corners { scene, tracer, cache, turn };
+    let mut corners = Corners { scene, tracer, light, turn };
+    let trusted = light.least_distance() == 0.0;
     for i in 0..rays {
-        if i == PILOT.max(rays / 4) && landed == i && lit == 0 {
+        if trusted && i == PILOT.max(rays / 4) && landed == i && lit == 0 {
             break;
         }
         traced += 1;
@@ -102,31 +139,41 @@ fn near(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> bool {
     cells.length_squared() < NEAR * NEAR
 }
 
-/// Whether a hit is on the inside of a cap, whose light no cache holds: few scenes have any.
+/// Whether a hit is on the inside of a cap, whose light nothing holds: few scenes have any.
 #[inline]
 fn is_cap_from_within(hit: FlattenedHit) -> bool {
     matches!(hit.target, Target::Cap(_, Side::Higher))
 }
 
-/// What the cache holds where a ray landed.
+/// What is known where a ray landed; `None` if nothing is, or it is too near to be trusted.
 #[inline]
-fn found(scene: &Scene, cache: &RadianceCache, ray: &FlattenedRay, hit: FlattenedHit, misses: &mut u64) -> DVec3 {
+fn found(
+    scene: &Scene,
+    light: &impl KnownLight,
+    ray: &FlattenedRay,
+    hit: FlattenedHit,
+    misses: &mut u64,
+) -> Option<DVec3> {
+    let near = light.least_distance();
+    if is_cap_from_within(hit) || (near > 0.0 && hit.t * ray.direction.length() < near) {
+        return None;
+    }
     let target = (hit.target, scene.leaves_within(ray.departure));
-    cache.lookup(scene, target, ray.at(hit.t), ray.isovalue, misses)
+    light.radiance(scene, target, ray.at(hit.t), ray.isovalue, misses)
 }
 
 /// What gathers in corners know.
-struct Corners<'a, T> {
+struct Corners<'a, T, L> {
     scene: &'a Scene,
     tracer: &'a T,
-    cache: &'a RadianceCache,
+    light: &'a L,
     /// Counts the rays that landed near.
     turn: u64,
 }
 
-impl<T: Tracer> Corners<'_, T> {
-    /// Radiance that arrives along `ray` from its `hit`: that of the cache if it is far away or nothing around it is
-    /// lit, else on a path until it is. `rng` makes the random numbers of the path.
+impl<T: Tracer, L: KnownLight> Corners<'_, T, L> {
+    /// Radiance that arrives along `ray` from its `hit`: what is known if it is far away or nothing around it is lit,
+    /// else on a path until it is. `rng` makes the random numbers of the path.
     #[inline]
     fn radiance(
         &mut self,
@@ -136,41 +183,40 @@ impl<T: Tracer> Corners<'_, T> {
         misses: &mut u64,
         rays: &mut u64,
     ) -> DVec3 {
-        let cached = found(self.scene, self.cache, &ray, hit, misses);
-        if is_cap_from_within(hit) {
-            return self.path(ray, hit, cached, &mut rng(), misses, rays);
-        }
-        if cached == DVec3::ZERO || !near(self.scene, &ray, hit) {
-            return cached;
+        let known = found(self.scene, self.light, &ray, hit, misses);
+        let Some(there) = known else { return self.path(ray, hit, known, &mut rng(), misses, rays) };
+        if there == DVec3::ZERO || !near(self.scene, &ray, hit) {
+            return there;
         }
         self.turn = self.turn.wrapping_add(1);
         if !self.turn.is_multiple_of(SHARE) {
-            return cached;
+            return there;
         }
-        cached + (self.path(ray, hit, cached, &mut rng(), misses, rays) - cached) * SHARE as f64
+        there + (self.path(ray, hit, known, &mut rng(), misses, rays) - there) * SHARE as f64
     }
 
-    /// The same along a path from a `hit` that is near or a cap from within, for which the cache says `cached`. Russian
-    /// roulette ends what goes from cap to cap. \[Arvo90\]
+    /// The same along a path from a `hit` that is near, or of which nothing is `known`. Russian roulette ends what goes
+    /// on and on unknown. \[Arvo90\]
     #[cold]
     fn path(
         &self,
         mut ray: FlattenedRay,
         mut hit: FlattenedHit,
-        mut cached: DVec3,
+        mut known: Option<DVec3>,
         rng: &mut Rng,
         misses: &mut u64,
         rays: &mut u64,
     ) -> DVec3 {
-        let Self { scene, tracer, cache, .. } = *self;
+        let Self { scene, tracer, light, .. } = *self;
         let (mut total, mut weight) = (DVec3::ZERO, DVec3::ONE);
         let mut corners = 0;
         loop {
-            let cap = is_cap_from_within(hit);
-            if !cap && (corners == CORNERS || cached == DVec3::ZERO || !near(scene, &ray, hit)) {
-                break;
+            if let Some(there) = known {
+                if corners == CORNERS || there == DVec3::ZERO || !near(scene, &ray, hit) {
+                    return total + weight * there;
+                }
+                corners += 1;
             }
-            corners += usize::from(!cap);
             let Some((mut receiver, albedo, emission)) = landing(scene, &ray, hit) else { return total };
             if touches(scene, &ray, hit) {
                 receiver.departure = ray.departure;
@@ -181,7 +227,7 @@ impl<T: Tracer> Corners<'_, T> {
             }
             weight *= albedo;
             total += weight * direct_once(scene, tracer, &receiver, rng, rays) / PI;
-            if cap {
+            if known.is_none() {
                 let survival = weight.max_element();
                 if rng.unit() >= survival {
                     return total;
@@ -193,9 +239,8 @@ impl<T: Tracer> Corners<'_, T> {
             *rays += 1;
             let Some(next) = tracer.intersect(&ray) else { return total };
             hit = next;
-            cached = found(scene, cache, &ray, hit, misses);
+            known = found(scene, light, &ray, hit, misses);
         }
-        total + weight * cached
     }
 }
 
@@ -266,5 +311,37 @@ mod tests {
         });
         println!("{light:?}");
         assert!((light[0] / light[1] / 4.0 - 1.0).abs() < 0.05, "{light:?}");
+    }
+
+    /// A bright patch on a dark floor, which a ray in fifty finds: all that is known if nothing is too near.
+    struct Patch(f32);
+
+    impl KnownLight for Patch {
+        fn least_distance(&self) -> f32 {
+            self.0
+        }
+        fn radiance(&self, _: &Scene, _: (Target, bool), p: DVec3, _: f32, _: &mut u64) -> Option<DVec3> {
+            Some(if (p.x - 4.0).abs() < 0.5 && (p.y - 4.0).abs() < 0.5 { DVec3::ONE } else { DVec3::ZERO })
+        }
+    }
+
+    /// Where paths are in play, some rays that find none do not stand for the others.
+    #[test]
+    fn rare_light_counts_in_full() {
+        let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::splat(0.125)).unwrap();
+        let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[0] as f32).collect();
+        let volume = Volume::new("ramp", lattice, Samples::F32(samples)).unwrap();
+        let field = Field::new(&volume, Sweep::new(0.0, 8.0).unwrap()).unwrap();
+        let scene = Scene::new(field, Surface::default(), Boundary::Open, Vec::new()).unwrap();
+        let position = DVec3::new(4.0, 4.0, 4.0).as_vec3();
+        let receiver = Receiver { position, normal: -DVec3::Z, isovalue: 0.5, departure: Departure::Free };
+        let found = |rays: u32, index: u64| {
+            gathered_irradiance(&scene, &Floor(0), &Patch(1e-6), &receiver, rays, (1, index)).estimate.mean.x
+        };
+        let expected = found(1 << 18, 0);
+        assert!((0.01..0.03).contains(&(expected / PI)), "{expected}");
+        let mut few = Moments::default();
+        (1..4000).for_each(|index| few.push(found(64, index)));
+        assert!((few.mean() - expected).abs() < 4.5 * few.std_error(), "{} {expected}", few.mean());
     }
 }

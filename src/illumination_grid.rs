@@ -126,22 +126,35 @@ impl IlluminationGrid {
     /// Radiance at index coordinates `p` of its `lattice`, as a 3D texture gives it: trilinear over the points of the
     /// cell that hold something; 0 where none does.
     pub fn interpolate(&self, lattice: &Lattice, p: DVec3) -> DVec3 {
-        let [radiance] = self.between(lattice, p, [&self.radiance]);
-        radiance
+        self.between(lattice, p, [&self.radiance]).map_or(DVec3::ZERO, |[radiance]| radiance)
     }
 
     /// Radiance of `side` at local position `p` of `scene`, which this grid over `lattice` lights: as
     /// [`IlluminationGrid::interpolate`] of a grid that is not split; else direct light is that of the place and its
     /// normal, in closed form, times the share that is visible.
     pub fn radiance_at(&self, scene: &Scene, lattice: &Lattice, p: DVec3, side: Side) -> DVec3 {
-        let at = if lattice == scene.lattice() { p } else { p * (lattice.far() / scene.lattice().far()) };
-        let Some(Split { indirect, visible }) = &self.split else { return self.interpolate(lattice, at) };
-        let [indirect, visible] = self.between(lattice, at, [indirect, visible]);
-        split::radiance(scene, p, side, indirect, visible)
+        self.known_at(scene, lattice, p, side).unwrap_or_default()
     }
 
-    /// What `values` of the points, three channels each, say between them.
-    fn between<const N: usize>(&self, lattice: &Lattice, p: DVec3, values: [&[[f32; 3]]; N]) -> [DVec3; N] {
+    /// As [`IlluminationGrid::radiance_at`]; `None` where no point of the cell holds something.
+    pub fn known_at(&self, scene: &Scene, lattice: &Lattice, p: DVec3, side: Side) -> Option<DVec3> {
+        let at = if lattice == scene.lattice() { p } else { p * (lattice.far() / scene.lattice().far()) };
+        let Some(Split { indirect, visible }) = &self.split else {
+            return self.between(lattice, at, [&self.radiance]).map(|[radiance]| radiance);
+        };
+        let [indirect, visible] = self.between(lattice, at, [indirect, visible])?;
+        Some(split::radiance(scene, p, side, indirect, visible))
+    }
+
+    /// Radiance at index coordinates `p` of its `lattice`, but for what is reflected of direct light; `None` of a grid
+    /// that is not split, and where no point of the cell holds something.
+    pub fn indirect_at(&self, lattice: &Lattice, p: DVec3) -> Option<DVec3> {
+        self.between(lattice, p, [&self.split.as_ref()?.indirect]).map(|[indirect]| indirect)
+    }
+
+    /// What `values` of the points, three channels each, say between them; `None` where none of the points holds
+    /// something.
+    fn between<const N: usize>(&self, lattice: &Lattice, p: DVec3, values: [&[[f32; 3]]; N]) -> Option<[DVec3; N]> {
         let far = lattice.far();
         let p = p.clamp(DVec3::ZERO, far);
         let base = p.floor().min(far - 1.0);
@@ -164,7 +177,7 @@ impl IlluminationGrid {
             sums.iter_mut().zip(values).for_each(|(sum, v)| *sum += w * DVec3::from_array(v[o].map(f64::from)));
             weight += w;
         }
-        sums.map(|sum| if weight > 0.0 { sum / weight } else { DVec3::ZERO })
+        (weight > 0.0).then(|| sums.map(|sum| sum / weight))
     }
 
     /// Empties points whose radiance or standard error is not finite, and counts them.

@@ -66,6 +66,7 @@ pub mod scene_file;
 // Products.
 pub mod export;
 pub mod surface_mesh;
+pub mod final_gather;
 pub mod render;
 pub mod view;
 // One isosurface at a time in 3D, and how far a bake is from it.

@@ -139,7 +139,7 @@ impl<T: Tracer> Sampler<'_, T> {
                 (e.mean, e.variance, [e.mean; 2])
             }
             Indirect::Gather(cache, rays) => {
-                let g = gathered_irradiance(scene, tracer, cache, &receiver, *rays, (self.seed, index));
+                let g = gathered_irradiance(scene, tracer, *cache, &receiver, *rays, (self.seed, index));
                 let e = g.estimate;
                 counts[0] += e.rays;
                 counts[1] += e.misses;

@@ -6,8 +6,8 @@ use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
 use crate::export::picture::Picture;
 use crate::field::Shortest;
-use crate::flat;
-use crate::flattened::{FlattenedHit, FlattenedRay, Side, Target, split_face};
+use crate::final_gather::{FinalGather, FinalGatherSettings, seen};
+use crate::flattened::{FlattenedHit, FlattenedRay, Target};
 use crate::progress::Progress;
 use crate::rng::{Sobol, Stage};
 use crate::scene::Scene;
@@ -67,8 +67,8 @@ impl Camera {
 /// How surfaces get their colours.
 #[derive(Clone, Copy)]
 pub enum Shading<'a> {
-    /// By the baked radiance; the scene drawn must be the bake's.
-    Baked(&'a BakedVolume),
+    /// By the baked radiance, or by rays into it; the scene drawn must be the bake's.
+    Baked(&'a BakedVolume, Option<FinalGatherSettings>),
     /// By a headlight and a constant, what viewers do without a bake: radiance that this exposure brings to [0, 1].
     Local(f64),
 }
@@ -80,12 +80,15 @@ pub struct Rendered {
     pub picture: Picture,
     /// Share of primary rays that met a side of the surface that was not baked.
     pub unbaked: f64,
+    /// Rays traced from what was seen.
+    pub rays: u64,
 }
 
 /// Renders the isosurface at `isovalue` (source units) with `samples` rays per pixel.
 ///
 /// # Errors
-/// `Invalid` for an isovalue outside the sweep or an impossible camera; `Embree`; `Interrupted`.
+/// `Invalid` for an isovalue outside the sweep or an impossible camera; `Embree`; `Interrupted`; as
+/// [`FinalGather::new`].
 pub fn render(
     scene: &Scene,
     isovalue: f64,
@@ -105,17 +108,30 @@ pub fn render(
     let tracer = GraphTracer::new(device, scene)?;
     let c = sweep.isovalue(isovalue);
     let unbaked = AtomicU64::new(0);
-    let shade = |ray: &FlattenedRay, hit: FlattenedHit, direction: DVec3| match shading {
-        Shading::Local(exposure) => local(scene, ray, hit, direction) / exposure,
-        Shading::Baked(baked) => radiance(baked, ray, hit).unwrap_or_else(|| {
+    let gather = match shading {
+        Shading::Baked(baked, Some(settings)) => Some(FinalGather::new(baked, &tracer, settings)?),
+        _ => None,
+    };
+    let shade = |ray: &FlattenedRay, hit: FlattenedHit, direction: DVec3, index: u64| {
+        let light = match (shading, &gather) {
+            (Shading::Local(exposure), _) => Some(local(scene, ray, hit, direction) / exposure),
+            (_, Some(gather)) => gather.seen(ray, hit, index),
+            (Shading::Baked(baked, _), None) => seen(baked, ray, hit),
+        };
+        light.unwrap_or_else(|| {
             unbaked.fetch_add(1, Ordering::Relaxed);
             DVec3::ZERO
-        }),
+        })
     };
     let picture = trace_picture(scene, &tracer, c, camera, samples, &shade, progress)?;
     let total = (camera.size[0] * camera.size[1]) as f64 * f64::from(samples);
-    Ok(Rendered { picture, unbaked: unbaked.into_inner() as f64 / total })
+    let rays = gather.map_or(0, |g| g.rays());
+    Ok(Rendered { picture, unbaked: unbaked.into_inner() as f64 / total, rays })
 }
+
+/// What stands for the radiance of a hit: of its ray, the ray's direction in the world, and the number of the ray in
+/// the picture.
+pub type Shade<'a> = dyn Fn(&FlattenedRay, FlattenedHit, DVec3, u64) -> DVec3 + Sync + 'a;
 
 /// Sends `samples` stratified rays through each pixel of hyperplane `c` and averages what `shade` makes of the hits;
 /// misses are black.
@@ -128,7 +144,7 @@ pub fn trace_picture<T: Tracer>(
     c: f32,
     camera: &Camera,
     samples: u32,
-    shade: &(dyn Fn(&FlattenedRay, FlattenedHit, DVec3) -> DVec3 + Sync),
+    shade: &Shade<'_>,
     progress: Progress,
 ) -> Result<Picture> {
     let [forward, right, down] = camera.basis().map(|[f, r, u]| [f, r, -u])?;
@@ -148,48 +164,13 @@ pub fn trace_picture<T: Tracer>(
             let direction = (forward + right * x + down * y).normalize();
             let ray = scene.ray(eye, direction, c, crate::flattened::Departure::Free);
             if let Some(hit) = tracer.intersect(&ray) {
-                sum += shade(&ray, hit, direction);
+                sum += shade(&ray, hit, direction, i as u64 * u64::from(samples) + u64::from(s));
             }
         }
         *pixel = (sum / f64::from(samples)).as_vec3().to_array();
     });
     stage.end()?;
     Ok(picture)
-}
-
-/// Baked radiance at a hit; `None` on a side that is not stored.
-fn radiance(baked: &BakedVolume, ray: &FlattenedRay, hit: FlattenedHit) -> Option<DVec3> {
-    let scene = &baked.scene;
-    let p = ray.at(hit.t);
-    let texture = |baked: &BakedVolume, number: usize, uv: [f64; 2]| {
-        let t = baked.flats.get(number)?.as_ref()?;
-        // Beyond the outermost centres linear functions go on, below 0 where light ends.
-        Some(t.lookup([uv[0], uv[1], f64::from(ray.isovalue)]).max(DVec3::ZERO))
-    };
-    match hit.target {
-        Target::Surface(side) => baked.radiance(side, p),
-        Target::Companion(n, side) => {
-            let companion = &scene.companions()[usize::from(n)];
-            baked.companions[usize::from(n)].radiance(side, companion.to_index(p))
-        }
-        Target::Cap(_, Side::Higher) => Some(DVec3::ZERO),
-        Target::Cap(face, Side::Lower) => {
-            // Each bake holds its own caps.
-            let (companion, own) = split_face(face);
-            let baked = companion.map_or(baked, |n| &baked.companions[usize::from(n)]);
-            texture(baked, scene.polygons().len() + usize::from(own), flat::face_texture(scene, face, p))
-        }
-        Target::Polygon(id) => {
-            let polygon = &scene.polygons()[id as usize];
-            // From behind, only luminaires are seen: black.
-            let seen = scene.lattice().axes() * ray.direction.as_dvec3();
-            if seen.dot(polygon.normal()) > 0.0 {
-                return Some(DVec3::ZERO);
-            }
-            let uv = polygon.texture(scene.lattice().to_world(p));
-            Some(polygon.emission + texture(baked, id as usize, uv).unwrap_or(DVec3::ZERO))
-        }
-    }
 }
 
 /// Headlight shading, already exposed: ρ (0.15 + 0.85 |cos|).

@@ -59,7 +59,7 @@ pub struct Survey {
     /// where t is what the bake shows and r what paths find: without their noise, 0 where that is negative.
     pub percent_rms: f64,
     /// The same where t is radiance as a 3D texture shows it: another number if the bake is split
-    /// ([`crate::split::Split`]).
+    /// ([`crate::split::Split`]) or looked at by rays ([`crate::final_gather`]).
     pub percent_rms_texture: f64,
     /// The same per channel: / √3.
     pub percent_rms_sqrt3: f64,
@@ -91,8 +91,10 @@ const STRATA: usize = 40;
 /// Points to choose from for each that is chosen.
 const CANDIDATES: usize = 32;
 
-/// Compares `grid` (over `lattice`, of the outside) with paths through `scene`, of whose field it is. `tick(n)` reports
-/// n of 2 · points done; returning false stops early, with a result that is worth nothing.
+/// Compares `grid` (over `lattice`, of the outside) with paths through `scene`, of whose field it is: at points on
+/// isosurfaces what is `shown` there, given index coordinates of `lattice` and the point's number; at the grid's own
+/// what it holds. `tick(n)` reports n of 2 · points done; returning false stops early, with a result that is worth
+/// nothing.
 ///
 /// # Errors
 /// `Invalid` if no isosurface of the sweep is found.
@@ -100,6 +102,7 @@ pub fn survey<T: Tracer>(
     scene: &Scene,
     tracer: &T,
     (lattice, grid): (&Lattice, &IlluminationGrid),
+    shown: &(dyn Fn(DVec3, u64) -> DVec3 + Sync),
     settings: &SurveySettings,
     tick: &(dyn Fn(u64) -> bool + Sync),
 ) -> Result<Survey> {
@@ -122,7 +125,7 @@ pub fn survey<T: Tracer>(
         .enumerate()
         .with_max_len(16)
         .map(|(i, &p)| {
-            let shown = [grid.radiance_at(scene, lattice, p, side), grid.interpolate(lattice, p * scale)];
+            let shown = [shown(p * scale, i as u64), grid.interpolate(lattice, p * scale)];
             let between = compare(p, shown, 2 * i);
             tick(1);
             let at = beside(lattice, grid, p * scale, &mut stream(settings, i as u64)).and_then(|o| {
@@ -309,7 +312,8 @@ mod tests {
         let device = Device::new(0).unwrap();
         let tracer = GraphTracer::new(&device, scene).unwrap();
         let settings = SurveySettings { points, paths: 1, seed: 3 };
-        survey(scene, &tracer, (lattice, &grid), &settings, &|_| true).unwrap()
+        let shown = |p, _| grid.interpolate(lattice, p);
+        survey(scene, &tracer, (lattice, &grid), &shown, &settings, &|_| true).unwrap()
     }
 
     #[test]

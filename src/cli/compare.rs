@@ -1,5 +1,6 @@
 //! `isolume compare`: a bake against one or two references of an isosurface, or all of its isosurfaces against paths.
 
+use super::final_gather::{FinalGatherOptions, light};
 use super::{device, expect_extension, outputs};
 use crate::accuracy::{Accuracy, ReferenceMesh, Survey, SurveySettings, belongs, compare, survey};
 use crate::embree::GraphTracer;
@@ -7,11 +8,12 @@ use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
 use crate::export::{Mesh, ply};
 use crate::field::span;
+use crate::final_gather::{FinalGather, FinalGatherSettings};
 use crate::illumination_grid::GridSize;
 use crate::progress::{Progress, say};
-use crate::reference::{Origin, light};
+use crate::reference::{self, Origin};
 use crate::scene_file::Inputs;
-use crate::surface_mesh::texture;
+use glam::DVec3;
 use std::path::PathBuf;
 
 #[derive(clap::Args, Debug)]
@@ -27,6 +29,7 @@ One reference adds its own noise to the result (noise_floor); two of different s
 
 Examples:
   isolume compare out.vti
+  isolume compare out.vti --gather-rays 64             what render and extract show with that
   isolume compare out.vti ref.ply --json
   isolume compare out.vti ref1.ply ref2.ply -o error.ply")]
 pub(super) struct Compare {
@@ -47,6 +50,8 @@ pub(super) struct Compare {
     /// Without references, of several volumes: the one to look at, by its name (default: the first)
     #[arg(long, value_name = "NAME", conflicts_with = "references")]
     field: Option<String>,
+    #[command(flatten)]
+    rays: FinalGatherOptions,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -58,8 +63,9 @@ pub(super) struct Compare {
 
 impl Compare {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
+        let rays = self.rays.settings()?;
         if self.references.is_empty() {
-            return self.everywhere(progress);
+            return self.everywhere(rays, progress);
         }
         if let Some(output) = &self.output {
             expect_extension(output, &["ply"])?;
@@ -77,7 +83,7 @@ impl Compare {
         for ((reference, file), path) in references.iter().zip(&files).zip(&self.references) {
             let origin = Origin::from_comments(&file.comments);
             belongs(&reference.positions, origin.isovalue, &baked.scene.field).map_err(|e| e.in_file(path))?;
-            let another = |c| origin.light.is_some_and(|known| known != light(&baked.scene, c));
+            let another = |c| origin.light.is_some_and(|known| known != reference::light(&baked.scene, c));
             if origin.isovalue.is_some_and(another) {
                 say!(
                     "warning: {}: was made of another material or box than {}; the difference counts as error",
@@ -86,7 +92,14 @@ impl Compare {
                 );
             }
         }
-        let colours = texture(&baked, &references[0].positions).map_err(|e| e.in_file(&self.bake))?;
+        let first = &references[0];
+        // Rays cost, and nobody looks at the others.
+        let sampled = |v: &usize| references.iter().all(|r| r.sampled.get(*v) == Some(&true));
+        let chosen: Vec<usize> = (0..first.positions.len()).filter(sampled).collect();
+        let positions: Vec<DVec3> = chosen.iter().map(|&v| first.positions[v]).collect();
+        let found = light(&baked, rays, &positions, progress).map_err(|e| e.in_file(&self.bake))?;
+        let mut colours = vec![DVec3::ZERO; first.positions.len()];
+        chosen.into_iter().zip(found.radiance).for_each(|(v, light)| colours[v] = light);
         let (accuracy, errors) = compare(&colours, &references, baked.exposure)?;
         if self.json {
             println!("{}", serde_json::to_string_pretty(&accuracy).expect("the numbers are plain data"));
@@ -103,7 +116,7 @@ impl Compare {
     }
 
     /// All isosurfaces of the bake against paths.
-    fn everywhere(&self, progress: Progress) -> Result<()> {
+    fn everywhere(&self, rays: Option<FinalGatherSettings>, progress: Progress) -> Result<()> {
         if !(1..=1 << 20).contains(&self.points) || !(1..=1 << 20).contains(&self.paths) {
             return Err(Error::Invalid("--points, --paths: 1 to 1048576".into()));
         }
@@ -114,6 +127,7 @@ impl Compare {
             None => baked,
         };
         baked.whole().map_err(in_file)?;
+        rays.map_or(Ok(()), |rays| rays.check(&baked)).map_err(in_file)?;
         let own = baked.source().map_err(in_file)?;
         if own.is_none() {
             say!(
@@ -130,8 +144,16 @@ impl Compare {
         let settings = SurveySettings { points: self.points, paths: self.paths, seed: self.seed };
         let device = device()?;
         let tracer = GraphTracer::new(&device, &scene)?;
+        let own = GraphTracer::new(&device, &baked.scene)?;
+        let gather = rays.map(|rays| FinalGather::new(&baked, &own, rays)).transpose().map_err(in_file)?;
+        #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
+        let shown = |p: DVec3, index| {
+            let isovalue = || baked.scene.field.value(p) as f32;
+            let light = gather.as_ref().map_or_else(|| baked.radiance(side, p), |g| g.outside(p, isovalue(), index));
+            light.expect("the outside is stored")
+        };
         let stage = progress.stage("paths", 2 * self.points as u64);
-        let found = survey(&scene, &tracer, (baked.lattice(), grid), &settings, &|n| stage.tick(n));
+        let found = survey(&scene, &tracer, (baked.lattice(), grid), &shown, &settings, &|n| stage.tick(n));
         stage.end()?;
         let found = found.map_err(in_file)?;
         if self.json {
@@ -142,15 +164,16 @@ impl Compare {
             let finer = if long { "--grid cubic" } else { "a finer --grid" };
             // Scattered samples cannot be split.
             let nodes = baked.report.pointer("/settings/strategy").is_some_and(|s| s == "nodes");
-            print!("{}", everywhere(&found, finer, grid.split.is_none() && nodes));
+            let advice = rays.is_none().then_some((finer, grid.split.is_none() && nodes));
+            print!("{}", everywhere(&found, advice));
         }
         Ok(())
     }
 }
 
-/// A survey's numbers, a line each, and that a `finer` grid lowers what interpolation costs, as it would if the bake
-/// were split, if it `can_split`.
-fn everywhere(s: &Survey, finer: &str, can_split: bool) -> String {
+/// A survey's numbers, a line each; and, with what is `finer` and whether the bake can be split, how to lower what
+/// interpolation costs.
+fn everywhere(s: &Survey, advice: Option<(&str, bool)>) -> String {
     let interval = |[lo, hi]: [f64; 2]| format!("(95 % confidence {lo:.3} … {hi:.3})");
     let parts: String = s
         .parts
@@ -173,11 +196,13 @@ fn everywhere(s: &Survey, finer: &str, can_split: bool) -> String {
         }
     };
     let between = s.grid_points > 0 && 2.0 * s.percent_rms_grid_points.powi(2) < s.percent_rms.powi(2);
-    let splitting = if can_split { ", and --split in pictures, meshes and pages" } else { "" };
-    let advice = match between {
-        true => format!("most of it lies between grid points: {finer} lowers it{splitting}\n"),
-        false => String::new(),
-    };
+    let advice = advice.filter(|_| between).map_or_else(String::new, |(finer, can_split)| {
+        let splitting = if can_split { ", and --split in pictures, meshes and pages" } else { "" };
+        format!(
+            "most of it lies between grid points: {finer} lowers it{splitting}; render and extract end it by \
+             --gather-rays 64\n"
+        )
+    });
     format!(
         "percent RMS       {:8.3}   {}\n{texture}  per channel, /√3 {:8.3}\n{parts}at grid points    {at_points}\n\
          bias              {:+8.3}\npoints            {:8}   (2 × {} paths each; {} left out)\n{advice}",

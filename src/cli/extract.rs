@@ -1,5 +1,6 @@
 //! `isolume extract`: one isosurface as a mesh, with a bake's light on its vertices.
 
+use super::final_gather::{FinalGatherOptions, light};
 use super::{expect_extension, outputs};
 use crate::error::{Error, Result};
 use crate::export::Mesh;
@@ -8,7 +9,7 @@ use crate::progress::{Progress, say, unless_interrupted};
 use crate::scene::Scene;
 use crate::scene_file::{Inputs, SceneOptions, load};
 use crate::series::is_pattern;
-use crate::surface_mesh::{SurfaceMesh, channel, display_colours, texture, unit_isovalue};
+use crate::surface_mesh::{SurfaceMesh, channel, display_colours, unit_isovalue};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -20,6 +21,7 @@ and, in .ply as `radiance_r`, `radiance_g`, `radiance_b` and in .vtp as `radianc
 Examples:
   isolume extract head.nii.gz --isovalue 80 -o head.ply
   isolume extract baked.vti --isovalue 80 -o textured.ply --refine 2
+  isolume extract baked.vti --isovalue 80 -o exact.ply --gather-rays 256    light by rays from every vertex
   isolume extract baked.vti --isovalue 80 -o textured.glb     for browsers, Blender, ChimeraX, PowerPoint")]
 pub(super) struct Extract {
     /// Volume, scene file (.toml), or bake (.vti, .vtm)
@@ -36,6 +38,8 @@ pub(super) struct Extract {
     /// Cut every cell into R³ by trilinear interpolation first, so that the triangles follow the surface more closely
     #[arg(long, default_value_t = 1, value_name = "R")]
     refine: usize,
+    #[command(flatten)]
+    rays: FinalGatherOptions,
     /// Print vertices, triangles and seconds as JSON
     #[arg(long)]
     json: bool,
@@ -47,8 +51,19 @@ impl Extract {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
         expect_extension(&self.output, &["ply", "obj", "glb", "vtp"])?;
         outputs([&*self.output], &Inputs::of(&self.input, &self.scene)?)?;
+        let rays = self.rays.settings()?;
         let begun = Instant::now();
         let (scene, baked) = open_scene(&self.input, &self.scene, self.field.as_deref())?;
+        match (rays, &baked) {
+            (Some(_), None) => {
+                return Err(Error::invalid(
+                    &self.input,
+                    "is no bake: --shadow-rays, --gather-rays are for the light of one; leave them out, or bake first",
+                ));
+            }
+            (Some(rays), Some(baked)) => rays.check(baked).map_err(|e| e.in_file(&self.input))?,
+            (None, _) => {}
+        }
         let isovalue = match &baked {
             // There is light on isosurfaces of the sweep only.
             Some(_) => unit_isovalue(&scene.field, self.isovalue).map_err(|e| self.without_light(&e))?,
@@ -56,9 +71,11 @@ impl Extract {
         };
         unless_interrupted()?;
         let mesh = SurfaceMesh::extract(&scene, isovalue, self.refine)?;
-        let radiance = baked.as_ref().map(|b| texture(b, &mesh.positions)).transpose()?;
-        let channels: Option<[Vec<f32>; 3]> = radiance.as_ref().map(|r| [0, 1, 2].map(|c| channel(r, c)));
-        let colours = radiance.as_ref().zip(baked.as_ref()).map(|(r, b)| display_colours(r, b.exposure));
+        let found = baked.as_ref().map(|b| light(b, rays, &mesh.positions, progress)).transpose();
+        let found = found.map_err(|e| e.in_file(&self.input))?;
+        let radiance = found.as_ref().map(|f| &f.radiance);
+        let channels: Option<[Vec<f32>; 3]> = radiance.map(|r| [0, 1, 2].map(|c| channel(r, c)));
+        let colours = radiance.zip(baked.as_ref()).map(|(r, b)| display_colours(r, b.exposure));
         let properties: Vec<(&str, &[f32])> = match &channels {
             Some([r, g, b]) => vec![("radiance_r", r), ("radiance_g", g), ("radiance_b", b)],
             None => Vec::new(),
@@ -72,6 +89,7 @@ impl Extract {
                 "vertices": mesh.positions.len(),
                 "triangles": mesh.triangles.len(),
                 "lit": radiance.is_some(),
+                "rays": found.as_ref().map_or(0, |f| f.rays),
                 "seconds": begun.elapsed().as_secs_f64(),
             });
             println!("{numbers:#}");

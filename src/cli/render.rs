@@ -1,6 +1,7 @@
 //! `isolume render`: a picture of one isosurface.
 
 use super::extract::open_bake;
+use super::final_gather::FinalGatherOptions;
 use super::reference::picture;
 use super::{device, expect_extension, outputs};
 use crate::error::{Error, Result};
@@ -24,6 +25,7 @@ Examples:
   isolume render lit.vti --isovalue 80 -o lit.png
   isolume render lit.vti --isovalue 80 -o local.png --local            the same view as other tools would light it
   isolume render lit.vti --isovalue 80 -o side.exr --eye 90,-300,120 --target 90,108,90
+  isolume render lit.vti --isovalue 80 -o exact.png --gather-rays 16             nearly as by paths, without their noise
   isolume render lit.vti --isovalue 80 -o truth.png --reference --samples 256")]
 pub(super) struct Render {
     /// A bake (.vti, .vtm); with --reference or --local also a volume or scene file
@@ -39,10 +41,10 @@ pub(super) struct Render {
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// Plain local shading of the same view, for comparison
-    #[arg(long)]
+    #[arg(long, conflicts_with_all = ["shadow_rays", "gather_rays"])]
     local: bool,
     /// Path-trace the isosurface's triangles instead of using the bake's light
-    #[arg(long, conflicts_with = "local")]
+    #[arg(long, conflicts_with_all = ["local", "shadow_rays", "gather_rays"])]
     reference: bool,
     /// Path-trace the trilinear surface itself instead of triangles, caps included
     #[arg(long, requires = "reference")]
@@ -71,6 +73,8 @@ pub(super) struct Render {
     /// Brightness: multiplies the bake's exposure
     #[arg(long, default_value_t = 1.0, value_name = "FACTOR")]
     exposure: f64,
+    #[command(flatten)]
+    rays: FinalGatherOptions,
     #[command(flatten)]
     scene: SceneOptions,
 }
@@ -108,10 +112,12 @@ impl Render {
         if !(self.exposure > 0.0 && self.exposure.is_finite()) {
             return Err(Error::Invalid(format!("--exposure {}: must be a positive finite number", self.exposure)));
         }
+        let gather = self.rays.settings()?;
         let baked = match open_bake(&self.file, &self.scene)? {
             None if !self.reference && !self.local => Some(BakedVolume::read(&self.file)?),
             found => found,
         };
+        gather.zip(baked.as_ref()).map_or(Ok(()), |(g, b)| g.check(b)).map_err(|e| e.in_file(&self.file))?;
         let loaded = match baked {
             Some(_) => None,
             None => Some(load(&self.file, &self.scene)?.scene),
@@ -158,10 +164,10 @@ impl Render {
         let rendered = if self.reference {
             baked.as_ref().map_or(Ok(()), BakedVolume::whole).map_err(|e| e.in_file(&self.file))?;
             let picture = picture(scene, isovalue, &camera, self.samples, self.trilinear, &device()?, progress)?;
-            Rendered { picture, unbaked: 0.0 }
+            Rendered { picture, unbaked: 0.0, rays: 0 }
         } else {
             let shading = match &baked {
-                Some(baked) if !self.local => Shading::Baked(baked),
+                Some(baked) if !self.local => Shading::Baked(baked, gather),
                 _ => Shading::Local(exposure),
             };
             render(scene, isovalue, &camera, shading, self.samples, &device()?, progress)?
@@ -172,6 +178,7 @@ impl Render {
                 () if self.trilinear => "path traced, trilinear",
                 () if self.reference => "path traced",
                 () if self.local || baked.is_none() => "local",
+                () if gather.is_some() => "baked, by rays",
                 () => "baked",
             };
             let vector = |v: DVec3| format!("{:?},{:?},{:?}", v.x, v.y, v.z);
@@ -196,7 +203,8 @@ impl Render {
         }
         if progress == Progress::Shown {
             let seconds = begun.elapsed().as_secs_f64();
-            say!("{}: {}×{} in {seconds:.2} s", self.output.display(), camera.size[0], camera.size[1]);
+            let rays = gather.map_or_else(String::new, |_| format!(", {:.1} M rays", rendered.rays as f64 / 1e6));
+            say!("{}: {}×{} in {seconds:.2} s{rays}", self.output.display(), camera.size[0], camera.size[1]);
         }
         if rendered.unbaked > 0.001 {
             say!(

@@ -31,7 +31,7 @@ pub(super) fn figure6(study: &Study, subject: &Subject, name: &str, strategy: St
             &baked.scene,
             subject.main_isovalue(),
             &square(&baked),
-            Shading::Baked(&baked),
+            Shading::Baked(&baked, None),
             8,
             &study.device,
             Progress::Quiet,

@@ -160,7 +160,9 @@ fn all_isosurfaces_are_compared_with_paths() {
     let mut grid = baked.sides[0].1.clone();
     grid.radiance.as_flattened_mut().iter_mut().for_each(|x| *x *= 0.9);
     let settings = SurveySettings { points: 1500, paths: 64, seed: 1 };
-    let dim = isolume::accuracy::survey(&scene, &tracer, (baked.lattice(), &grid), &settings, &|_| true).unwrap();
+    let shown = |p, _| grid.interpolate(baked.lattice(), p);
+    let dim = isolume::accuracy::survey(&scene, &tracer, (baked.lattice(), &grid), &shown, &settings, &|_| true);
+    let dim = dim.unwrap();
     let missing = number(&found, "bias") - dim.bias;
     assert!((1.0..8.0).contains(&missing) && dim.percent_rms > number(&found, "percent_rms") + 1.0, "{dim:?}");
     let said = text(&ok(dir, &["compare", "lit.vti", "-q"]).stdout);

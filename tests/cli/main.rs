@@ -9,6 +9,7 @@ use std::process::{Command, Output};
 mod bad_input;
 mod compare;
 mod engines;
+mod final_gather;
 mod outputs;
 mod pictures;
 mod reproducibility;

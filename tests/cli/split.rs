@@ -21,7 +21,8 @@ fn surveyed(baked: &BakedVolume, grid: &IlluminationGrid) -> Survey {
     let (device, scene) = (Device::new(0).unwrap(), baked.source().unwrap().unwrap());
     let tracer = GraphTracer::new(&device, &scene).unwrap();
     let settings = SurveySettings { points: 2000, paths: 64, seed: 1 };
-    survey(&scene, &tracer, (baked.lattice(), grid), &settings, &|_| true).unwrap()
+    let shown = |p, _| grid.radiance_at(&baked.scene, baked.lattice(), p, baked.scene.surface.outside);
+    survey(&scene, &tracer, (baked.lattice(), grid), &shown, &settings, &|_| true).unwrap()
 }
 
 /// By either engine, on the volume's own grid, on both sides of a finer one, and where some grid points are fitted: at

@@ -1,0 +1,355 @@
+//! What a bake shows where one looks: its light between the points of its grid, or, by rays from the very place, direct
+//! light past what really stands in its way and indirect light by one more final gather, into the bake.
+//! \[Jensen01; Christensen99\]
+//!
+//! A 3D texture blurs light over a voxel. Where one looks, that is seen; where gather rays land, the next reflection
+//! averages over it. What lands within a few voxels sees that blur as well as the eye does: such rays go on as paths.
+
+use crate::brdf::reflected;
+use crate::direct::{Receiver, direct_irradiance};
+use crate::error::{Error, Result};
+use crate::export::bake_file::BakedVolume;
+use crate::flat;
+use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target, split_face};
+use crate::gather::{KnownLight, gathered_irradiance};
+use crate::landing::landing;
+use crate::rng::Stage;
+use crate::scene::{Policy, Scene};
+use crate::tracer::Tracer;
+use glam::DVec3;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// Rays from every place that is looked at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FinalGatherSettings {
+    /// Shadow rays per luminaire, the most, as those of a bake's samples.
+    pub shadow_rays: u32,
+    /// Gather rays; 0 takes indirect light from the grid of a split bake, and that of walls and caps from their
+    /// textures. The more, the less of the bake is taken for true, so that what is off by interpolation ends: only what
+    /// lands beyond √n / 4 cells.
+    pub gather_rays: u32,
+}
+
+impl FinalGatherSettings {
+    /// Refuses what `baked` has no light for.
+    ///
+    /// # Errors
+    /// `NotSupported` without gather rays, if it does not hold indirect light by itself; if it does not hold all that
+    /// lit it, or holds fields that gave each other no light.
+    pub fn check(self, baked: &BakedVolume) -> Result<()> {
+        baked.whole()?;
+        if !baked.companions.is_empty() && baked.scene.policy() == Policy::Independent {
+            return Err(Error::NotSupported(
+                "holds several volumes that give each other no light, and rays see all; name the .vti of one of them"
+                    .into(),
+            ));
+        }
+        let split = |b: &BakedVolume| b.sides.iter().all(|(_, grid)| grid.split.is_some());
+        if self.gather_rays == 0 && !(split(baked) && baked.companions.iter().all(split)) {
+            return Err(Error::NotSupported(
+                "holds direct and indirect light in one, of which --shadow-rays replaces a part; add --gather-rays 64, or \
+                 bake with --split"
+                    .into(),
+            ));
+        }
+        Ok(())
+    }
+
+    /// Hits nearer than this (cells) go on as paths, which are noisy, but not off.
+    fn least_distance(self) -> f32 {
+        (self.gather_rays as f32).sqrt() / 4.0
+    }
+}
+
+/// Light of a bake, found by rays where one looks. The same bits for the same places and indices, on any number of
+/// threads.
+pub struct FinalGather<'a, T> {
+    baked: &'a BakedVolume,
+    tracer: &'a T,
+    settings: FinalGatherSettings,
+    rays: AtomicU64,
+}
+
+/// The seed of all rays: two pictures of a bake differ by what they show.
+const SEED: u64 = 0;
+
+impl<'a, T: Tracer> FinalGather<'a, T> {
+    /// Into `baked`, whose scene `tracer` traces.
+    ///
+    /// # Errors
+    /// As [`FinalGatherSettings::check`].
+    pub fn new(baked: &'a BakedVolume, tracer: &'a T, settings: FinalGatherSettings) -> Result<Self> {
+        settings.check(baked)?;
+        Ok(Self { baked, tracer, settings, rays: AtomicU64::new(0) })
+    }
+
+    /// Radiance that leaves where a picture's `ray` landed, with what luminaires emit. `index` tells places apart.
+    /// `None` on a side that the bake does not hold, without gather rays.
+    pub fn seen(&self, ray: &FlattenedRay, hit: FlattenedHit, index: u64) -> Option<DVec3> {
+        let shown = || seen(self.baked, ray, hit);
+        match hit.target {
+            Target::Cap(_, Side::Higher) => return shown(),
+            Target::Cap(..) | Target::Polygon(_) if self.settings.gather_rays == 0 => return shown(),
+            _ => {}
+        }
+        let Some((receiver, albedo, emission)) = landing(&self.baked.scene, ray, hit) else { return shown() };
+        let luminaire = match hit.target {
+            Target::Polygon(id) if albedo != DVec3::ZERO => self.baked.scene.polygons()[id as usize].emission,
+            Target::Polygon(_) => return shown(),
+            _ => DVec3::ZERO,
+        };
+        Some(self.leaving(&receiver, albedo, emission, index)? + luminaire)
+    }
+
+    /// Radiance that leaves `receiver`, which is no luminaire.
+    fn leaving(&self, receiver: &Receiver, albedo: DVec3, emission: DVec3, index: u64) -> Option<DVec3> {
+        let Self { baked, tracer, settings, .. } = *self;
+        let scene = &baked.scene;
+        let p = receiver.position.as_dvec3();
+        if scene.covers(scene.lattice().to_world(p)) {
+            return Some(emission);
+        }
+        // Only the bake holds the rest of what leaves there.
+        let rest = if settings.gather_rays == 0 { Some(indirect(baked, receiver.departure, p)?) } else { None };
+        let direct = direct_irradiance(scene, tracer, receiver, settings.shadow_rays, (SEED, Stage::Direct, index));
+        self.rays.fetch_add(direct.rays, Ordering::Relaxed);
+        let rest = rest.unwrap_or_else(|| {
+            let known = Landings { baked, least_distance: settings.least_distance() };
+            let light = gathered_irradiance(scene, tracer, &known, receiver, settings.gather_rays, (SEED, index));
+            self.rays.fetch_add(light.estimate.rays, Ordering::Relaxed);
+            reflected(albedo, light.estimate.mean) + emission
+        });
+        Some((reflected(albedo, direct.mean) + rest).max(DVec3::ZERO))
+    }
+
+    /// Radiance that leaves the outside of level set `isovalue` (units of the sweep) at local position `p`. `None` as
+    /// [`FinalGather::seen`].
+    pub fn outside(&self, p: DVec3, isovalue: f32, index: u64) -> Option<DVec3> {
+        let scene = &self.baked.scene;
+        let side = scene.surface.outside;
+        let position = p.as_vec3();
+        let Some(normal) = scene.normal(position.as_dvec3(), side) else { return self.baked.radiance(side, p) };
+        let receiver = Receiver { position, normal, isovalue, departure: Departure::Surface(side) };
+        self.leaving(&receiver, scene.surface.albedo.at(f64::from(isovalue)), scene.surface.emission, index)
+    }
+
+    /// Rays traced so far.
+    pub fn rays(&self) -> u64 {
+        self.rays.load(Ordering::Relaxed)
+    }
+}
+
+/// What leaves a level set at local position `p`, but for what it reflects of direct light; `None` if that is not
+/// stored.
+fn indirect(baked: &BakedVolume, departure: Departure, p: DVec3) -> Option<DVec3> {
+    let (own, side, p) = match departure {
+        Departure::Surface(side) => (baked, side, p),
+        Departure::Companion(n, side) => {
+            let n = usize::from(n);
+            (&baked.companions[n], side, baked.scene.companions()[n].to_index(p))
+        }
+        Departure::Free | Departure::Polygon(_) | Departure::Cap(..) => return None,
+    };
+    let (_, grid) = own.sides.iter().find(|(s, _)| *s == side)?;
+    Some(grid.indirect_at(own.lattice(), p).unwrap_or_default())
+}
+
+/// Baked radiance where a picture's `ray` landed, with what luminaires emit; `None` on a side that is not stored.
+pub fn seen(baked: &BakedVolume, ray: &FlattenedRay, hit: FlattenedHit) -> Option<DVec3> {
+    let scene = &baked.scene;
+    let p = ray.at(hit.t);
+    match hit.target {
+        Target::Surface(side) => baked.radiance(side, p),
+        Target::Companion(n, side) => {
+            let n = usize::from(n);
+            baked.companions[n].radiance(side, scene.companions()[n].to_index(p))
+        }
+        Target::Cap(_, Side::Higher) => Some(DVec3::ZERO),
+        // Beyond the outermost centres linear functions go on, below 0 where light ends.
+        Target::Cap(face, Side::Lower) => cap(baked, face, p, ray.isovalue).map(|light| light.max(DVec3::ZERO)),
+        Target::Polygon(id) => {
+            let polygon = &scene.polygons()[id as usize];
+            // From behind, only luminaires are seen: black.
+            let seen = scene.lattice().axes() * ray.direction.as_dvec3();
+            if seen.dot(polygon.normal()) > 0.0 {
+                return Some(DVec3::ZERO);
+            }
+            let light = wall(baked, id as usize, p, ray.isovalue).unwrap_or_default();
+            Some(polygon.emission + light.max(DVec3::ZERO))
+        }
+    }
+}
+
+/// What the texture of polygon `id` holds at local position `p`, if it has one.
+fn wall(baked: &BakedVolume, id: usize, p: DVec3, isovalue: f32) -> Option<DVec3> {
+    let texture = baked.flats.get(id)?.as_ref()?;
+    let [u, v] = baked.scene.polygons()[id].texture(baked.lattice().to_world(p));
+    Some(texture.lookup([u, v, f64::from(isovalue)]))
+}
+
+/// What the texture of the cap on a face of Ω holds at local position `p`, if it has one: each bake holds its own.
+fn cap(baked: &BakedVolume, face: u8, p: DVec3, isovalue: f32) -> Option<DVec3> {
+    let scene = &baked.scene;
+    let (companion, own) = split_face(face);
+    let holder = companion.map_or(baked, |n| &baked.companions[usize::from(n)]);
+    let texture = holder.flats.get(scene.polygons().len() + usize::from(own))?.as_ref()?;
+    let [u, v] = flat::face_texture(scene, face, p);
+    Some(texture.lookup([u, v, f64::from(isovalue)]))
+}
+
+/// A bake where gather rays land. Rays go on where it holds nothing: from sides and cells that are not stored, and from
+/// walls and caps within solids, whose light there is not.
+struct Landings<'a> {
+    baked: &'a BakedVolume,
+    least_distance: f32,
+}
+
+impl KnownLight for Landings<'_> {
+    fn least_distance(&self) -> f32 {
+        self.least_distance
+    }
+
+    fn radiance(
+        &self,
+        scene: &Scene,
+        (target, within): (Target, bool),
+        position: DVec3,
+        isovalue: f32,
+        _: &mut u64,
+    ) -> Option<DVec3> {
+        let own = |baked: &BakedVolume, side: Side, p: DVec3| {
+            let (_, grid) = baked.sides.iter().find(|(s, _)| *s == side)?;
+            grid.known_at(&baked.scene, baked.lattice(), p, side)
+        };
+        match target {
+            Target::Surface(side) => own(self.baked, side, position),
+            Target::Companion(n, side) => {
+                let n = usize::from(n);
+                own(&self.baked.companions[n], side, scene.companions()[n].to_index(position))
+            }
+            Target::Cap(_, Side::Higher) => None,
+            Target::Cap(face, Side::Lower) => Some(cap(self.baked, face, position, isovalue).unwrap_or_default()),
+            Target::Polygon(_) if within => None,
+            // Those without a texture reflect nothing.
+            Target::Polygon(id) => Some(wall(self.baked, id as usize, position, isovalue).unwrap_or_default()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bake::{BakeOptions, BakeSettings, Engine, bake};
+    use crate::brdf::reflected;
+    use crate::direct::open_irradiance;
+    use crate::embree::{Device, GraphTracer};
+    use crate::field::{Field, Sweep};
+    use crate::polygon::Polygon;
+    use crate::progress::Progress;
+    use crate::scene::{Boundary, Surface};
+    use crate::split::Split;
+    use crate::stats::Moments;
+    use crate::volume::{Lattice, Samples, Volume};
+    use std::f64::consts::TAU;
+
+    const ALBEDO: f64 = 0.5;
+    const GLOW: f64 = 0.3;
+    const RADIUS: f64 = 0.7;
+
+    /// Spheres around the origin of [−1, 1]³, cells of 0.1, that are lit from within or from without.
+    fn spheres(outside: Side, luminaires: Vec<Polygon>) -> Scene {
+        let lattice = Lattice::aligned([21; 3], DVec3::splat(-1.0), DVec3::splat(0.1)).unwrap();
+        let place = |o: usize| lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)));
+        let samples = (0..lattice.len()).map(|o| place(o).length()).collect();
+        let volume = Volume::new("spheres", lattice.clone(), Samples::F64(samples)).unwrap();
+        let field = Field::new(&volume, Sweep::new(0.2, 0.9).unwrap()).unwrap();
+        let albedo = DVec3::splat(ALBEDO).into();
+        let surface = Surface { albedo, emission: DVec3::splat(GLOW), outside, both_sides: false };
+        Scene::new(field, surface, Boundary::Open, luminaires).unwrap()
+    }
+
+    /// A bake of `scene` whose light is the same everywhere.
+    fn baked(scene: Scene, radiance: f32, split: Option<[f32; 2]>) -> BakedVolume {
+        let options = BakeOptions {
+            engine: Some(Engine::Photon),
+            photons: Some(100),
+            shadow_rays: Some(1),
+            gather_rays: Some(1),
+            ..BakeOptions::default()
+        };
+        let settings = BakeSettings::new(&options, &scene).unwrap();
+        let bake = bake(&scene, &settings, &Device::new(1).unwrap(), Progress::Quiet).unwrap();
+        let mut baked = BakedVolume::new(scene, bake);
+        let grid = &mut baked.sides[0].1;
+        grid.radiance.fill([radiance; 3]);
+        let all = |x| vec![[x; 3]; grid.mask.len()];
+        grid.split = split.map(|[indirect, visible]| Split { indirect: all(indirect), visible: all(visible) });
+        baked
+    }
+
+    /// What leaves places all over the sphere of [`RADIUS`], with what is expected there.
+    fn found(
+        baked: &BakedVolume,
+        [shadow_rays, gather_rays]: [u32; 2],
+        places: u32,
+        expected: impl Fn(DVec3, DVec3) -> f64,
+    ) -> Moments {
+        let device = Device::new(0).unwrap();
+        let tracer = GraphTracer::new(&device, &baked.scene).unwrap();
+        let gather = FinalGather::new(baked, &tracer, FinalGatherSettings { shadow_rays, gather_rays }).unwrap();
+        let mut off = Moments::default();
+        for i in 0..places {
+            let z = 1.0 - 2.0 * (f64::from(i) + 0.5) / f64::from(places);
+            let turn = TAU * f64::from(i) * 0.618_034;
+            let n = DVec3::new((1.0 - z * z).sqrt() * turn.cos(), (1.0 - z * z).sqrt() * turn.sin(), z);
+            let p = baked.lattice().to_index(RADIUS * n);
+            let c = baked.scene.field.value(p) as f32;
+            let light = gather.outside(p, c, u64::from(i)).unwrap();
+            off.push(light.x - expected(p, baked.scene.normal(p, baked.scene.surface.outside).unwrap()));
+        }
+        assert!(gather.rays() >= u64::from(places * gather_rays));
+        off
+    }
+
+    /// Within a sphere that glows e and reflects ρ there is e / (1 − ρ) everywhere. Of a bake that is off by d a few
+    /// rays, all of which it answers but grazing ones, see ρ d; many, all of which are too near to trust it, nothing.
+    #[test]
+    fn what_is_near_is_found_by_paths() {
+        let within = GLOW / (1.0 - ALBEDO);
+        for off in [0.0, 0.4] {
+            let wrong = baked(spheres(Side::Lower, Vec::new()), (within + off) as f32, None);
+            let trusted = found(&wrong, [1, 16], 200, |_, _| within + ALBEDO * off);
+            let allowed = 0.02 * off + 4.5 * trusted.std_error();
+            assert!(allowed < 0.02 && trusted.mean().abs() < allowed, "{off}: {} ± {allowed}", trusted.mean());
+            // √n / 4 is 16 cells, and the sphere 14 wide.
+            let paths = found(&wrong, [1, 4096], 40, |_, _| within);
+            let allowed = 4.5 * paths.std_error();
+            assert!(allowed < 0.003 && paths.mean().abs() < allowed, "{off}: {} ± {allowed}", paths.mean());
+        }
+    }
+
+    /// Nothing hides a luminaire from a sphere but its own horizon: shadow rays find the closed form, whatever the bake
+    /// says is visible, and the rest as the bake has it.
+    #[test]
+    fn shadow_rays_replace_the_visible_share() {
+        let corners = [[-0.3, -0.3], [0.3, -0.3], [0.3, 0.3], [-0.3, 0.3]].map(|[x, y]| DVec3::new(y, x, 1.4));
+        let above = Polygon::new("above", corners.to_vec(), DVec3::ZERO, DVec3::splat(3.0)).unwrap();
+        let scene = spheres(Side::Higher, vec![above]);
+        let own = scene.clone();
+        let split = baked(scene, 9.0, Some([0.25, 0.1]));
+        let direct = |p, n| reflected(DVec3::splat(ALBEDO), open_irradiance(&own, p, n)).x;
+        let off = found(&split, [64, 0], 300, |p, n| 0.25 + direct(p, n));
+        assert!(off.mean().abs() < 1e-3 && off.variance() < 1e-4, "{} {}", off.mean(), off.variance());
+        let lit = found(&split, [64, 0], 300, |_, _| 0.25);
+        assert!(lit.mean() > 0.01, "{}", lit.mean());
+    }
+
+    #[test]
+    fn what_the_bake_cannot_tell_is_refused() {
+        let whole = baked(spheres(Side::Lower, Vec::new()), 1.0, None);
+        let told = |settings: FinalGatherSettings| settings.check(&whole).map_err(|e| e.to_string());
+        let refused = told(FinalGatherSettings { shadow_rays: 16, gather_rays: 0 }).unwrap_err();
+        assert!(refused.contains("--gather-rays") && refused.contains("--split"), "{refused}");
+        assert_eq!(told(FinalGatherSettings { shadow_rays: 16, gather_rays: 4 }), Ok(()));
+    }
+}
