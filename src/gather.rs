@@ -15,7 +15,8 @@ use std::f64::consts::PI;
 
 /// Light that is known where gather rays land.
 pub trait KnownLight: Sync {
-    /// What hits nearer than this (cells of the scene's lattice) find is found by paths instead; 0 trusts all.
+    /// What hits nearer than this (cells of the scene's lattice) find is found by paths instead, and all that is near
+    /// in a cavity ([`CAVITY`]); 0 trusts all.
     #[inline]
     fn least_distance(&self) -> f32 {
         0.0
@@ -68,8 +69,11 @@ const CORNERS: usize = 4;
 /// One of so many of a receiver's rays that land so goes on, for all of them: it corrects what the cache says, which is
 /// the mean of the rays that it stands for but for a part that light in corners adds. \[Arvo90\]
 const SHARE: u64 = 8;
-/// Fewest rays that show a receiver to be sealed off from all light.
+/// Fewest rays that show a receiver to be sealed off, from all light or from all that is far.
 const PILOT: u32 = 16;
+/// A receiver whose first rays all end on level sets within this many cells is in a cavity, which may have closed or
+/// opened between the isovalues that its light is interpolated from: nothing nearer than they are is trusted there.
+pub const CAVITY: f32 = 16.0;
 
 /// Indirect irradiance at `receiver`: π/M Σ L over `rays` cosine-distributed directions. Luminaires count 0, since
 /// direct light is counted apart; what leaves everything carries nothing. \[BB09 Eq. 2\] A receiver that sees nothing
@@ -92,16 +96,33 @@ pub fn gathered_irradiance<T: Tracer, L: KnownLight>(
     // Rays that landed, and of them those that found any light.
     let (mut landed, mut lit) = (0, 0);
     let turn = Rng::stream(seed, Stage::Gather, index << 20 ^ 0xF_FFFF).bits();
-    let mut corners = Corners { scene, tracer, light, turn };
+    let ray = |i: u32| {
+        let direction = frame.to_world(cosine_hemisphere(set.point2(i, 0)));
+        scene.ray(receiver.position, direction, receiver.isovalue, receiver.departure)
+    };
     let trusted = light.least_distance() == 0.0;
+    let mut pilot = [None; PILOT as usize];
+    let mut least_distance = light.least_distance();
+    if !trusted {
+        let shown = (0..rays).zip(&mut pilot).map(|(i, hit)| {
+            let ray = ray(i);
+            *hit = tracer.intersect(&ray);
+            hit.filter(|hit| is_level_set(hit.target)).map_or(f32::INFINITY, |hit| hit.t * ray.direction.length())
+        });
+        let farthest = shown.fold(0.0, f32::max);
+        if farthest < CAVITY {
+            least_distance = least_distance.max(farthest);
+        }
+    }
+    let mut corners = Corners { scene, tracer, light, least_distance, turn };
     for i in 0..rays {
         if trusted && i == PILOT.max(rays / 4) && landed == i && lit == 0 {
             break;
         }
         traced += 1;
-        let direction = frame.to_world(cosine_hemisphere(set.point2(i, 0)));
-        let ray = scene.ray(receiver.position, direction, receiver.isovalue, receiver.departure);
-        let radiance = tracer.intersect(&ray).map_or(DVec3::ZERO, |hit| {
+        let ray = ray(i);
+        let hit = if trusted || i >= PILOT { tracer.intersect(&ray) } else { pilot[i as usize] };
+        let radiance = hit.map_or(DVec3::ZERO, |hit| {
             landed += 1;
             let mut rng = || Rng::stream(seed, Stage::Gather, index << 20 ^ u64::from(i));
             corners.radiance(ray, hit, &mut rng, &mut misses, &mut traced)
@@ -139,6 +160,12 @@ fn near(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> bool {
     cells.length_squared() < NEAR * NEAR
 }
 
+/// Whether a hit is on a level set of any field.
+#[inline]
+fn is_level_set(target: Target) -> bool {
+    matches!(target, Target::Surface(_) | Target::Companion(..))
+}
+
 /// Whether a hit is on the inside of a cap, whose light nothing holds: few scenes have any.
 #[inline]
 fn is_cap_from_within(hit: FlattenedHit) -> bool {
@@ -149,13 +176,13 @@ fn is_cap_from_within(hit: FlattenedHit) -> bool {
 #[inline]
 fn found(
     scene: &Scene,
-    light: &impl KnownLight,
+    (light, least_distance): (&impl KnownLight, f32),
     ray: &FlattenedRay,
     hit: FlattenedHit,
     misses: &mut u64,
 ) -> Option<DVec3> {
-    let near = light.least_distance();
-    if is_cap_from_within(hit) || (near > 0.0 && hit.t * ray.direction.length() < near) {
+    let near = least_distance > 0.0 && hit.t * ray.direction.length() < least_distance;
+    if near || is_cap_from_within(hit) {
         return None;
     }
     let target = (hit.target, scene.leaves_within(ray.departure));
@@ -167,6 +194,8 @@ struct Corners<'a, T, L> {
     scene: &'a Scene,
     tracer: &'a T,
     light: &'a L,
+    /// Hits nearer than this (cells) go on as paths.
+    least_distance: f32,
     /// Counts the rays that landed near.
     turn: u64,
 }
@@ -183,7 +212,7 @@ impl<T: Tracer, L: KnownLight> Corners<'_, T, L> {
         misses: &mut u64,
         rays: &mut u64,
     ) -> DVec3 {
-        let known = found(self.scene, self.light, &ray, hit, misses);
+        let known = found(self.scene, (self.light, self.least_distance), &ray, hit, misses);
         let Some(there) = known else { return self.path(ray, hit, known, &mut rng(), misses, rays) };
         if there == DVec3::ZERO || !near(self.scene, &ray, hit) {
             return there;
@@ -207,7 +236,7 @@ impl<T: Tracer, L: KnownLight> Corners<'_, T, L> {
         misses: &mut u64,
         rays: &mut u64,
     ) -> DVec3 {
-        let Self { scene, tracer, light, .. } = *self;
+        let Self { scene, tracer, light, least_distance, .. } = *self;
         let (mut total, mut weight) = (DVec3::ZERO, DVec3::ONE);
         let mut corners = 0;
         loop {
@@ -239,7 +268,7 @@ impl<T: Tracer, L: KnownLight> Corners<'_, T, L> {
             *rays += 1;
             let Some(next) = tracer.intersect(&ray) else { return total };
             hit = next;
-            known = found(scene, light, &ray, hit, misses);
+            known = found(scene, (light, least_distance), &ray, hit, misses);
         }
     }
 }
