@@ -109,16 +109,17 @@ impl<'a, T: Tracer> FinalGather<'a, T> {
         if scene.covers(scene.lattice().to_world(p)) {
             return Some(emission);
         }
-        // Only the bake holds the rest of what leaves there.
-        let rest = if settings.gather_rays == 0 { Some(indirect(baked, receiver.departure, p)?) } else { None };
+        let rest = match settings.gather_rays {
+            0 => indirect(baked, receiver.departure, p)?,
+            gather_rays => {
+                let known = Landings { baked, least_distance: settings.least_distance() };
+                let light = gathered_irradiance(scene, tracer, &known, receiver, gather_rays, (SEED, index)).estimate;
+                self.rays.fetch_add(light.rays, Ordering::Relaxed);
+                reflected(albedo, light.mean) + emission
+            }
+        };
         let direct = direct_irradiance(scene, tracer, receiver, settings.shadow_rays, (SEED, Stage::Direct, index));
         self.rays.fetch_add(direct.rays, Ordering::Relaxed);
-        let rest = rest.unwrap_or_else(|| {
-            let known = Landings { baked, least_distance: settings.least_distance() };
-            let light = gathered_irradiance(scene, tracer, &known, receiver, settings.gather_rays, (SEED, index));
-            self.rays.fetch_add(light.estimate.rays, Ordering::Relaxed);
-            reflected(albedo, light.estimate.mean) + emission
-        });
         Some((reflected(albedo, direct.mean) + rest).max(DVec3::ZERO))
     }
 
@@ -139,19 +140,31 @@ impl<'a, T: Tracer> FinalGather<'a, T> {
     }
 }
 
+/// The bake that holds the level sets of companion `n`, or of the scene's own field, and local position `p` in its
+/// frame.
+fn holder(baked: &BakedVolume, n: Option<u8>, p: DVec3) -> (&BakedVolume, DVec3) {
+    let Some(n) = n.map(usize::from) else { return (baked, p) };
+    (&baked.companions[n], baked.scene.companions()[n].to_index(p))
+}
+
 /// What leaves a level set at local position `p`, but for what it reflects of direct light; `None` if that is not
 /// stored.
 fn indirect(baked: &BakedVolume, departure: Departure, p: DVec3) -> Option<DVec3> {
-    let (own, side, p) = match departure {
-        Departure::Surface(side) => (baked, side, p),
-        Departure::Companion(n, side) => {
-            let n = usize::from(n);
-            (&baked.companions[n], side, baked.scene.companions()[n].to_index(p))
-        }
+    let (n, side) = match departure {
+        Departure::Surface(side) => (None, side),
+        Departure::Companion(n, side) => (Some(n), side),
         Departure::Free | Departure::Polygon(_) | Departure::Cap(..) => return None,
     };
+    let (own, p) = holder(baked, n, p);
     let (_, grid) = own.sides.iter().find(|(s, _)| *s == side)?;
     Some(grid.indirect_at(own.lattice(), p).unwrap_or_default())
+}
+
+/// What leaves a level set at local position `p`; `None` if that is not stored, or no point around holds something.
+fn stored(baked: &BakedVolume, n: Option<u8>, side: Side, p: DVec3) -> Option<DVec3> {
+    let (own, p) = holder(baked, n, p);
+    let (_, grid) = own.sides.iter().find(|(s, _)| *s == side)?;
+    grid.known_at(&own.scene, own.lattice(), p, side)
 }
 
 /// Baked radiance where a picture's `ray` landed, with what luminaires emit; `None` on a side that is not stored.
@@ -161,8 +174,8 @@ pub fn seen(baked: &BakedVolume, ray: &FlattenedRay, hit: FlattenedHit) -> Optio
     match hit.target {
         Target::Surface(side) => baked.radiance(side, p),
         Target::Companion(n, side) => {
-            let n = usize::from(n);
-            baked.companions[n].radiance(side, scene.companions()[n].to_index(p))
+            let (own, p) = holder(baked, Some(n), p);
+            own.radiance(side, p)
         }
         Target::Cap(_, Side::Higher) => Some(DVec3::ZERO),
         // Beyond the outermost centres linear functions go on, below 0 where light ends.
@@ -211,22 +224,15 @@ impl KnownLight for Landings<'_> {
 
     fn radiance(
         &self,
-        scene: &Scene,
+        _: &Scene,
         (target, within): (Target, bool),
         position: DVec3,
         isovalue: f32,
         _: &mut u64,
     ) -> Option<DVec3> {
-        let own = |baked: &BakedVolume, side: Side, p: DVec3| {
-            let (_, grid) = baked.sides.iter().find(|(s, _)| *s == side)?;
-            grid.known_at(&baked.scene, baked.lattice(), p, side)
-        };
         match target {
-            Target::Surface(side) => own(self.baked, side, position),
-            Target::Companion(n, side) => {
-                let n = usize::from(n);
-                own(&self.baked.companions[n], side, scene.companions()[n].to_index(position))
-            }
+            Target::Surface(side) => stored(self.baked, None, side, position),
+            Target::Companion(n, side) => stored(self.baked, Some(n), side, position),
             Target::Cap(_, Side::Higher) => None,
             Target::Cap(face, Side::Lower) => Some(cap(self.baked, face, position, isovalue).unwrap_or_default()),
             Target::Polygon(_) if within => None,

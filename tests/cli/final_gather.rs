@@ -2,6 +2,8 @@
 
 use super::{ok, refused, text};
 use exr::prelude::read_all_flat_layers_from_file;
+use glam::DVec3;
+use isolume::volume::{Lattice, Samples, Volume};
 use std::path::Path;
 
 /// Linear RGB of a small picture.
@@ -36,19 +38,28 @@ fn pictures_by_rays_are_as_paths_have_them() {
     let two = "[[volume]]\nname = \"bumps\"\ngenerator = \"bumps\"\nsize = 17\nisovalues = [3.6, 95]\n\
                [[volume]]\nname = \"ball\"\ngenerator = \"sphere\"\nsize = 13\norigin = [0.05, 0.15, 0.01]\nscale = 0.3\n\
                isovalues = [0.02, 0.2]\nalbedo = [0.8, 0.12, 0.1]\noutside = \"higher\"\n";
-    let capped = "[surface]\nboundary = \"capped\"\nsides = \"both\"\n[box]\nmargin = 0.3\n";
+    // Its solid ends in a cap towards the camera, with a hole.
+    let lattice = Lattice::aligned([13; 3], DVec3::ZERO, DVec3::splat(1.0 / 12.0)).unwrap();
+    let falling = (0..lattice.len()).map(|o| {
+        let x = lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)));
+        1.0 - x.y - 1.5 * (0.35 - x.with_y(0.5).distance(DVec3::splat(0.5))).max(0.0)
+    });
+    let volume = Volume::new("falling", lattice.clone(), Samples::F64(falling.collect())).unwrap();
+    volume.write(dir.join("falling.vti")).unwrap();
+    let capped = "isovalues = [0.1, 0.9]\n[volume]\nfile = \"falling.vti\"\n[surface]\nboundary = \"capped\"\n\
+                  sides = \"both\"\n[box]\nmargin = 0.3\n";
     let glowing = "[surface]\nalbedo = [{ isovalue = 0, colour = [0.9, 0.2, 0.2] }, { isovalue = 100, colour = 0.5 }]\n\
                    emission = [0.0, 0.3, 0.1]\n";
     let scenes = [
-        ("open", BUMPS.to_owned(), "lit.vti"),
-        ("capped", [BUMPS, capped].concat(), "lit.vti"),
-        ("glowing", [BUMPS, glowing].concat(), "lit.vti"),
-        ("two", two.to_owned(), "lit.vtm"),
+        ("open", BUMPS.to_owned(), "lit.vti", "30"),
+        ("capped", capped.to_owned(), "lit.vti", "0.7"),
+        ("glowing", [BUMPS, glowing].concat(), "lit.vti", "30"),
+        ("two", two.to_owned(), "lit.vtm", "30"),
     ];
-    for (name, scene, file) in scenes {
+    for (name, scene, file, isovalue) in scenes {
         std::fs::write(dir.join("s.toml"), scene).unwrap();
         ok(dir, &["bake", "s.toml", "-o", file, "--preset", "preview", "-q"]);
-        let isovalue = ["--isovalue", "30"];
+        let isovalue = ["--isovalue", isovalue];
         // Paths are told apart by their direction: two pictures that see the same, with noise of their own.
         let truth = ["40", "40.00001"].map(|fov| {
             let paths = ["--reference", "--trilinear", "--samples", "400", "--fov", fov];
@@ -59,7 +70,7 @@ fn pictures_by_rays_are_as_paths_have_them() {
         let rays = [&bake[..], &["--gather-rays", "32", "--shadow-rays", "16"]].concat();
         let found = percent_off(&draw(dir, &rays), &truth);
         println!("{name}: {stored:.2} % as stored, {found:.2} by rays");
-        assert!(found < 0.6 * stored && found < 2.5, "{name}: {stored} {found}");
+        assert!(found < 0.7 * stored && found < 2.5, "{name}: {stored} {found}");
     }
 }
 
