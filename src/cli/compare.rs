@@ -144,8 +144,10 @@ impl Compare {
         let settings = SurveySettings { points: self.points, paths: self.paths, seed: self.seed };
         let device = device()?;
         let tracer = GraphTracer::new(&device, &scene)?;
-        let own = GraphTracer::new(&device, &baked.scene)?;
-        let gather = rays.map(|rays| FinalGather::new(&baked, &own, rays)).transpose().map_err(in_file)?;
+        // On the grid's lattice, which may be finer.
+        let within = rays.map(|_| GraphTracer::new(&device, &baked.scene)).transpose()?;
+        let gather = rays.zip(within.as_ref()).map(|(rays, tracer)| FinalGather::new(&baked, tracer, rays));
+        let gather = gather.transpose().map_err(in_file)?;
         #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
         let shown = |p: DVec3, index| {
             let isovalue = || baked.scene.field.value(p) as f32;

@@ -16,8 +16,8 @@ pub(super) struct FinalGatherOptions {
     /// (default: as many as gather rays; without these the bake must have been made with --split)
     #[arg(long, value_name = "N")]
     shadow_rays: Option<u32>,
-    /// Indirect light of every point that is looked at by N rays into the bake: 64 are within 2 % or so of path
-    /// tracing, 1024 within 1 %, in a tenth of its time
+    /// Indirect light of every point that is looked at by N rays into the bake: as a rule 64 are within 2 % or so of
+    /// path tracing, 1024 within 1 %, in a tenth of its time
     #[arg(long, value_name = "N")]
     gather_rays: Option<u32>,
 }

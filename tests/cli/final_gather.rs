@@ -29,15 +29,16 @@ fn percent_off(picture: &[f32], truth: &[Vec<f32>; 2]) -> f64 {
 
 const BUMPS: &str = "isovalues = [3.6, 95]\n[volume]\ngenerator = \"bumps\"\nsize = 17\n";
 
+const TWO: &str = "[[volume]]\nname = \"bumps\"\ngenerator = \"bumps\"\nsize = 17\nisovalues = [3.6, 95]\n\
+     [[volume]]\nname = \"ball\"\ngenerator = \"sphere\"\nsize = 13\norigin = [0.05, 0.15, 0.01]\nscale = 0.3\n\
+     isovalues = [0.02, 0.2]\nalbedo = [0.8, 0.12, 0.1]\noutside = \"higher\"\n";
+
 /// Solids that are open or capped, glow, and stand beside others: pictures by rays are nearer to path traced ones than
 /// those of the light that is stored.
 #[test]
 fn pictures_by_rays_are_as_paths_have_them() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
-    let two = "[[volume]]\nname = \"bumps\"\ngenerator = \"bumps\"\nsize = 17\nisovalues = [3.6, 95]\n\
-               [[volume]]\nname = \"ball\"\ngenerator = \"sphere\"\nsize = 13\norigin = [0.05, 0.15, 0.01]\nscale = 0.3\n\
-               isovalues = [0.02, 0.2]\nalbedo = [0.8, 0.12, 0.1]\noutside = \"higher\"\n";
     // Its solid ends in a cap towards the camera, with a hole.
     let lattice = Lattice::aligned([13; 3], DVec3::ZERO, DVec3::splat(1.0 / 12.0)).unwrap();
     let falling = (0..lattice.len()).map(|o| {
@@ -54,7 +55,7 @@ fn pictures_by_rays_are_as_paths_have_them() {
         ("open", BUMPS.to_owned(), "lit.vti", "30"),
         ("capped", capped.to_owned(), "lit.vti", "0.7"),
         ("glowing", [BUMPS, glowing].concat(), "lit.vti", "30"),
-        ("two", two.to_owned(), "lit.vtm", "30"),
+        ("two", TWO.to_owned(), "lit.vtm", "30"),
     ];
     for (name, scene, file, isovalue) in scenes {
         std::fs::write(dir.join("s.toml"), scene).unwrap();
@@ -143,4 +144,13 @@ fn rays_need_a_bake_that_has_use_for_them() {
         .stderr,
     );
     assert!(said.contains("--local") && said.contains("--gather-rays"), "{said}");
+    // What others lit needs them, and what they did not must not see them.
+    for (policy, file, words) in
+        [("joint", "two-ball.vti", "name the .vtm"), ("independent", "two.vtm", "name the .vti")]
+    {
+        std::fs::write(dir.join("two.toml"), format!("policy = \"{policy}\"\n{TWO}")).unwrap();
+        ok(dir, &["bake", "two.toml", "-o", "two.vtm", "--preset", "preview", "-q"]);
+        let given = ["render", file, "--isovalue", "0.1", "-o", "p.png", "--gather-rays", "8"];
+        refused(dir, &given, &[file, words]);
+    }
 }
