@@ -12,7 +12,7 @@ use crate::export::bake_file::BakedVolume;
 use crate::flat;
 use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target, split_face};
 use crate::gather::{KnownLight, gathered_irradiance};
-use crate::landing::landing;
+use crate::landing::{Landing, landing};
 use crate::rng::Stage;
 use crate::scene::{Policy, Scene};
 use crate::tracer::Tracer;
@@ -92,7 +92,8 @@ impl<'a, T: Tracer> FinalGather<'a, T> {
             Target::Cap(..) | Target::Polygon(_) if self.settings.gather_rays == 0 => return shown(),
             _ => {}
         }
-        let Some((receiver, albedo, emission)) = landing(&self.baked.scene, ray, hit) else { return shown() };
+        let Some(landed) = landing(&self.baked.scene, ray, hit) else { return shown() };
+        let Landing { receiver, albedo, emission, .. } = landed;
         let luminaire = match hit.target {
             Target::Polygon(id) if albedo != DVec3::ZERO => self.baked.scene.polygons()[id as usize].emission,
             Target::Polygon(_) => return shown(),
@@ -183,8 +184,7 @@ pub fn seen(baked: &BakedVolume, ray: &FlattenedRay, hit: FlattenedHit) -> Optio
         Target::Polygon(id) => {
             let polygon = &scene.polygons()[id as usize];
             // From behind, only luminaires are seen: black.
-            let seen = scene.lattice().axes() * ray.direction.as_dvec3();
-            if seen.dot(polygon.normal()) > 0.0 {
+            if !scene.sees_front(ray, id) {
                 return Some(DVec3::ZERO);
             }
             let light = wall(baked, id as usize, p, ray.isovalue).unwrap_or_default();

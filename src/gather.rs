@@ -3,7 +3,7 @@
 
 use crate::direct::{Estimate, Receiver, direct_once, luminance};
 use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target};
-use crate::landing::{landing, touches};
+use crate::landing::{Landing, MOST_LANDINGS, landing};
 use crate::radiance_cache::RadianceCache;
 use crate::rng::{Rng, Sobol, Stage};
 use crate::scene::Scene;
@@ -69,16 +69,18 @@ const CORNERS: usize = 4;
 /// One of so many of a receiver's rays that land so goes on, for all of them: it corrects what the cache says, which is
 /// the mean of the rays that it stands for but for a part that light in corners adds. \[Arvo90\]
 const SHARE: u64 = 8;
-/// Fewest rays that show a receiver to be sealed off, from all light or from all that is far.
+/// Fewest rays that show a receiver to be sealed off from all that is far.
 const PILOT: u32 = 16;
+/// Fewest dark rays that speak for the rest: ending there takes slivers of light away and brings none back.
+const LEAST_UNANIMOUS: u32 = 64;
 /// A receiver whose first rays all end on level sets within this many cells is in a cavity, which may have closed or
 /// opened between the isovalues that its light is interpolated from: nothing nearer than they are is trusted there.
 pub const CAVITY: f32 = 16.0;
 
 /// Indirect irradiance at `receiver`: π/M Σ L over `rays` cosine-distributed directions. Luminaires count 0, since
 /// direct light is counted apart; what leaves everything carries nothing. \[BB09 Eq. 2\] A receiver that sees nothing
-/// but dark surfaces all around, as inside another field's solid, is known to be dark after a quarter of its rays, if
-/// all `light` is trusted: paths find none now and then where there is some.
+/// but dark surfaces all around, as inside another field's solid, is known to be dark after a quarter of its rays, but at
+/// least 64, if all `light` is trusted: paths find none now and then where there is some.
 pub fn gathered_irradiance<T: Tracer, L: KnownLight>(
     scene: &Scene,
     tracer: &T,
@@ -116,7 +118,7 @@ pub fn gathered_irradiance<T: Tracer, L: KnownLight>(
     }
     let mut corners = Corners { scene, tracer, light, least_distance, turn };
     for i in 0..rays {
-        if trusted && i == PILOT.max(rays / 4) && landed == i && lit == 0 {
+        if trusted && i == LEAST_UNANIMOUS.max(rays / 4) && landed == i && lit == 0 {
             break;
         }
         traced += 1;
@@ -185,6 +187,13 @@ fn found(
     if near || is_cap_from_within(hit) {
         return None;
     }
+    // What is known of a luminaire is its front's.
+    if let Target::Polygon(id) = hit.target
+        && scene.polygons()[id as usize].opaque_back
+        && !scene.sees_front(ray, id)
+    {
+        return Some(DVec3::ZERO);
+    }
     let target = (hit.target, scene.leaves_within(ray.departure));
     light.radiance(scene, target, ray.at(hit.t), ray.isovalue, misses)
 }
@@ -239,17 +248,14 @@ impl<T: Tracer, L: KnownLight> Corners<'_, T, L> {
         let Self { scene, tracer, light, least_distance, .. } = *self;
         let (mut total, mut weight) = (DVec3::ZERO, DVec3::ONE);
         let mut corners = 0;
-        loop {
+        for _ in 0..MOST_LANDINGS {
             if let Some(there) = known {
                 if corners == CORNERS || there == DVec3::ZERO || !near(scene, &ray, hit) {
                     return total + weight * there;
                 }
                 corners += 1;
             }
-            let Some((mut receiver, albedo, emission)) = landing(scene, &ray, hit) else { return total };
-            if touches(scene, &ray, hit) {
-                receiver.departure = ray.departure;
-            }
+            let Some(Landing { receiver, albedo, emission, .. }) = landing(scene, &ray, hit) else { return total };
             total += weight * emission;
             if albedo == DVec3::ZERO {
                 return total;
@@ -270,6 +276,7 @@ impl<T: Tracer, L: KnownLight> Corners<'_, T, L> {
             hit = next;
             known = found(scene, (light, least_distance), &ray, hit, misses);
         }
+        total
     }
 }
 
@@ -361,16 +368,20 @@ mod tests {
         let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[0] as f32).collect();
         let volume = Volume::new("ramp", lattice, Samples::F32(samples)).unwrap();
         let field = Field::new(&volume, Sweep::new(0.0, 8.0).unwrap()).unwrap();
-        let scene = Scene::new(field, Surface::default(), Boundary::Open, Vec::new()).unwrap();
+        let mut walls = cornell_box(field.lattice(), 0.0).unwrap();
+        walls.retain(|p| p.name == "z_min");
+        let scene = Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap();
         let position = DVec3::new(4.0, 4.0, 4.0).as_vec3();
         let receiver = Receiver { position, normal: -DVec3::Z, isovalue: 0.5, departure: Departure::Free };
-        let found = |rays: u32, index: u64| {
-            gathered_irradiance(&scene, &Floor(0), &Patch(1e-6), &receiver, rays, (1, index)).estimate.mean.x
-        };
-        let expected = found(1 << 18, 0);
-        assert!((0.01..0.03).contains(&(expected / PI)), "{expected}");
-        let mut few = Moments::default();
-        (1..4000).for_each(|index| few.push(found(64, index)));
-        assert!((few.mean() - expected).abs() < 4.5 * few.std_error(), "{} {expected}", few.mean());
+        for trust in [1e-6, 0.0] {
+            let found = |rays: u32, index: u64| {
+                gathered_irradiance(&scene, &Floor(0), &Patch(trust), &receiver, rays, (1, index)).estimate.mean.x
+            };
+            let expected = found(1 << 18, 0);
+            assert!((0.01..0.03).contains(&(expected / PI)), "{expected}");
+            let mut few = Moments::default();
+            (1..4000).for_each(|index| few.push(found(64, index)));
+            assert!((few.mean() - expected).abs() < 4.5 * few.std_error(), "{trust}: {} {expected}", few.mean());
+        }
     }
 }

@@ -5,14 +5,30 @@ use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target};
 use crate::scene::Scene;
 use glam::DVec3;
 
-/// What stands at a hit: a receiver, its albedo, and its emission unless it is a luminaire, whose light counts as
-/// direct. `None` where ∇h vanishes.
+/// Landings after which a path ends at the latest: among surfaces that absorb nothing it would go on for ever.
+pub const MOST_LANDINGS: u16 = u16::MAX;
+
+/// What stands where a ray landed.
+#[derive(Clone, Copy, Debug)]
+pub struct Landing {
+    /// The surface, on the side that the ray came to, as what leaves it starts: on the level set that the ray left if a
+    /// polygon or a cap is met there, within the rounding of f32 coordinates. It must not begin behind that.
+    pub receiver: Receiver,
+    /// The surface itself.
+    pub on: Departure,
+    /// What it reflects: nothing on the back of a luminaire.
+    pub albedo: DVec3,
+    /// Radiance that it emits, unless it is a luminaire, whose light counts as direct.
+    pub emission: DVec3,
+}
+
+/// What stands at a hit; `None` where ∇h vanishes.
 #[inline]
-pub fn landing(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> Option<(Receiver, DVec3, DVec3)> {
+pub fn landing(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> Option<Landing> {
     let position = ray.at(hit.t).as_vec3();
     let isovalue = ray.isovalue;
     let none = DVec3::ZERO;
-    let (normal, departure, albedo, emission) = match hit.target {
+    let (normal, on, albedo, emission) = match hit.target {
         Target::Surface(side) => {
             let normal = scene.normal(position.as_dvec3(), side)?;
             (normal, Departure::Surface(side), scene.surface.albedo.at(f64::from(isovalue)), scene.surface.emission)
@@ -20,27 +36,26 @@ pub fn landing(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> Option<(
         Target::Companion(n, side) => {
             let companion = &scene.companions()[usize::from(n)];
             let (normal, surface) = (companion.normal(position.as_dvec3(), side)?, &companion.member.surface);
-            (normal, Departure::Companion(n, side), surface.albedo.at(f64::from(ray.isovalue)), surface.emission)
+            (normal, Departure::Companion(n, side), surface.albedo.at(f64::from(isovalue)), surface.emission)
         }
         Target::Cap(face, side) => {
             let n = scene.face_normal(face);
-            let albedo = scene.face_surface(face).albedo.at(f64::from(ray.isovalue));
+            let albedo = scene.face_surface(face).albedo.at(f64::from(isovalue));
             (if side == Side::Lower { n } else { -n }, Departure::Cap(face, side), albedo, none)
         }
         Target::Polygon(id) => {
             let p = &scene.polygons()[id as usize];
-            // The back of a luminaire is black.
-            let seen = (scene.lattice().axes() * ray.direction.as_dvec3()).dot(p.normal()) < 0.0;
-            (p.normal(), Departure::Polygon(id), if seen { p.albedo } else { none }, none)
+            (p.normal(), Departure::Polygon(id), if scene.sees_front(ray, id) { p.albedo } else { none }, none)
         }
     };
-    Some((Receiver { position, normal, isovalue, departure }, albedo, emission))
+    let departure = if touches(scene, ray, hit) { ray.departure } else { on };
+    Some(Landing { receiver: Receiver { position, normal, isovalue, departure }, on, albedo, emission })
 }
 
-/// Whether a ray from a level set meets a polygon or a cap where it starts, within the rounding of f32 coordinates.
-/// What leaves that there starts on the level set, too: it must not begin behind it. (The polygon itself is no obstacle
-/// if it is met from its front only.)
-pub fn touches(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> bool {
+/// Whether a ray from a level set meets a polygon or a cap where it starts. (The polygon itself is no obstacle if it is
+/// met from its front only.)
+#[inline]
+fn touches(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> bool {
     let opaque_back = match hit.target {
         Target::Polygon(id) => scene.polygons()[id as usize].opaque_back,
         Target::Cap(..) => false,

@@ -46,9 +46,9 @@ pub mod tracer;
 #[allow(unsafe_code, reason = "FFI to Embree: the one place in this crate")]
 pub mod embree;
 // Light transport, generic over the tracer.
-pub mod photon;
 pub mod direct;
 pub mod landing;
+pub mod photon;
 pub mod photon_map;
 pub mod radiance_cache;
 pub mod gather;

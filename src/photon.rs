@@ -1,8 +1,10 @@
 //! Photons in the flattened scene: emission over luminaires and isovalues, scattering inside one hyperplane, energy
 //! kept to the last bit. \[BB09 §2.3; Jensen01\]
 
+use crate::flat;
 use crate::flattened::{Departure, Side, Target};
 use crate::isovalue_axis::IsovalueAxis;
+use crate::landing::{Landing, MOST_LANDINGS, landing};
 use crate::rng::{Rng, Sobol, Stage};
 use crate::scene::Scene;
 use crate::tracer::Tracer;
@@ -143,6 +145,42 @@ impl Photons {
         self.energy.iter_mut().zip(part.energy).for_each(|(a, b)| *a += b);
     }
 
+    /// Keeps what `photon` brings to `target` at local position `x`, but for flats that reflect nothing.
+    #[allow(clippy::cast_possible_truncation, reason = "storage is f32; there are few flats")]
+    fn store(
+        &mut self,
+        scene: &Scene,
+        (photon, bounces): (&Flight, u16),
+        (target, x): (Target, DVec3),
+        landed: Option<&Landing>,
+    ) {
+        // Where a receiver will look: f32.
+        let position = x.as_vec3().as_dvec3();
+        let normal = landed.map(|l| l.receiver.normal);
+        let (flat, [u, v]) = match target {
+            Target::Surface(side) => {
+                let gradient = scene.field.gradient(position);
+                let field = (scene.number(), side);
+                let landed = SurfacePhoton::landed(photon, bounces, field, position.as_vec3(), normal, gradient);
+                return self.surface.push(landed);
+            }
+            Target::Companion(n, side) => {
+                let companion = &scene.companions()[usize::from(n)];
+                let place = companion.to_index(position).as_vec3();
+                let gradient = companion.member.field.gradient(place.as_dvec3());
+                let field = (companion.number, side);
+                return self.surface.push(SurfacePhoton::landed(photon, bounces, field, place, normal, gradient));
+            }
+            // The texture of a cap is its outer side's.
+            Target::Cap(_, Side::Higher) => return,
+            Target::Cap(face, Side::Lower) => (flat::cap(scene, face) as u32, flat::face_texture(scene, face, x)),
+            Target::Polygon(_) if landed.is_none_or(|l| l.albedo == DVec3::ZERO) => return,
+            Target::Polygon(id) => (id, scene.polygons()[id as usize].texture(scene.lattice().to_world(x))),
+        };
+        let uvc = [u as f32, v as f32, photon.isovalue];
+        self.flat.push(FlatPhoton { flat, uvc, power: photon.power.as_vec3(), bounces });
+    }
+
     /// The energy of all bins.
     pub fn total_energy(&self) -> Energy {
         let mut total = Energy::default();
@@ -278,62 +316,20 @@ fn trace_photon<T: Tracer>(
     let mut rng = Rng::stream(settings.seed, Stage::Photon, index);
     out.emitted += 1;
     let Some(mut photon) = emit(scene, settings, sources, total, index) else { return };
-    let lattice = scene.lattice();
     let bin = ((photon.isovalue * ENERGY_BINS as f32) as usize).min(ENERGY_BINS - 1);
-    let energy = &mut out.energy[bin];
-    energy.emitted += photon.power.element_sum();
+    out.energy[bin].emitted += photon.power.element_sum();
     let first = photon.bounces;
-    for bounces in first..=u16::MAX {
+    for bounces in first..=MOST_LANDINGS {
         let ray = scene.ray(photon.origin, photon.direction, photon.isovalue, photon.departure);
         out.rays += 1;
         let Some(hit) = tracer.intersect(&ray) else {
-            energy.escaped += photon.power.element_sum();
+            out.energy[bin].escaped += photon.power.element_sum();
             return;
         };
-        let local = ray.at(hit.t);
-        let position = local.as_vec3();
-        let mut store_flat = |flat: u32, [u, v]: [f64; 2]| {
-            let uvc = [u as f32, v as f32, photon.isovalue];
-            out.flat.push(FlatPhoton { flat, uvc, power: photon.power.as_vec3(), bounces });
-        };
-        let (albedo, normal, departure) = match hit.target {
-            Target::Surface(side) => {
-                let normal = scene.normal(position.as_dvec3(), side);
-                let gradient = scene.field.gradient(position.as_dvec3());
-                let field = (scene.number(), side);
-                out.surface.push(SurfacePhoton::landed(&photon, bounces, field, position, normal, gradient));
-                let albedo = scene.surface.albedo.at(f64::from(photon.isovalue));
-                (albedo, normal, Departure::Surface(side))
-            }
-            Target::Companion(n, side) => {
-                let companion = &scene.companions()[usize::from(n)];
-                let normal = companion.normal(position.as_dvec3(), side);
-                let place = companion.to_index(position.as_dvec3()).as_vec3();
-                let gradient = companion.member.field.gradient(place.as_dvec3());
-                let field = (companion.number, side);
-                out.surface.push(SurfacePhoton::landed(&photon, bounces, field, place, normal, gradient));
-                let albedo = companion.member.surface.albedo.at(f64::from(photon.isovalue));
-                (albedo, normal, Departure::Companion(n, side))
-            }
-            Target::Cap(face, side) => {
-                // The texture of a cap is its outer side's.
-                if side == Side::Lower {
-                    store_flat(crate::flat::cap(scene, face) as u32, crate::flat::face_texture(scene, face, local));
-                }
-                let n = scene.face_normal(face);
-                let n = if side == Side::Lower { n } else { -n };
-                let albedo = scene.face_surface(face).albedo.at(f64::from(photon.isovalue));
-                (albedo, Some(n), Departure::Cap(face, side))
-            }
-            Target::Polygon(id) => {
-                let p = &scene.polygons()[id as usize];
-                if p.albedo != DVec3::ZERO {
-                    store_flat(id, p.texture(lattice.to_world(local)));
-                }
-                (p.albedo, Some(p.normal()), Departure::Polygon(id))
-            }
-        };
-        let Some(normal) = normal else {
+        let landed = landing(scene, &ray, hit);
+        out.store(scene, (&photon, bounces), (hit.target, ray.at(hit.t)), landed.as_ref());
+        let energy = &mut out.energy[bin];
+        let Some(Landing { receiver, albedo, .. }) = landed else {
             out.flat_gradient += 1;
             energy.terminated += photon.power.element_sum();
             return;
@@ -347,12 +343,12 @@ fn trace_photon<T: Tracer>(
         }
         let next = reflected / survival;
         energy.absorbed += (photon.power - next).element_sum();
-        if bounces - first >= settings.max_bounces || bounces == u16::MAX {
+        if bounces - first >= settings.max_bounces || bounces == MOST_LANDINGS {
             energy.terminated += next.element_sum();
             return;
         }
-        let direction = Frame::new(normal).to_world(cosine_hemisphere(rng.unit2()));
-        photon = Flight { origin: position, direction, departure, power: next, ..photon };
+        let direction = Frame::new(receiver.normal).to_world(cosine_hemisphere(rng.unit2()));
+        photon = Flight { origin: receiver.position, direction, departure: receiver.departure, power: next, ..photon };
     }
 }
 
@@ -429,7 +425,11 @@ fn emit(scene: &Scene, settings: &PhotonSettings, sources: &[Source], total: f64
             let falling = field.falling_normal(origin.as_dvec3())?;
             let normal = if side == Side::Lower { falling } else { -falling };
             let diagonal = (lattice.axes() * lattice.far()).length();
+            // On a plateau beside a slope there is a normal, and nothing to emit.
             let power = share * field.gradient(origin.as_dvec3()).length() * diagonal;
+            if power == DVec3::ZERO {
+                return None;
+            }
             let (origin, departure) = match (companion, other) {
                 (Some(n), Some(c)) => (c.to_local(origin.as_dvec3()).as_vec3(), Departure::Companion(n as u8, side)),
                 _ => (origin, Departure::Surface(side)),

@@ -221,6 +221,12 @@ impl Scene {
         }
     }
 
+    /// Whether `ray` comes towards the front of polygon `id`. The back of a luminaire is black.
+    #[inline]
+    pub fn sees_front(&self, ray: &FlattenedRay, id: u32) -> bool {
+        (self.lattice().axes() * ray.direction.as_dvec3()).dot(self.polygons[id as usize].normal()) < 0.0
+    }
+
     /// Whether light within solids is stored, of any field.
     pub fn gathers_within(&self) -> bool {
         self.surface.both_sides || self.companions.iter().any(|c| c.member.surface.both_sides)

@@ -5,7 +5,7 @@ use crate::direct::{Receiver, direct_once};
 use crate::error::Result;
 use crate::export::picture::Picture;
 use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Target};
-use crate::landing::{landing, touches};
+use crate::landing::{Landing, MOST_LANDINGS, landing};
 use crate::luminaire::{Aim, unoccluded};
 use crate::progress::Progress;
 use crate::render::{Camera, trace_picture};
@@ -102,16 +102,13 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
     }
 
     /// Radiance that arrives along `ray`, without what its first hit emits as a luminaire. Russian roulette keeps the
-    /// largest channel.
+    /// largest channel; after [`MOST_LANDINGS`] the path ends.
     fn incoming(&mut self, mut ray: FlattenedRay, rng: &mut Rng) -> DVec3 {
         let (mut total, mut weight) = (DVec3::ZERO, DVec3::ONE);
-        loop {
+        for _ in 0..MOST_LANDINGS {
             self.rays += 1;
             let Some(hit) = self.tracer.intersect(&ray) else { return total };
-            let Some((mut receiver, albedo, emission)) = landing(self.scene, &ray, hit) else { return total };
-            if touches(self.scene, &ray, hit) {
-                receiver.departure = ray.departure;
-            }
+            let Some(Landing { receiver, albedo, emission, .. }) = landing(self.scene, &ray, hit) else { return total };
             total += weight * emission;
             let survival = (weight * albedo).max_element() / weight.max_element();
             if !(survival > 0.0) {
@@ -125,6 +122,7 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
             let direction = Frame::new(receiver.normal).to_world(cosine_hemisphere(rng.unit2()));
             ray = self.scene.ray(receiver.position, direction, ray.isovalue, receiver.departure);
         }
+        total
     }
 }
 
@@ -150,11 +148,11 @@ pub fn path_picture<T: Tracer>(
 
 /// Radiance seen along `ray` of a picture, from one path; what a luminaire emits is seen.
 fn path_radiance<T: Tracer>(scene: &Scene, tracer: &T, ray: &FlattenedRay, hit: FlattenedHit, rng: &mut Rng) -> DVec3 {
-    let Some((receiver, albedo, mut emission)) = landing(scene, ray, hit) else { return DVec3::ZERO };
-    if let Target::Polygon(id) = hit.target {
-        let p = &scene.polygons()[id as usize];
-        let seen = (scene.lattice().axes() * ray.direction.as_dvec3()).dot(p.normal()) < 0.0;
-        emission = if seen { p.emission } else { DVec3::ZERO };
+    let Some(Landing { receiver, albedo, mut emission, .. }) = landing(scene, ray, hit) else { return DVec3::ZERO };
+    if let Target::Polygon(id) = hit.target
+        && scene.sees_front(ray, id)
+    {
+        emission = scene.polygons()[id as usize].emission;
     }
     if albedo == DVec3::ZERO {
         return emission;

@@ -5,7 +5,7 @@ use crate::brdf::reflected;
 use crate::direct::Receiver;
 use crate::field::Field;
 use crate::flattened::{Departure, Side};
-use crate::landing::{landing, touches};
+use crate::landing::{Landing, landing};
 use crate::nearest::{Neighbours, PointGrid};
 use crate::photon::Photons;
 use crate::rng::{Rng, Sobol, Stage};
@@ -180,14 +180,12 @@ impl SurfaceMap {
             let ray = scene.ray(receiver.position, direction, receiver.isovalue, receiver.departure);
             paths.rays += 1;
             let Some(hit) = tracer.intersect(&ray) else { continue };
-            let Some((mut landed, albedo, emission)) = landing(scene, &ray, hit) else { continue };
+            let Some(Landing { receiver: landed, on, albedo, emission }) = landing(scene, &ray, hit) else { continue };
             sum += emission;
             if albedo != DVec3::ZERO {
                 let distance = (scene.lattice().axes() * ray.direction.as_dvec3()).length() * f64::from(hit.t);
-                let (mapped, radius) = self.irradiance(scene, &landed, &mut scratch);
-                if touches(scene, &ray, hit) {
-                    landed.departure = ray.departure;
-                }
+                let surface = Receiver { departure: on, ..landed };
+                let (mapped, radius) = self.irradiance(scene, &surface, &mut scratch);
                 let indirect = if distance < radius { paths.indirect_once(&landed, &mut rng) } else { mapped };
                 sum += reflected(albedo, paths.direct_once(&landed, &mut rng) + indirect);
             }

@@ -109,7 +109,7 @@ fn rays_leave_a_cap_where_others_landed() {
         let ray = scene.ray(local(&scene, at + from), at + y - (at + from), 0.0, Departure::Free);
         let Some(hit) = tracer.intersect(&ray) else { continue };
         let Target::Cap(_, side) = hit.target else { continue };
-        let (receiver, ..) = landing(&scene, &ray, hit).unwrap();
+        let receiver = landing(&scene, &ray, hit).unwrap().receiver;
         let away = Frame::new(receiver.normal).to_world(cosine_hemisphere([rng.unit(), rng.unit()]));
         let ray = scene.ray(receiver.position, away, ray.isovalue, receiver.departure);
         let next = tracer.intersect(&ray);

@@ -8,6 +8,7 @@ mod context;
 mod crossings;
 mod gaps;
 mod invariance;
+mod luminaires;
 mod photons;
 mod samplers;
 mod support;

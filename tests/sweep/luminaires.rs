@@ -5,7 +5,7 @@ use glam::DVec3;
 use isolume::direct::{Receiver, direct_irradiance};
 use isolume::embree::{Device, GraphTracer};
 use isolume::flattened::{Departure, Side, Target};
-use isolume::landing::landing;
+use isolume::landing::{Landing, landing};
 use isolume::luminaire::unoccluded;
 use isolume::polygon::Polygon;
 use isolume::rng::{Sobol, Stage};
@@ -176,7 +176,7 @@ fn one_bounce_near_a_luminaire_keeps_its_energy() {
             let Some(hit) = tracer.intersect(&ray).filter(|h| matches!(h.target, Target::Surface(_))) else {
                 return 0.0;
             };
-            let Some((receiver, ..)) = landing(&scene, &ray, hit) else { return 0.0 };
+            let Some(Landing { receiver, .. }) = landing(&scene, &ray, hit) else { return 0.0 };
             direct_irradiance(&scene, &tracer, &receiver, 32, (1, Stage::Test, (o as u64) << 16 | u64::from(i))).mean.y
         };
         (0..rays).map(hit).sum::<f64>() / f64::from(rays)

@@ -1,0 +1,126 @@
+//! Luminaires that reflect, and light without an end.
+
+use crate::support::*;
+use glam::DVec3;
+use isolume::bake::{BakeSettings, Engine};
+use isolume::embree::{Device, GraphTracer};
+use isolume::flattened::{Side, Target};
+use isolume::gather::{KnownLight, gathered_irradiance};
+use isolume::landing::MOST_LANDINGS;
+use isolume::mask::Mask;
+use isolume::polygon::Polygon;
+use isolume::reference::{PathTracer, receiver};
+use isolume::scene::{Scene, Surface};
+use std::f64::consts::PI;
+
+const RED: DVec3 = DVec3::new(9.0, 0.0, 0.0);
+const BLUE: DVec3 = DVec3::new(0.0, 0.0, 9.0);
+
+/// A square of ±`half` about the volume's middle at height z that faces up or down.
+fn square(name: &str, half: f64, z: f64, up: bool, albedo: f64, emission: DVec3) -> Polygon {
+    let corners = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)];
+    let at = |(x, y): (f64, f64)| DVec3::new(0.5 + half * x, 0.5 + half * if up { y } else { -y }, z);
+    Polygon::new(name, corners.map(at).to_vec(), DVec3::splat(albedo), emission).unwrap()
+}
+
+/// Level planes z = c of the unit cube that a large white luminaire at 0.47 cuts into two worlds: it shines red on what
+/// is above, where a ceiling reflects, and another one shines blue from below onto its back, which is black. Nothing
+/// red gets below, nothing blue above: not by photons, gathers, lines or paths.
+#[test]
+fn nothing_passes_through_a_luminaire_that_reflects() {
+    let planes = field(lattice([17; 3], DVec3::ZERO, DVec3::ONE), 0.05, 0.95, |x| x.z);
+    let polygons = vec![
+        square("middle", 1.5, 0.47, true, 0.8, RED),
+        square("below", 0.4, -0.1, true, 0.8, BLUE),
+        square("ceiling", 0.5, 1.1, false, 0.8, DVec3::ZERO),
+    ];
+    let scene = scene(planes, Surface { both_sides: true, ..grey(0.8, Side::Lower) }, polygons);
+    let device = Device::new(0).unwrap();
+    let tracer = GraphTracer::new(&device, &scene).unwrap();
+    for engine in [Engine::Photon, Engine::Sweep] {
+        let bake = run(&scene, &BakeSettings { engine, photons: 1 << 15, gather_rays: 64, ..at_nodes(1) });
+        // Brightest red and blue of each side above and below the luminaire, by the bake and by paths.
+        let mut found = [[[[0.0f64; 2]; 2]; 2]; 2];
+        for (side, grid) in &bake.sides {
+            for o in (0..grid.mask.len()).filter(|&o| grid.mask[o] == Mask::Valid) {
+                let x = world(&bake.lattice, o);
+                let by_paths = o % 7 == 0;
+                // A luminaire that stands in a cell hides what is there.
+                if (x.z - 0.47).abs() < 0.07 {
+                    continue;
+                }
+                let found = &mut found[side.index()][usize::from(x.z > 0.47)];
+                let mut see = |by: usize, light: [f64; 3]| {
+                    found[by] = [found[by][0].max(light[0]), found[by][1].max(light[2])];
+                };
+                see(0, grid.radiance[o].map(f64::from));
+                if by_paths {
+                    let receiver = receiver(&scene, scene.lattice().to_index(x), scene.field.samples()[o], *side);
+                    let paths = PathTracer::new(&scene, &tracer).outgoing(&receiver.unwrap(), 16, (1, o as u64));
+                    see(1, paths.to_array());
+                }
+            }
+        }
+        println!("{engine:?}: {found:.3?}");
+        let lit = |[red, blue]: [f64; 2]| [red > 0.1, blue > 0.1];
+        // What lines gather is sharpened.
+        let most = if engine == Engine::Sweep { 1e-3 } else { 0.0 };
+        let dark = |[red, blue]: [f64; 2]| [red <= most, blue <= most];
+        let [[lower_below, lower_above], [higher_below, higher_above]] = found;
+        for by in [0, 1] {
+            // Planes above look down on the red front, and those below on the blue one; from above, planes below the
+            // luminaire see its back, and those above it the ceiling, which the red light reaches around them.
+            assert_eq!((lit(lower_above[by]), dark(lower_above[by])), ([true, false], [false, true]));
+            assert_eq!((lit(lower_below[by]), dark(lower_below[by])), ([false, true], [true, false]));
+            assert_eq!((lit(higher_above[by]), dark(higher_above[by])), ([true, false], [false, true]));
+            assert_eq!(dark(higher_below[by]), [true, true]);
+        }
+    }
+}
+
+/// Knows nothing.
+struct Unknown;
+
+impl KnownLight for Unknown {
+    fn radiance(&self, _: &Scene, _: (Target, bool), _: DVec3, _: f32, _: &mut u64) -> Option<DVec3> {
+        None
+    }
+}
+
+/// In a closed cavity that emits 1 and absorbs nothing paths go on until they are cut.
+#[test]
+fn paths_among_white_surfaces_end() {
+    let cavity = field(lattice([25; 3], DVec3::NEG_ONE, DVec3::ONE), 0.16, 0.81, |x| x.length_squared());
+    let white = Surface { emission: DVec3::ONE, ..grey(1.0, Side::Lower) };
+    let scene = scene(cavity, white, Vec::new());
+    let device = Device::new(0).unwrap();
+    let tracer = GraphTracer::new(&device, &scene).unwrap();
+    let receiver = receiver(
+        &scene,
+        DVec3::new(20.0, 12.0, 12.0),
+        scene.field.value(DVec3::new(20.0, 12.0, 12.0)) as f32,
+        Side::Lower,
+    );
+    let receiver = receiver.unwrap();
+    let path = PathTracer::new(&scene, &tracer).outgoing(&receiver, 2, (1, 1)).x;
+    let gathered = gathered_irradiance(&scene, &tracer, &Unknown, &receiver, 2, (1, 1)).estimate.mean.x / PI;
+    println!("{path}, {gathered}");
+    let landings = f64::from(MOST_LANDINGS);
+    assert!((path / (landings + 1.0) - 1.0).abs() < 1e-9 && (gathered / landings - 1.0).abs() < 1e-9);
+}
+
+/// Steps of 8-bit data that emit: most of the volume is a plateau on the sweep's end, beside whose slopes there are
+/// normals, but which emits nothing. A photon of no power would never be absorbed.
+#[test]
+fn plateaus_emit_nothing() {
+    let steps = field(lattice([12; 3], DVec3::ZERO, DVec3::ONE), 0.0, 1.0, |x| if x.x > 0.5 { 1.0 } else { 0.0 });
+    for outside in [Side::Lower, Side::Higher] {
+        let surface = Surface { emission: DVec3::ONE, ..grey(0.5, outside) };
+        let scene = scene(steps.clone(), surface, Vec::new());
+        let photons = photons(&scene, &emission(1 << 12, 1));
+        let total = photons.total_energy();
+        println!("{outside:?}: {} landings, {} rays, {total:?}", photons.stored(), photons.rays);
+        assert!(total.emitted > 0.0 && total.imbalance() < 1e-12);
+        assert!(photons.rays <= 2 * photons.emitted, "{} rays", photons.rays);
+    }
+}
