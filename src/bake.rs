@@ -17,11 +17,12 @@ pub use time::TimeEstimate;
 use crate::checkpoint::{self, Checkpoint};
 use crate::embree::Device;
 use crate::error::{Error, Result};
+use crate::field::Field;
 use crate::flat::FlatTexture;
 use crate::flattened::Side;
 use crate::illumination_grid::{GridSize, IlluminationGrid};
 use crate::isa::Isa;
-use crate::mask::{Mask, masks, unknown_share};
+use crate::mask::{Mask, masks, stand_ins, unknown_share};
 use crate::progress::{Clock, Progress};
 use crate::scene::{Policy, Scene};
 use crate::sweep;
@@ -266,10 +267,28 @@ fn nothing_found(scene: &Scene, grid: &Lattice) -> String {
     )
 }
 
+/// Why no place near the points of a grid is on an isosurface.
+fn too_thin() -> Error {
+    let why = "no grid point lies on or beside an isosurface of the sweep: its values are too close together for this \
+               volume; widen --isovalues, or refine --grid";
+    Error::Invalid(why.into())
+}
+
+/// Whether a grid finds places on the sweep's isosurfaces: not if f32 tells too few apart within so thin a sweep.
+fn has_places(field: &Field, grid: &Lattice, seed: u64) -> bool {
+    if field.samples().par_iter().any(|h| (0.0..=1.0).contains(h)) {
+        return true;
+    }
+    let masks = masks(field, grid);
+    let place = |o: usize| stand_ins::<1>(field, grid, o, seed)[0].is_some();
+    (0..masks.len()).into_par_iter().any(|o| masks[o] != Mask::Empty && place(o))
+}
+
 /// Whether the engine can light the scene, and the grid can hold its light.
 ///
 /// # Errors
-/// `NotSupported` as [`sweep::supported`]; `Invalid` for a grid so coarse that no isosurface passes near its points.
+/// `NotSupported` as [`sweep::supported`]; `Invalid` for a grid so coarse that no isosurface passes near its points,
+/// and for a sweep so thin that none of its isosurfaces has a place.
 pub fn supported(scene: &Scene, settings: &BakeSettings) -> Result<()> {
     if settings.engine == Engine::Sweep {
         can_sweep(scene)?;
@@ -279,7 +298,11 @@ pub fn supported(scene: &Scene, settings: &BakeSettings) -> Result<()> {
         let scene = scene.lit(number);
         let lattice = grid_of(&scene, settings)?;
         let coarse = lattice.len() < scene.lattice().len();
-        if coarse { masks_of(&scene, &lattice).map(drop) } else { Ok(()) }
+        let places = has_places(&scene.field, &lattice, settings.seed);
+        if coarse || !places {
+            masks_of(&scene, &lattice)?;
+        }
+        if places { Ok(()) } else { Err(named(&scene, too_thin())) }
     })
 }
 
@@ -325,11 +348,7 @@ fn finish(
     let fields = std::mem::take(&mut lit.fields);
     let bake = |(job, mut sides): (&Job, Vec<(Side, IlluminationGrid)>)| {
         if sides.iter().all(|(_, grid)| nothing_in(&grid.mask)) {
-            return Err(Error::Invalid(
-                "no grid point lies on or beside an isosurface of the sweep: its values are too close together for this \
-                 volume; widen --isovalues, or refine --grid"
-                    .into(),
-            ));
+            return Err(too_thin());
         }
         let non_finite = sides.iter_mut().map(|(_, grid)| grid.clear_non_finite()).sum::<u64>();
         let count = |m: Mask| sides[0].1.mask.par_iter().filter(|&&x| x == m).count() as u64;

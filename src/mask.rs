@@ -131,15 +131,21 @@ pub fn own_light<'a>(
     }
 }
 
-/// Of the points that the sweep's surfaces need, the share with none beside them that holds light of its own level set:
-/// where samples jump over the sweep, as in binary volumes. Nothing but rays knows what surfaces reflect there.
+/// Of the points that the sweep's surfaces need, the share with none beside them that sweeps light: where samples jump
+/// over the sweep, as in binary volumes, or where it is a small part of a voxel's step. Nothing but rays knows what
+/// surfaces reflect there.
 pub fn unknown_share(field: &Field, lattice: &Lattice) -> f64 {
     let masks = masks(field, lattice);
+    let beside = |o: usize, all: &[bool]| neighbourhood(lattice.dims(), o).any(|run| all[run].contains(&true));
+    let pick = |chosen: &(dyn Fn(usize) -> bool + Sync)| -> Vec<bool> {
+        (0..masks.len()).into_par_iter().with_min_len(1 << 12).map(chosen).collect()
+    };
+    let valid = pick(&|o| masks[o] == Mask::Valid);
+    // Beyond the sweep lines light what is beside a point of it.
     let own = own_light(field, lattice, &masks, true);
-    let own: Vec<bool> = (0..masks.len()).into_par_iter().with_min_len(1 << 12).map(own).collect();
-    let known = |&o: &usize| neighbourhood(lattice.dims(), o).any(|run| own[run].contains(&true));
+    let own = pick(&|o| own(o) && beside(o, &valid));
     let needed = || (0..masks.len()).into_par_iter().with_min_len(1 << 12).filter(|&o| masks[o] != Mask::Empty);
-    1.0 - needed().filter(known).count() as f64 / needed().count().max(1) as f64
+    1.0 - needed().filter(|&o| beside(o, &own)).count() as f64 / needed().count().max(1) as f64
 }
 
 /// Slices of constant z that are looked at together.
@@ -363,6 +369,22 @@ mod tests {
         assert_eq!(share(&|_| true), 1.0);
         let half = share(&|x| x > 0.0);
         assert!((0.1..0.5).contains(&half), "{half}");
+    }
+
+    /// Between two shells of points, of a sweep that holds none: those closely outside are not lit.
+    #[test]
+    fn points_are_unknown_where_the_sweep_holds_none() {
+        let lattice = Lattice::aligned([20; 3], DVec3::splat(-0.5), DVec3::splat(1.0 / 19.0)).unwrap();
+        let place = |o: usize| lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)));
+        let samples = Samples::F64((0..lattice.len()).map(|o| 1.0 - place(o).length()).collect());
+        let volume = Volume::new("ball", lattice.clone(), samples).unwrap();
+        let share = |hi: f64| {
+            let field = Field::new(&volume, Sweep::new(0.7, hi).unwrap()).unwrap();
+            let valid = masks(&field, &lattice).into_iter().filter(|m| *m == Mask::Valid).count();
+            (valid, unknown_share(&field, &lattice))
+        };
+        assert_eq!([0.704, 0.705, 0.707].map(share), [(0, 1.0); 3]);
+        assert!(share(0.74).0 > 100 && share(0.74).1 < 0.05, "{:?}", share(0.74));
     }
 
     /// Waves over a sweep of a thousandth of a voxel's step: every point whose cells it crosses has places in it, the

@@ -240,3 +240,18 @@ fn scene_flags_are_refused_where_the_input_is_a_bake() {
     }
     assert!(!text(&fs::read(dir.join("m.ply")).unwrap()).contains("radiance"));
 }
+
+/// A sweep of which f32 tells no two places of a cell apart is refused before any light is computed, by trial runs, too.
+#[test]
+fn a_sweep_that_is_too_thin_is_refused_beforehand() {
+    let dir = tempfile::tempdir().unwrap();
+    let lattice = Lattice::aligned([20; 3], glam::DVec3::splat(-0.5), glam::DVec3::splat(1.0 / 19.0)).unwrap();
+    let radius = |o: usize| lattice.to_world(glam::DVec3::from_array(lattice.ijk(o).map(|i| i as f64))).length();
+    let samples = Samples::F64((0..lattice.len()).map(|o| 1.0 - radius(o)).collect());
+    Volume::new("ball", lattice.clone(), samples).unwrap().write(dir.path().join("ball.nrrd")).unwrap();
+    for engine in ["sweep", "photon"] {
+        let bake = ["bake", "ball.nrrd", "-o", "out.vti", "--dry-run", "--engine", engine, "--isovalues", "0.7"];
+        refused(dir.path(), &[&bake[..], &["0.7000000001"]].concat(), &["ball.nrrd", "too close together"]);
+        ok(dir.path(), &[&bake[..], &["0.704"]].concat());
+    }
+}
