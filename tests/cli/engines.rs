@@ -1,5 +1,6 @@
 //! Which engine lights a scene, and what is said about it.
 
+use super::pictures::pixels;
 use super::{ok, refused, text};
 use isolume::volume::vti::VtiFile;
 use isolume::volume::{Lattice, Samples, Volume};
@@ -99,6 +100,33 @@ fn an_outside_that_caps_close_off_is_warned_of() {
             "{more:?}: {lines}"
         );
     }
+}
+
+/// Planes across the whole box, whose higher side holds the luminaire at most isovalues: the room there is dark by
+/// sweeps of the lower side alone.
+#[test]
+fn rooms_within_solids_are_lit() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "linear:1,2,4", "--size", "17", "-o", "lin.vti", "-q"]);
+    let bake = ["bake", "lin.vti", "--isovalues", "0.1", "6.9", "-o", "lit.vti", "--preset", "preview"];
+    let dry = |more: &[&str]| text(&ok(dir, &[&bake[..], &["--dry-run"], more].concat()).stderr);
+    for (more, engine, warned) in [
+        (&[][..], "photon", false),
+        (&["--engine", "sweep"], "sweep", true),
+        (&["--outside", "higher"], "sweep", false),
+        (&["--sides", "both"], "sweep", false),
+        (&["--margin", "0.1"], "sweep", false),
+    ] {
+        let lines = dry(more);
+        let warning = lines.contains("warning: the luminaires stand mostly within the solids");
+        assert!(lines.contains(&format!("engine  {engine}")) && warning == warned, "{more:?}: {lines}");
+    }
+    ok(dir, &[&bake[..], &["-q"]].concat());
+    ok(dir, &["render", "lit.vti", "--isovalue", "3.5", "--height", "60", "--samples", "4", "-o", "room.png"]);
+    let (rgb, _) = pixels(&dir.join("room.png"));
+    let bright = rgb.iter().flatten().filter(|x| **x > 60).count();
+    assert!(4 * bright > rgb.len(), "{bright} of {}", rgb.len());
 }
 
 /// Two solids that end in the same face: whose cap is seen there nothing tells.

@@ -34,7 +34,7 @@ fn exposure(file: &VtiFile) -> f64 {
 }
 
 /// 8-bit RGB of a picture and its width.
-fn pixels(path: &Path) -> (Vec<[u8; 3]>, usize) {
+pub(crate) fn pixels(path: &Path) -> (Vec<[u8; 3]>, usize) {
     let mut reader = png::Decoder::new(std::io::BufReader::new(fs::File::open(path).unwrap())).read_info().unwrap();
     let mut bytes = vec![0; reader.output_buffer_size().unwrap()];
     let info = reader.next_frame(&mut bytes).unwrap();

@@ -1,6 +1,6 @@
 //! What a bake warns of before it begins.
 
-use crate::bake::{BakeOptions, BakeSettings, Engine, common_size, left_out};
+use crate::bake::{BakeOptions, BakeSettings, Engine, common_size, leaves_walls_dark, left_out};
 use crate::error::Result;
 use crate::flattened::Side;
 use crate::illumination_grid::GridSize;
@@ -33,15 +33,21 @@ pub(super) fn warnings(scene: &Scene, options: &BakeOptions, settings: &BakeSett
         ));
     }
     // Sweeps that nobody asked for were chosen because they leave out nothing to speak of.
-    if settings.engine == Engine::Sweep
-        && !options.leaves_engine()
-        && let Some(share) = left_out(scene, &settings.grid)?
-    {
-        lines.push(format!(
-            "samples jump over the whole sweep at {:.0} % of the points that surfaces need, where sweeps leave out what \
-             surfaces reflect; use --engine photon, a finer --grid or smoother samples",
-            100.0 * share
-        ));
+    if settings.engine == Engine::Sweep && !options.leaves_engine() {
+        if leaves_walls_dark(scene) {
+            lines.push(
+                "the luminaires stand mostly within the solids, where sweeps leave walls dark; use --engine photon, or the \
+                 other outside"
+                    .into(),
+            );
+        }
+        if let Some(share) = left_out(scene, &settings.grid)? {
+            lines.push(format!(
+                "samples jump over the whole sweep at {:.0} % of the points that surfaces need, where sweeps leave out \
+                 what surfaces reflect; use --engine photon, a finer --grid or smoother samples",
+                100.0 * share
+            ));
+        }
     }
     if options.grid.is_none() {
         lines.extend(long_voxels(scene));
