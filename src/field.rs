@@ -5,8 +5,9 @@ mod rows;
 mod sweep;
 
 pub use rows::{FieldRows, GradientRow};
-pub use sweep::{Shortest, Sweep, span};
+pub use sweep::Sweep;
 
+use crate::digits::span;
 use crate::error::{Error, Result};
 use crate::neighbourhood::within;
 use crate::volume::{Lattice, Volume};

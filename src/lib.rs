@@ -8,6 +8,7 @@
 
 // Numerics, no knowledge of volumes; progress of long work.
 pub mod error;
+pub mod digits;
 pub mod isa;
 pub mod atomic;
 mod files;

@@ -1,11 +1,11 @@
 //! Pictures: the isosurface of a baked volume, coloured by its grid, inside its box.
 
+use crate::digits::Shortest;
 use crate::direct::luminance;
 use crate::embree::{Device, GraphTracer};
 use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
 use crate::export::picture::Picture;
-use crate::field::Shortest;
 use crate::final_gather::{FinalGather, FinalGatherSettings, seen};
 use crate::flattened::{FlattenedHit, FlattenedRay, Target};
 use crate::progress::Progress;

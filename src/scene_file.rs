@@ -372,20 +372,7 @@ fn context(entries: &[ContextOptions], folder: &Path) -> Result<Vec<Polygon>> {
 /// The sweep that the data suggest.
 fn suggested(volume: &Volume) -> Result<[f64; 2]> {
     let statistics = VolumeStatistics::of(volume);
-    let none = || match statistics.range {
-        None => Error::invalid(&volume.name, "none of its samples is finite"),
-        Some([v, _]) if statistics.constant() => {
-            Error::invalid(&volume.name, format!("every sample is {v}: it holds no isosurface"))
-        }
-        Some([lo, hi]) => Error::invalid(
-            &volume.name,
-            format!(
-                "its samples, {lo:?} to {hi:?}, suggest no sweep (they are too far apart, or no neighbours are \
-                 finite); choose one (--isovalues, or `isovalues` in a scene file)"
-            ),
-        ),
-    };
-    statistics.sweep.ok_or_else(none)
+    statistics.sweep.ok_or_else(|| Error::invalid(&volume.name, statistics.without_sweep().unwrap_or_default()))
 }
 
 /// The scene file that `input` is or stands for, its text if it is one, and where its paths begin.

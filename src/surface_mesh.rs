@@ -1,10 +1,11 @@
 //! One isosurface as users take it away: world units, unit normals, outside faces out.
 
+use crate::digits::Shortest;
 use crate::error::{Error, Result};
 use crate::export::Mesh;
 use crate::export::bake_file::BakedVolume;
 use crate::export::picture::srgb_encode;
-use crate::field::{Field, Shortest};
+use crate::field::Field;
 use crate::flattened::Side;
 use crate::isosurface::{Isosurface, extract_refined};
 use crate::scene::Scene;

@@ -19,6 +19,7 @@ pub mod vti;
 
 use crate::error::{Error, Result};
 use glam::{DMat3, DVec3};
+use rayon::prelude::*;
 use std::path::Path;
 
 /// The extensions that [`Volume::open`] reads.
@@ -531,6 +532,16 @@ impl Volume {
         match &self.samples {
             Samples::F32(v) => v.iter().filter(|v| !v.is_finite()).count(),
             Samples::F64(v) => v.iter().filter(|v| !v.is_finite()).count(),
+            _ => 0,
+        }
+    }
+
+    /// Number of samples that [`Volume::value`] rounds: integers beyond 2⁵³ that f64 does not hold.
+    #[allow(clippy::cast_possible_truncation, reason = "integers come back whole")]
+    pub fn rounded(&self) -> usize {
+        match &self.samples {
+            Samples::U64(v) => v.par_iter().filter(|&&v| v as f64 as u128 != u128::from(v)).count(),
+            Samples::I64(v) => v.par_iter().filter(|&&v| v as f64 as i128 != i128::from(v)).count(),
             _ => 0,
         }
     }

@@ -1,7 +1,8 @@
 //! Whether a mesh is an isosurface of a volume.
 
+use crate::digits::{Shortest, brief_within};
 use crate::error::{Error, Result};
-use crate::field::{Field, Shortest};
+use crate::field::Field;
 use glam::DVec3;
 
 /// How far h may be from the isovalue everywhere, in units of the sweep: the rounding of positions and samples.
@@ -44,8 +45,8 @@ pub fn belongs(positions: &[DVec3], isovalue: Option<f64>, field: &Field) -> Res
         None => ROUNDING + median(found.iter().map(|f| (f[0] - c).abs())).unwrap_or(0.0),
     };
     // A median has digits that mean nothing.
-    let rounded = || format!("{:.4e}", sweep.from_unit(c)).parse().unwrap_or(middle);
-    let said = Shortest(isovalue.unwrap_or_else(rounded));
+    let rounded = || brief_within(sweep.from_unit(c), [sweep.lo(), sweep.hi()]);
+    let said = isovalue.map_or_else(rounded, Shortest);
     if !(-slack..=1.0 + slack).contains(&c) {
         return Err(Error::Invalid(format!(
             "is of isovalue {said}, outside of the bake's sweep {sweep}; make one inside, or bake a wider sweep"

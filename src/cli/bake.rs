@@ -226,7 +226,7 @@ impl Bake {
                 );
             }
         }
-        for warning in warnings(&loaded.scene, &options, &settings)? {
+        for warning in warnings(&loaded.scene, &volumes, &options, &settings)? {
             if said.insert(warning.clone()) {
                 say!("warning: {warning}");
             }

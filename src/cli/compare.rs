@@ -3,11 +3,11 @@
 use super::final_gather::{FinalGatherOptions, light};
 use super::{device, expect_extension, outputs};
 use crate::accuracy::{Accuracy, ReferenceMesh, Survey, SurveySettings, belongs, compare, survey};
+use crate::digits::brief_span;
 use crate::embree::GraphTracer;
 use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
 use crate::export::{Mesh, ply};
-use crate::field::span;
 use crate::final_gather::{FinalGather, FinalGatherSettings};
 use crate::illumination_grid::GridSize;
 use crate::progress::{Progress, say};
@@ -182,9 +182,7 @@ fn everywhere(s: &Survey, advice: Option<(&str, bool)>) -> String {
         .iter()
         .filter(|p| p.points > 0)
         .map(|p| {
-            // Fifths of a sweep have digits that mean nothing.
-            let ends = p.isovalues.map(|c| format!("{c:.5e}").parse().unwrap_or(c));
-            format!("  isovalues        {:8.3}   ({}; {} points)\n", p.percent_rms, span(ends.into()), p.points)
+            format!("  isovalues        {:8.3}   ({}; {} points)\n", p.percent_rms, brief_span(p.isovalues), p.points)
         })
         .collect();
     let at_points = match s.grid_points {

@@ -2,6 +2,7 @@
 
 use super::{expect_extension, export};
 use crate::atomic::AtomicFile;
+use crate::digits::brief_span;
 use crate::error::{Error, Result};
 use crate::illumination_grid::GridSize;
 use crate::progress::{Progress, say};
@@ -82,17 +83,12 @@ fn scene_text(volume: &Path, raw: &RawOptions, statistics: &VolumeStatistics, la
     let [nx, ny, nz] = statistics.dims;
     let about = match statistics.range {
         Some([lo, hi]) => {
-            format!("{nx} x {ny} x {nz} samples of type {}, values {lo} to {hi}", statistics.element_type)
+            format!("{nx} x {ny} x {nz} samples of type {}, values {}", statistics.element_type, brief_span([lo, hi]))
         }
         None => format!("{nx} x {ny} x {nz} samples, none of them finite"),
     };
-    let sweep = match statistics.sweep {
-        Some([lo, hi]) => format!("isovalues = [{lo:?}, {hi:?}]"),
-        None if statistics.constant() => {
-            "# isovalues = [LO, HI]    # nothing to suggest: the volume holds no isosurface".to_owned()
-        }
-        None => "# isovalues = [LO, HI]    # nothing to suggest: choose them".to_owned(),
-    };
+    let none = || format!("# isovalues = [LO, HI]    # {}", statistics.without_sweep().unwrap_or_default());
+    let sweep = statistics.sweep.map_or_else(none, |[lo, hi]| format!("isovalues = [{lo:?}, {hi:?}]"));
     // Light on a grid of long voxels is blurred.
     let grid = if GridSize::Cubic.of(lattice) == GridSize::OWN { "# grid = \"1x\"" } else { "grid = \"cubic\"" };
     let mut layout = String::new();

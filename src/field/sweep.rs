@@ -1,5 +1,6 @@
-//! The range of isovalues that is swept, and how people write such numbers.
+//! The range of isovalues that is swept.
 
+use crate::digits::{Shortest, span};
 use crate::error::{Error, Result};
 use std::fmt;
 
@@ -64,32 +65,12 @@ impl fmt::Display for Sweep {
     }
 }
 
-/// A range as people write it.
-pub fn span((lo, hi): (f64, f64)) -> String {
-    format!("{} … {}", Shortest(lo), Shortest(hi))
-}
-
-/// A number as people write it: all digits that tell it from others, an exponent where it is very large or small.
-pub struct Shortest(
-    /// The number.
-    pub f64,
-);
-
-impl fmt::Display for Shortest {
-    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        let text = format!("{:?}", self.0);
-        f.write_str(text.strip_suffix(".0").unwrap_or(&text))
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn numbers_have_their_digits_and_no_more() {
-        let written = [47.0, -0.25, 0.1 + 0.2, 1e300, 5e-324, 7.18e299].map(|v| Shortest(v).to_string());
-        assert_eq!(written, ["47", "-0.25", "0.30000000000000004", "1e300", "5e-324", "7.18e299"]);
+    fn sweeps_are_written_with_all_digits() {
         assert_eq!(Sweep::new(-3.5, 1e20).unwrap().to_string(), "-3.5 … 1e20");
         assert!(Sweep::new(1e300, 1.0).unwrap_err().to_string().contains("isovalues 1e300 1:"));
     }

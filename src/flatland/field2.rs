@@ -1,7 +1,8 @@
 //! h₂: samples on a rectangle, bilinear in every cell, in units of the sweep.
 
+use crate::digits::span;
 use crate::error::{Error, Result};
-use crate::field::{Sweep, span};
+use crate::field::Sweep;
 use crate::volume::Volume;
 use crate::volume::plane::Plane;
 use glam::DVec2;

@@ -2,6 +2,7 @@
 
 mod sweep;
 
+use crate::digits::{Shortest, brief, brief_span, brief_within, span};
 use crate::volume::{Samples, Volume};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -32,6 +33,8 @@ pub struct VolumeStatistics {
     pub samples: usize,
     /// Samples that are NaN or infinite.
     pub non_finite: usize,
+    /// Samples that f64 does not hold: integers beyond 2⁵³, which are rounded in everything below.
+    pub rounded: usize,
     /// Least and greatest sample; `None` (as all below) if no sample is finite.
     pub range: Option<[f64; 2]>,
     /// The samples at [`PERCENTILES`], each a value that occurs.
@@ -80,6 +83,7 @@ impl VolumeStatistics {
             element_type: volume.samples().element_type().name(),
             samples: lattice.len(),
             non_finite: volume.non_finite(),
+            rounded: volume.rounded(),
             range: None,
             percentiles: None,
             histogram: None,
@@ -105,9 +109,25 @@ impl VolumeStatistics {
         statistics
     }
 
-    /// Whether no two finite samples differ, so that there is no isosurface.
-    pub fn constant(&self) -> bool {
-        self.range.is_none_or(|[min, max]| min == max)
+    /// Why no sweep is suggested and what to do, for people; `None` if one is.
+    pub fn without_sweep(&self) -> Option<String> {
+        let why = match self.range {
+            _ if self.sweep.is_some() => return None,
+            None => "none of its samples is finite: it holds no isosurface".into(),
+            Some([min, max]) if min < max => format!(
+                "its samples, {}, suggest none (they are too far apart, or no neighbours are finite); choose one \
+                 (--isovalues, or `isovalues` in a scene file)",
+                span((min, max))
+            ),
+            Some([v, _]) if self.rounded > 0 => {
+                format!(
+                    "64-bit floats do not tell its samples, all near {}, apart: subtract that from them",
+                    Shortest(v)
+                )
+            }
+            Some([v, _]) => format!("every sample is {}: it holds no isosurface", Shortest(v)),
+        };
+        Some(why)
     }
 
     /// A table for people, one fact per line.
@@ -116,7 +136,7 @@ impl VolumeStatistics {
         let mut line = |key: &str, value: String| {
             let _ = writeln!(t, "{key:<18}{value}");
         };
-        let list = |v: &[f64]| v.iter().map(|v| number(*v)).collect::<Vec<_>>().join("  ");
+        let list = |v: &[f64]| v.iter().map(|v| brief(*v).to_string()).collect::<Vec<_>>().join("  ");
         let percent = |n: usize| format!("{:.3} %", 100.0 * n as f64 / self.samples as f64);
         let [nx, ny, nz] = self.dims;
         line("volume", self.name.clone());
@@ -129,24 +149,24 @@ impl VolumeStatistics {
             line("axes", rows.join(" "));
         }
         line("not finite", format!("{} ({})", self.non_finite, percent(self.non_finite)));
+        if self.rounded > 0 {
+            let rounded = format!("{} ({})", self.rounded, percent(self.rounded));
+            line(
+                "rounded",
+                format!("{rounded}: integers beyond 2^53, which 64-bit floats do not hold; subtract an offset"),
+            );
+        }
         if let (Some(range), Some(p), Some(c), Some(share)) =
             (self.range, self.percentiles, self.commonest, self.commonest_share)
         {
-            line("range", list(&range).replace("  ", " … "));
-            line("percentiles", format!("{}  (at {} %)", list(&p), PERCENTILES.map(|p| p.to_string()).join(", ")));
-            line("commonest value", format!("{}, {:.3} % of samples", number(c), 100.0 * share));
+            line("range", brief_span(range));
+            let values = p.map(|v| brief_within(v, range).to_string()).join("  ");
+            line("percentiles", format!("{values}  (at {} %)", PERCENTILES.map(|p| p.to_string()).join(", ")));
+            line("commonest value", format!("{}, {:.3} % of samples", brief_within(c, range), 100.0 * share));
             line("zero gradient", format!("{} ({})", self.flat, percent(self.flat)));
         }
-        line(
-            "suggested sweep",
-            match self.sweep {
-                Some(sweep) => list(&sweep).replace("  ", " … "),
-                None if self.constant() => "none: the volume has no isosurface".to_string(),
-                None => {
-                    "none: its values are too far apart, or no neighbours are finite; choose --isovalues".to_string()
-                }
-            },
-        );
+        let none = || self.without_sweep().map_or_else(String::new, |why| format!("none: {why}"));
+        line("suggested sweep", self.sweep.map_or_else(none, brief_span));
         if let Some(histogram) = &self.histogram {
             line("histogram", bars(histogram));
         }
@@ -158,16 +178,6 @@ impl std::fmt::Display for VolumeStatistics {
     fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
         f.write_str(&self.to_text())
     }
-}
-
-/// A number of at most 6 digits or so.
-fn number(v: f64) -> String {
-    if v != 0.0 && !(1e-4..1e7).contains(&v.abs()) {
-        return format!("{v:.5e}");
-    }
-    let digits = (5 - v.abs().max(1e-4).log10().floor() as i32).clamp(0, 9) as usize;
-    let text = format!("{v:.digits$}");
-    if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_string() } else { text }
 }
 
 /// A histogram as a line of bars, logarithmic: backgrounds are many orders of magnitude commoner than surfaces.

@@ -65,6 +65,8 @@ fn bakes_of_data_on_an_offset_hold_their_isosurfaces() {
         let off = farthest(&plain, &raised);
         assert!(off < 1e-3 * size, "{grid}: {off} of {size}");
     }
+    let fifths = text(&ok(dir, &["compare", "high.vti", "--points", "40", "--paths", "2", "-q"]).stdout);
+    assert!(fifths.contains("(1000000000.05 … 1000000000.23;"), "{fifths}");
     // In units in which f32 has no such numbers, or whole steps; and a sample beyond f32 in a sweep that is not.
     let scaled = |by: f64| -> Vec<f64> { (0..bumps.lattice.len()).map(|o| by * bumps.value(o)).collect() };
     let mut one = scaled(1.0);
@@ -84,6 +86,67 @@ fn bakes_of_data_on_an_offset_hold_their_isosurfaces() {
         matches!(file.point_data.iter().find(|a| a.name == "value").unwrap().samples, Samples::F32(_))
     };
     assert!(stored("lit.vti") && !stored("high.vti"), "no more bytes than are needed");
+}
+
+/// What is printed of data on an offset tells its ends apart, and can be pasted.
+#[test]
+fn the_suggested_sweep_of_data_on_an_offset_can_be_pasted() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let lattice = Lattice::aligned([20; 3], DVec3::splat(-1.0), DVec3::splat(2.0 / 19.0)).unwrap();
+    let ball = |o: usize| {
+        let [i, j, k] = lattice.ijk(o).map(|i| i as f64);
+        1.0 - lattice.to_world(DVec3::new(i, j, k)).length()
+    };
+    for offset in [1e8, 101_325.0, -3e12] {
+        let samples = (0..lattice.len()).map(|o| offset + ball(o)).collect();
+        Volume::new("ball", lattice.clone(), Samples::F64(samples)).unwrap().write(dir.join("ball.npy")).unwrap();
+        let info = text(&ok(dir, &["info", "ball.npy"]).stdout);
+        let json: serde_json::Value = serde_json::from_slice(&ok(dir, &["info", "ball.npy", "--json"]).stdout).unwrap();
+        for (key, field) in [("range", "range"), ("suggested sweep", "sweep")] {
+            let line = info.lines().find_map(|l| l.strip_prefix(key)).unwrap();
+            let ends: Vec<f64> = line.split('…').map(|end| end.trim().parse().unwrap()).collect();
+            let exact = [0, 1].map(|n| json[field][n].as_f64().unwrap());
+            let off = (ends[0] - exact[0]).abs().max((ends[1] - exact[1]).abs());
+            assert!(off <= 1e-3 * (exact[1] - exact[0]), "{offset}: {line}");
+            if field == "sweep" {
+                let ends: Vec<String> = line.split('…').map(|end| end.trim().to_owned()).collect();
+                ok(dir, &["bake", "ball.npy", "-o", "b.vti", "--dry-run", "-q", "--isovalues", &ends[0], &ends[1]]);
+            }
+        }
+        let percentiles = info.lines().find_map(|l| l.strip_prefix("percentiles")).unwrap();
+        let values: Vec<&str> = percentiles.split_once('(').unwrap().0.split_whitespace().collect();
+        assert!(values.windows(2).all(|w| w[0] != w[1]), "{percentiles}");
+        ok(dir, &["init", "ball.npy", "-o", "ball.toml", "-q"]);
+        let scene = fs::read_to_string(dir.join("ball.toml")).unwrap();
+        let range = info.lines().find_map(|l| l.strip_prefix("range")).unwrap().trim();
+        assert!(scene.contains(range), "{range} in {scene}");
+        fs::remove_file(dir.join("ball.toml")).unwrap();
+    }
+}
+
+/// 64-bit integers that become the same floats are told from samples that are the same.
+#[test]
+fn integers_that_floats_do_not_hold_are_told_of() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let lattice = Lattice::aligned([4; 3], DVec3::ZERO, DVec3::ONE).unwrap();
+    let write = |factor: i64| {
+        let samples = Samples::I64((0..64).map(|k| (1 << 60) + factor * k).collect());
+        Volume::new("v", lattice.clone(), samples).unwrap().write(dir.join("v.npy")).unwrap();
+    };
+    write(1);
+    for verb in [&["bake", "v.npy", "-o", "out.vti"][..], &["extract", "v.npy", "--isovalue", "1", "-o", "m.ply"]] {
+        refused(dir, verb, &["v.npy", "apart", "subtract"]);
+    }
+    ok(dir, &["init", "v.npy", "-o", "v.toml", "-q"]);
+    assert!(!text(&fs::read(dir.join("v.toml")).unwrap()).contains("no isosurface"));
+    write(100);
+    let said = text(&ok(dir, &["bake", "v.npy", "-o", "v.vti", "--dry-run", "-q"]).stderr);
+    let lines = ["warning: ", "v.npy", "63 of 64 samples", "subtract an offset"];
+    assert!(lines.iter().all(|w| said.contains(w)), "{said}");
+    let info = text(&ok(dir, &["info", "v.npy"]).stdout);
+    assert!(info.contains("63 (98.438 %)") && info.contains("subtract an offset"), "{info}");
 }
 
 #[test]

@@ -6,14 +6,30 @@ use crate::flattened::Side;
 use crate::illumination_grid::GridSize;
 use crate::scene::{Boundary, Scene};
 use crate::sweep::lit_within_solids;
+use crate::volume::Volume;
 use glam::DVec3;
 
 /// What a user may not expect of the bake of `scene` that `options` ask for and `settings` describe.
 ///
 /// # Errors
 /// As [`left_out`].
-pub(super) fn warnings(scene: &Scene, options: &BakeOptions, settings: &BakeSettings) -> Result<Vec<String>> {
+pub(super) fn warnings(
+    scene: &Scene,
+    volumes: &[&Volume],
+    options: &BakeOptions,
+    settings: &BakeSettings,
+) -> Result<Vec<String>> {
     let mut lines = options.idle(settings);
+    for volume in volumes {
+        let rounded = volume.rounded();
+        if rounded > 0 {
+            lines.push(format!(
+                "{}: {rounded} of {} samples are integers beyond 2^53, which 64-bit floats round; subtract an offset from them",
+                volume.name,
+                volume.samples().len()
+            ));
+        }
+    }
     let dark = scene.members().iter().all(|m| m.surface.emission == DVec3::ZERO);
     if scene.luminaires().is_empty() && dark {
         lines.push("nothing emits light; everything will be black".into());
@@ -73,7 +89,7 @@ mod tests {
     use super::*;
     use crate::field::{Field, Sweep};
     use crate::scene::Surface;
-    use crate::volume::{Lattice, Samples, Volume};
+    use crate::volume::{Lattice, Samples};
 
     /// A grid that no lattice can be is no advice, nor a fault of a bake that did not ask for it.
     #[test]

@@ -152,8 +152,23 @@ fn json_has_the_same_facts() {
     assert_eq!(json["histogram"].as_array().unwrap().len(), BINS);
 }
 
+/// Neighbours among the integers from 2⁶⁰ on are 256 apart as floats.
 #[test]
-fn numbers_are_short() {
-    let all = [0.0, 1.0, -0.25, 1.0 / 3.0, 22526.0, 1e-7, 2.5e9, 123456.7].map(number);
-    assert_eq!(all, ["0", "1", "-0.25", "0.333333", "22526", "1.00000e-7", "2.50000e9", "123457"]);
+fn integers_that_floats_do_not_hold_are_counted() {
+    let near = |offset: i64| Samples::I64((0..8).map(|k| offset + k).collect());
+    let all = VolumeStatistics::of(&volume([2, 2, 2], near((1 << 60) + 1)));
+    assert_eq!((all.rounded, all.sweep), (8, None));
+    let text = all.to_text();
+    assert!(text.contains("8 (100.000 %)") && text.contains("apart") && text.contains("subtract"), "{text}");
+    assert!(!text.contains("every sample") && !text.contains("no isosurface"), "{text}");
+    // 2⁵³ + 1, + 3, + 5 and + 7 are no floats.
+    let some = VolumeStatistics::of(&volume([2, 2, 2], near(1 << 53)));
+    assert!(some.rounded == 4 && some.sweep.is_some() && some.to_text().contains("4 (50.000 %)"), "{some}");
+    for samples in [near(-(1 << 53) - 7), Samples::I64(vec![i64::MAX; 8]), Samples::U64(vec![u64::MAX; 8])] {
+        assert!(VolumeStatistics::of(&volume([2, 2, 2], samples)).rounded >= 3);
+    }
+    let held = [near(0), near((1 << 53) - 8), Samples::I64(vec![i64::MIN; 8]), Samples::F64(vec![1e300; 8])];
+    for samples in held {
+        assert_eq!(VolumeStatistics::of(&volume([2, 2, 2], samples)).rounded, 0);
+    }
 }
