@@ -10,6 +10,7 @@ pub use companion::{Companion, Member, Policy};
 pub(crate) use cover::{ON, SLIT, voxel_along};
 pub use obj::{Placement, read_context, read_obj};
 
+use crate::digits::{Shortest, brief_within};
 use crate::emission;
 use crate::error::{Error, Result};
 use crate::field::Field;
@@ -24,6 +25,9 @@ use std::sync::Arc;
 
 /// Widths of cells whose areas fit 32-bit floats, photon by photon.
 const WIDTHS: RangeInclusive<f64> = 1e-16..=1e16;
+
+/// Edges of a box whose walls have an area, in parts of the longest.
+const THINNEST: f64 = 1e-11;
 
 /// What the faces of Ω do to a level set that runs into them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -80,23 +84,34 @@ pub struct Scene {
     reference_irradiance: f64,
 }
 
-/// Whether a field can stand among `polygons`.
-fn check(surface: &Surface, boundary: Boundary, lattice: &Lattice, polygons: &[Polygon]) -> Result<()> {
-    let fail = |what: String| Err(Error::Invalid(what));
+/// Whether light can be computed with cells of a lattice's spacing.
+///
+/// # Errors
+/// `Invalid` if a cell is narrower or wider than 10⁻¹⁶ to 10¹⁶.
+pub(crate) fn check_spacing(lattice: &Lattice) -> Result<()> {
     let spacing = lattice.spacing();
-    if !(WIDTHS.contains(&spacing.min_element()) && WIDTHS.contains(&spacing.max_element())) {
-        return fail(format!(
-            "cells are {:e} × {:e} × {:e} wide: give lengths in a unit in which that is {:e} to {:e}; light does not depend on it",
-            spacing.x,
-            spacing.y,
-            spacing.z,
-            WIDTHS.start(),
-            WIDTHS.end()
-        ));
+    if WIDTHS.contains(&spacing.min_element()) && WIDTHS.contains(&spacing.max_element()) {
+        return Ok(());
     }
-    for (_, albedo) in surface.albedo.stops() {
+    let [x, y, z] = spacing.to_array().map(Shortest);
+    Err(Error::Invalid(format!(
+        "spacing {x}, {y}, {z}: cells must be {:e} to {:e} wide; give lengths in another unit: light does not depend on it",
+        WIDTHS.start(),
+        WIDTHS.end()
+    )))
+}
+
+/// Whether a field can stand among `polygons`.
+fn check(surface: &Surface, boundary: Boundary, field: &Field, polygons: &[Polygon]) -> Result<()> {
+    let fail = |what: String| Err(Error::Invalid(what));
+    let (lattice, sweep) = (field.lattice(), field.sweep());
+    check_spacing(lattice)?;
+    let stops = surface.albedo.stops();
+    for (s, albedo) in stops {
         if !(albedo.cmpge(DVec3::ZERO).all() && albedo.cmple(DVec3::ONE).all()) {
-            return fail(format!("surface albedo {albedo}: every channel must lie in [0, 1]"));
+            let isovalue = brief_within(sweep.from_unit(*s), [sweep.lo(), sweep.hi()]);
+            let at = if stops.len() > 1 { format!(" at isovalue {isovalue}") } else { String::new() };
+            return fail(format!("surface albedo {albedo}{at}: every channel must lie in [0, 1]"));
         }
     }
     emission::check(surface.emission).or_else(|e| fail(format!("surface {e}")))?;
@@ -137,7 +152,7 @@ impl Scene {
         let count = polygons.len();
         polygons.extend(walls);
         let lattice = field.lattice();
-        check(&surface, boundary, lattice, &polygons)?;
+        check(&surface, boundary, &field, &polygons)?;
         if count > MAX_TARGETS as usize || polygons.len() > MAX_POLYGONS as usize {
             return Err(Error::Invalid(format!(
                 "{count} luminaires among {} polygons: at most {MAX_TARGETS} among {MAX_POLYGONS} are possible",
@@ -292,6 +307,15 @@ pub fn cornell_box(lattice: &Lattice, margin: f64) -> Result<Vec<Polygon>> {
     }
     let nearest = nearest_axes(lattice);
     let far = lattice.far();
+    let edges = lattice.spacing() * far;
+    if !(edges.min_element() > THINNEST * edges.max_element()) {
+        let [x, y, z] = lattice.spacing().to_array().map(Shortest);
+        return Err(Error::Invalid(format!(
+            "spacing {x}, {y}, {z}: the volume is so thin that the walls of a box around it have no area; its edges may differ \
+             by a factor of {:e}",
+            1.0 / THINNEST
+        )));
+    }
     // Box coordinates along world-like axes, 0 … 1 from min to max face.
     let corner = |x: f64, y: f64, z: f64| {
         let mut p = DVec3::ZERO;

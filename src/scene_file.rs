@@ -3,10 +3,11 @@
 mod fault;
 mod frames;
 mod inputs;
+mod keys;
 mod several;
 mod surface;
 
-pub use fault::fault;
+pub(crate) use fault::parse as parse_toml;
 pub use frames::load_series;
 pub use inputs::Inputs;
 pub(crate) use inputs::same;
@@ -18,7 +19,7 @@ use crate::bake::BakeOptions;
 use crate::error::{Error, Result};
 use crate::field::{Field, Sweep};
 use crate::polygon::Polygon;
-use crate::scene::{Placement, Scene, cornell_box, read_context, read_obj};
+use crate::scene::{Placement, Scene, check_spacing, cornell_box, read_context, read_obj};
 use crate::volume::generate::Generator;
 use crate::volume::raw::RawLayout;
 use crate::volume::statistics::VolumeStatistics;
@@ -58,9 +59,13 @@ pub(crate) fn numbers<'de, D, const N: usize>(deserializer: D) -> std::result::R
 where
     D: serde::Deserializer<'de>,
 {
-    let values = Vec::<f64>::deserialize(deserializer)?;
-    let found = values.len();
-    values.try_into().map(Some).map_err(|_| serde::de::Error::custom(format!("needs {N} numbers, found {found}")))
+    let fail = |found: &str| serde::de::Error::custom(format!("needs {N} numbers, found {found}"));
+    let values = toml::Value::deserialize(deserializer)?;
+    let list = values.as_array().ok_or_else(|| fail(&values.to_string()))?;
+    let number = |v: &toml::Value| v.as_float().or_else(|| v.as_integer().map(|n| n as f64));
+    let numbers: Option<Vec<f64>> = list.iter().map(number).collect();
+    let numbers = numbers.ok_or_else(|| fail(&values.to_string()))?;
+    numbers.try_into().map(Some).map_err(|_| fail(&list.len().to_string()))
 }
 
 /// `[[context]]`: polygons beside the box, seen from both sides.
@@ -273,6 +278,21 @@ pub struct Loaded {
     pub scene: Scene,
     /// The file's `[bake]` table.
     pub bake: BakeOptions,
+    source: Option<Source>,
+}
+
+impl Loaded {
+    /// `error` about an option of the bake, at the line of the file that sets it if none of `flags` does.
+    #[must_use]
+    pub fn blame_bake(&self, flags: &BakeOptions, error: Error) -> Error {
+        let key = error.to_string().split([' ', ':']).next().unwrap_or_default().to_owned();
+        match &self.source {
+            Some(source) if self.bake.set().contains(&key) && !flags.set().contains(&key) => {
+                error.in_file(source.place(&["bake", &key]))
+            }
+            _ => error,
+        }
+    }
 }
 
 impl SceneFile {
@@ -298,15 +318,19 @@ impl Source {
     }
 
     fn parse(&self) -> Result<SceneFile> {
-        toml::from_str(&self.text).map_err(|e| fault(&self.path, &self.text, &e))
+        parse_toml(&self.path, &self.text)
     }
 
-    /// `error` as the fault of `key`, at the line where it stands.
-    fn blame(&self, key: &str, error: &Error) -> Error {
-        let names_key =
-            |l: &str| l.trim_start().strip_prefix(key).is_some_and(|rest| rest.trim_start().starts_with('='));
-        let line = self.text.lines().position(names_key).map_or(String::new(), |n| format!(":{}", n + 1));
-        Error::Invalid(format!("{}{line}: {key}: {error}", self.path.display()))
+    /// The file, and the line of the key at `path`, or of the last on the way that is there.
+    fn place(&self, path: &[&str]) -> String {
+        let line = |at: usize| format!(":{}", self.text[..at].matches('\n').count() + 1);
+        format!("{}{}", self.path.display(), keys::find(&self.text, path).map_or(String::new(), line))
+    }
+
+    /// `error` as the fault of the key at `path`, at the line where it stands.
+    fn blame(&self, path: &[&str], error: &Error) -> Error {
+        let key = path.last().unwrap_or(&"");
+        Error::Invalid(format!("{}: {key}: {error}", self.place(path)))
     }
 }
 
@@ -316,18 +340,21 @@ impl Source {
 /// `Io`, `Invalid` or `NotSupported`; messages name the file and what is wrong in it.
 pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
     let (source, file, folder) = parse(input)?;
-    let is_scene = source.is_some();
     let single = match &file.volume {
         Volumes::One(single) => single,
-        Volumes::Several(entries) => return several::load(entries, &file, input, options),
+        Volumes::Several(entries) => {
+            // Only a scene file lists several.
+            let source = source.ok_or_else(|| Error::invalid(input, "is no scene file"))?;
+            return several::load(entries, &file, input, source, options);
+        }
     };
     // What a flag brought is the flag's fault, the rest its key's.
-    let blame = |key: &'static str, flag: bool| {
+    let blame = |path: &'static [&'static str], flag: bool| {
         let source = source.as_ref().filter(|_| !flag);
-        move |e: Error| source.map_or_else(|| Error::Invalid(e.to_string()), |s| s.blame(key, &e))
+        move |e: Error| source.map_or_else(|| Error::Invalid(e.to_string()), |s| s.blame(path, &e))
     };
     if file.policy.is_some() {
-        return Err(blame("policy", false)(Error::Invalid(
+        return Err(blame(&["policy"], false)(Error::Invalid(
             "there is only one volume; list several as [[volume]]".into(),
         )));
     }
@@ -350,23 +377,43 @@ pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
         _ => suggested(&volume)?,
     };
     let given = options.isovalues.is_some() || file.isovalues.is_none();
-    let sweep = Sweep::new(isovalues[0], isovalues[1]).map_err(blame("isovalues", given))?;
-    let field = Field::new(&volume, sweep).map_err(blame("isovalues", given))?;
+    let sweep = Sweep::new(isovalues[0], isovalues[1]).map_err(blame(&["isovalues"], given))?;
+    let field = Field::new(&volume, sweep).map_err(blame(&["isovalues"], given))?;
     let boxed = options.surroundings.kind.is_some() || options.surroundings.margin.is_some();
-    let key = if file.surroundings.kind.is_some() { "kind" } else { "margin" };
-    let mut polygons =
-        surroundings(&file.surroundings, &options.surroundings, &folder, field.lattice()).map_err(blame(key, boxed))?;
-    polygons.extend(context(&file.context, &folder).map_err(blame("[[context]]", false))?);
-    let flag = options.surface.albedo.is_some();
-    let (surface, boundary) = surface(&file.surface, &options.surface, sweep).map_err(blame("albedo", flag))?;
-    let scene =
-        Scene::new(field, surface, boundary, polygons).map_err(|e| if is_scene { e.in_file(input) } else { e })?;
-    Ok(Loaded { volume, companions: Vec::new(), scene, bake: file.bake })
+    let of_volume = |e: Error| e.in_file(&volume.name);
+    check_spacing(field.lattice()).map_err(of_volume)?;
+    let key: &[&str] = if file.surroundings.kind.is_some() { &["box", "kind"] } else { &["box", "margin"] };
+    let around = surroundings(&file.surroundings, &options.surroundings, &folder, field.lattice());
+    let mut polygons = around.map_err(|e| match e.to_string().starts_with("spacing ") {
+        true => of_volume(e),
+        false => blame(key, boxed)(e),
+    })?;
+    polygons.extend(context(&file.context, &folder, source.as_ref())?);
+    let by_flag = [options.surface.albedo.is_some(), options.surface.emission.is_some()];
+    let (surface, boundary) =
+        surface(&file.surface, &options.surface, sweep).map_err(blame(&["surface", "albedo"], by_flag[0]))?;
+    // What the surface's material cannot be begins with its key.
+    let in_scene = |e: Error| match (&e.to_string(), &source) {
+        (text, Some(s)) if text.starts_with("surface albedo ") && !by_flag[0] => {
+            e.in_file(s.place(&["surface", "albedo"]))
+        }
+        (text, Some(s)) if text.starts_with("surface emission ") && !by_flag[1] => {
+            e.in_file(s.place(&["surface", "emission"]))
+        }
+        (_, Some(_)) => e.in_file(input),
+        (_, None) => e,
+    };
+    let scene = Scene::new(field, surface, boundary, polygons).map_err(in_scene)?;
+    Ok(Loaded { volume, companions: Vec::new(), scene, bake: file.bake, source })
 }
 
 /// Polygons of all context geometry.
-fn context(entries: &[ContextOptions], folder: &Path) -> Result<Vec<Polygon>> {
-    Ok(entries.iter().map(|c| c.polygons(folder)).collect::<Result<Vec<_>>>()?.concat())
+fn context(entries: &[ContextOptions], folder: &Path, source: Option<&Source>) -> Result<Vec<Polygon>> {
+    let blame = |n: usize, e: Error| {
+        source.map_or_else(|| Error::Invalid(e.to_string()), |s| s.blame(&["context", &n.to_string(), "file"], &e))
+    };
+    let polygons = entries.iter().enumerate().map(|(n, c)| c.polygons(folder).map_err(|e| blame(n, e)));
+    Ok(polygons.collect::<Result<Vec<_>>>()?.concat())
 }
 
 /// The sweep that the data suggest.
@@ -410,125 +457,15 @@ fn surroundings(file: &BoxOptions, flags: &BoxOptions, folder: &Path, lattice: &
         "cornell" => cornell_box(lattice, margin.unwrap_or(0.0)),
         _ if margin.is_some() => Err(Error::Invalid(format!("box margin: only the Cornell box has one, not '{kind}'"))),
         "none" => Ok(Vec::new()),
-        path => read_obj(&folder.join(path)),
+        path => {
+            let file = folder.join(path);
+            match fault::nearest(path, &["cornell", "none"]).filter(|_| !file.exists()) {
+                Some(meant) => Err(Error::Invalid(format!("'{path}' is no file; did you mean `{meant}`?"))),
+                None => read_obj(&file),
+            }
+        }
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::flattened::Side;
-    use crate::scene::Boundary;
-
-    fn error_of(text: &str) -> String {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("scene.toml");
-        std::fs::write(&path, text).unwrap();
-        match load(&path, &SceneOptions::default()) {
-            Ok(_) => panic!("accepted: {text}"),
-            Err(e) => e.to_string(),
-        }
-    }
-
-    #[test]
-    fn a_whole_scene() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("scene.toml");
-        let text = "isovalues = [3.6, 95]\n[volume]\ngenerator = \"bumps\"\nsize = 17\n[surface]\nalbedo = [0.1, 0.2, 0.3]\n\
-                    outside = \"higher\"\nsides = \"both\"\nboundary = \"capped\"\n[box]\nmargin = 0.1\n[bake]\ngather = 0\n\
-                    grid = \"2x\"\npreset = \"preview\"\n";
-        std::fs::write(&path, text).unwrap();
-        let loaded = load(&path, &SceneOptions::default()).unwrap();
-        assert_eq!(loaded.scene.surface.albedo.uniform(), Some(DVec3::new(0.1, 0.2, 0.3)));
-        assert_eq!((loaded.scene.surface.outside, loaded.scene.surface.both_sides), (Side::Higher, true));
-        assert_eq!((loaded.scene.boundary, loaded.bake.gather_rays), (Boundary::Capped, Some(0)));
-        assert_eq!(loaded.scene.field.sweep().hi(), 95.0);
-        let options = SceneOptions { isovalues: Some(vec![10.0, 20.0]), ..SceneOptions::default() };
-        assert_eq!(load(&path, &options).unwrap().scene.field.sweep().lo(), 10.0, "flags win");
-    }
-
-    #[test]
-    fn volumes_without_a_suggestion_are_told_why() {
-        let of = |samples: Vec<f64>| {
-            let lattice = Lattice::aligned([2; 3], DVec3::ZERO, DVec3::ONE).unwrap();
-            let volume = Volume::new("v", lattice, crate::volume::Samples::F64(samples)).unwrap();
-            suggested(&volume).unwrap_err().to_string()
-        };
-        assert!(of(vec![2.5; 8]).contains("v: every sample is 2.5"));
-        assert!(of(vec![f64::NAN; 8]).contains("finite"));
-        let wide = of([-1.5e308, 1.5e308].repeat(4));
-        let words = ["v: ", "-1.5e308", " 1.5e308", "--isovalues"];
-        assert!(words.iter().all(|w| wide.contains(w)) && !wide.contains("every"), "{wide}");
-    }
-
-    #[test]
-    fn colours_by_isovalue() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("scene.toml");
-        let text = "isovalues = [10, 90]\n[volume]\ngenerator = \"bumps\"\nsize = 9\n[surface]\nalbedo = [\n  \
-                    { isovalue = 50, colour = 0.5 },\n  { isovalue = 30, colour = [0.1, 0.2, 0.3] },\n]\n";
-        std::fs::write(&path, text).unwrap();
-        let albedo = |options: &SceneOptions| load(&path, options).unwrap().scene.surface.albedo;
-        let by_isovalue = albedo(&SceneOptions::default());
-        assert_eq!(by_isovalue.at(0.0), DVec3::new(0.1, 0.2, 0.3));
-        assert!(by_isovalue.at(0.375).abs_diff_eq(DVec3::new(0.3, 0.35, 0.4), 1e-12), "halfway");
-        let grey = SurfaceOptions { albedo: Some("0.2".parse().unwrap()), ..SurfaceOptions::default() };
-        let options = SceneOptions { surface: grey, ..SceneOptions::default() };
-        assert_eq!(albedo(&options).uniform(), Some(DVec3::splat(0.2)), "flags win");
-        let of = |albedo: &str| {
-            error_of(&format!("[volume]\ngenerator = \"bumps\"\nsize = 9\n[surface]\nalbedo = {albedo}\n"))
-        };
-        for (albedo, says) in [
-            ("[0.1, 0.2]", "list of { isovalue, colour }"),
-            ("\"red\"", "list of { isovalue, colour }"),
-            ("[{ isovalue = 3, color = 0.5 }]", "did you mean `colour`?"),
-            ("[{ isovalue = 3, colour = 0.5 }, { isovalue = 3, colour = 0.6 }]", "different"),
-            ("[{ isovalue = 3, colour = 1.5 }]", "[0, 1]"),
-        ] {
-            let e = of(albedo);
-            assert!(e.contains("scene.toml:") && e.contains(says) && !e.contains('\n'), "{albedo}: {e}");
-        }
-    }
-
-    #[test]
-    fn errors_name_file_line_and_key() {
-        let e = error_of("[volume]\ngenerator = \"bumps\"\ncolour = 3\n");
-        assert!(e.contains("scene.toml:3: unknown key `colour` in [volume]; known: file") && !e.contains('\n'), "{e}");
-        let e = error_of("[volume]\ngenerator = \"bumps\"\n[surface]\noutside = \"heigher\"\n");
-        assert!(e.contains("scene.toml:4: unknown value `heigher` in [surface]; did you mean `higher`?"), "{e}");
-        let e = error_of("[volume]\ngenerator = \"bumps\"\n[foo]\nx = 1\n");
-        assert!(e.contains("scene.toml:3: unknown key `foo`; known: volume"), "{e}");
-        let e = error_of("[volume]\ngenerator = \"bumps\"\n[volume.foo]\nx = 1\n");
-        assert!(e.contains("scene.toml:3: unknown key `foo` in [volume]; known: file"), "{e}");
-        let e = error_of("isovalue = [1, 2]\n[volume]\ngenerator = \"bumps\"\n");
-        assert!(e.contains("scene.toml:1: unknown key `isovalue`; did you mean `isovalues`?"), "{e}");
-        let e = error_of("isovalues = [5, 5]\n[volume]\ngenerator = \"bumps\"\nsize = 9\n");
-        assert!(e.contains("scene.toml:1: isovalues"), "{e}");
-        let e = error_of("[volume]\ngenerator = \"bumps\"\n[[context]]\nfile = \"a.obj\"\nscal = 3\n");
-        assert!(e.contains("scene.toml:5: unknown key `scal` in [[context]]; did you mean `scale`?"), "{e}");
-        let e = error_of("[volume]\ngenerator = \"bumps\"\nsize = 9\n[[context]]\nfile = \"nowhere.obj\"\n");
-        assert!(e.contains("scene.toml: [[context]]") && e.contains("nowhere.obj"), "{e}");
-        let e = error_of("[volume]\nfile = \"nowhere.vti\"\n");
-        assert!(e.contains("scene.toml:2: file") && e.contains("nowhere.vti"), "{e}");
-        let e = error_of("[volume]\ngenerator = \"bumps\"\nsize = 9\n[box]\nmargin = -1.0\n");
-        assert!(e.contains("scene.toml:5: margin"), "{e}");
-        let e = error_of("[volume]\ngenerator = \"bumps\"\nsize = 9\n[box]\nmargin = 1001\n");
-        assert!(e.contains("scene.toml:5: margin") && e.contains("1000"), "{e}");
-        let e = error_of("isovalues = [10, 20, 30]\n[volume]\ngenerator = \"bumps\"\n");
-        assert!(e.contains("scene.toml:1") && e.contains("needs 2 numbers, found 3"), "{e}");
-        for emission in ["\"red\"", "[1, 2]"] {
-            let e = error_of(&format!("[volume]\ngenerator = \"bumps\"\n[surface]\nemission = {emission}\n"));
-            assert!(e.contains("scene.toml:4") && e.contains("a number, or three"), "{e}");
-        }
-        assert!(error_of("[volume]\n").contains("file or generator"));
-        let e = error_of("[volume]\nfiles = [\"a.vti\", \"b.vti\"]\ngenerator = \"bumps\"\n");
-        assert!(e.contains("scene.toml:2: files") && e.contains("files or generator"), "{e}");
-        assert!(error_of("[volume]\nfile = \"a.vti\"\nsize = 9\n").contains("size is for a generator"));
-        let e = error_of("[volume]\ngenerator = \"bumps\"\nraw = { dims = [2, 2, 2], type = \"u8\" }\n");
-        assert!(e.contains("raw is for a file"), "{e}");
-        let e = error_of("[volume]\ngenerator = \"bumps\"\nsize = 100000\n");
-        assert!(e.contains("100000") && e.contains("2048"), "{e}");
-        let e = error_of("isovalues = [200, 300]\n[volume]\ngenerator = \"bumps\"\nsize = 9\n");
-        assert!(e.contains("outside the data"), "{e}");
-    }
-}
+mod tests;

@@ -17,6 +17,7 @@ pub mod statistics;
 pub mod tiff;
 pub mod vti;
 
+use crate::digits::Shortest;
 use crate::error::{Error, Result};
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
@@ -73,9 +74,11 @@ impl Lattice {
             || determinant.abs() <= 1e-9 * size
             || !inverse.is_finite()
         {
+            let [x, y, z] = [axes.x_axis, axes.y_axis, axes.z_axis];
+            let [dx, dy, dz] = [x, y, z].map(|axis| Shortest(axis.length()));
             return Err(Error::Invalid(format!(
-                "lattice axes {:?}, {:?}, {:?} with origin {origin}: they must be finite and linearly independent",
-                axes.x_axis, axes.y_axis, axes.z_axis
+                "spacing {dx}, {dy}, {dz} along the axes {x}, {y}, {z} from the origin {origin}: must be finite and not 0, and \
+                 the axes linearly independent"
             )));
         }
         Ok(Self { dims, origin, axes, inverse })

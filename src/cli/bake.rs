@@ -209,7 +209,7 @@ impl Bake {
         }
         let volumes: Vec<&Volume> = [&loaded.volume].into_iter().chain(&loaded.companions).collect();
         let options = self.bake.clone().or(&loaded.bake);
-        let mut settings = BakeSettings::new(&options, &loaded.scene)?;
+        let mut settings = BakeSettings::new(&options, &loaded.scene).map_err(|e| loaded.blame_bake(&self.bake, e))?;
         let sweep = loaded.scene.field.sweep();
         supported(&loaded.scene, &settings).map_err(|e| e.in_file(&self.input))?;
         let members = loaded.scene.members();

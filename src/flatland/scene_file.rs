@@ -4,7 +4,7 @@ use super::{FlatScene, HeightField, Segment};
 use crate::error::{Error, Result};
 use crate::field::Sweep;
 use crate::flattened::Side;
-use crate::scene_file::{OutsideName, Rgb, fault, numbers};
+use crate::scene_file::{OutsideName, Rgb, numbers, parse_toml};
 use glam::{DVec2, DVec3};
 use serde::Deserialize;
 use std::io::ErrorKind;
@@ -60,7 +60,7 @@ pub fn load(path: &Path) -> Result<FlatScene> {
         ErrorKind::InvalidData => Error::invalid(path, "is no text; a scene file of n = 2 (.toml) is wanted"),
         _ => Error::io(path, e),
     })?;
-    let file: File = toml::from_str(&text).map_err(|e| fault(path, &text, &e))?;
+    let file: File = parse_toml(path, &text)?;
     build(path, &file).map_err(|e| match e {
         // What is wrong in the field's own file names that file already.
         Error::Invalid(message) if !message.starts_with(&field_name(path, &file)) => Error::invalid(path, message),

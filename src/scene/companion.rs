@@ -178,7 +178,7 @@ impl Scene {
         (scene.name, scene.number, scene.policy) = (name, own, policy);
         let numbers = (0..all).filter(|&n| n != own);
         for (index, (member, number)) in (0u8..).zip(members.into_iter().zip(numbers)) {
-            super::check(&member.surface, member.boundary, member.field.lattice(), &scene.polygons)?;
+            super::check(&member.surface, member.boundary, &member.field, &scene.polygons)?;
             let companion = Companion::new(member, number, index, scene.field.lattice());
             for p in companion.corners() {
                 let x = scene.lattice().to_world(p);

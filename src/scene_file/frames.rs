@@ -13,7 +13,7 @@ use std::path::Path;
 pub fn load_series(input: &Path, options: &SceneOptions) -> Result<Option<Series>> {
     let (source, file, folder) = parse(input)?;
     let Volumes::One(single) = &file.volume else { return Ok(None) };
-    let blame = |e: Error| source.as_ref().map_or_else(|| e.to_string(), |s| s.blame("file", &e).to_string());
+    let blame = |e: Error| source.as_ref().map_or_else(|| e.to_string(), |s| s.blame(single.key(), &e).to_string());
     let series = single.series(&folder).map_err(|e| Error::Invalid(blame(e)))?;
     if let Some(series) = &series {
         series.check(|path| read_volume(path, single, &options.raw))?;
@@ -22,12 +22,12 @@ pub fn load_series(input: &Path, options: &SceneOptions) -> Result<Option<Series
 }
 
 impl VolumeSource {
-    /// The key that says where the volume comes from.
-    pub(super) fn key(&self) -> &'static str {
+    /// The path of the key that says where the volume comes from.
+    pub(super) fn key(&self) -> &'static [&'static str] {
         match self {
-            VolumeSource { files: Some(_), .. } => "files",
-            VolumeSource { file: Some(_), .. } => "file",
-            _ => "generator",
+            VolumeSource { files: Some(_), .. } => &["volume", "files"],
+            VolumeSource { file: Some(_), .. } => &["volume", "file"],
+            _ => &["volume", "generator"],
         }
     }
 

@@ -1,8 +1,8 @@
 //! `[[volume]]`: several volumes in one scene.
 
 use super::{
-    Albedo, BoundaryName, Loaded, OutsideName, RawOptions, Rgb, SceneFile, SceneOptions, SidesName, SurfaceOptions,
-    VolumeSource, context, load_volume, numbers, suggested, surface, surroundings,
+    Albedo, BoundaryName, Loaded, OutsideName, RawOptions, Rgb, SceneFile, SceneOptions, SidesName, Source,
+    SurfaceOptions, VolumeSource, context, load_volume, numbers, suggested, surface, surroundings,
 };
 use crate::error::{Error, Result};
 use crate::field::{Field, Sweep};
@@ -193,7 +193,13 @@ impl VolumeEntry {
 }
 
 /// Loads the volumes of a scene file and what surrounds them.
-pub(super) fn load(entries: &[VolumeEntry], file: &SceneFile, input: &Path, options: &SceneOptions) -> Result<Loaded> {
+pub(super) fn load(
+    entries: &[VolumeEntry],
+    file: &SceneFile,
+    input: &Path,
+    source: Source,
+    options: &SceneOptions,
+) -> Result<Loaded> {
     let folder = input.parent().unwrap_or(Path::new(""));
     if let Some((flag, _)) = options.of_volume().into_iter().find(|f| f.1) {
         return Err(Error::invalid(
@@ -205,7 +211,10 @@ pub(super) fn load(entries: &[VolumeEntry], file: &SceneFile, input: &Path, opti
     for (n, entry) in entries.iter().enumerate() {
         let named = |e: Error| {
             let name = if entry.name.is_empty() { format!("{}", n + 1) } else { format!("'{}'", entry.name) };
-            Error::invalid(input, format!("volume {name}: {e}"))
+            // Many messages begin with the key.
+            let text = e.to_string();
+            let key = text.split([' ', ':']).next().unwrap_or_default();
+            Error::invalid(source.place(&["volume", &n.to_string(), key]), format!("volume {name}: {text}"))
         };
         let volume = entry.volume(folder).map_err(named)?;
         lattices.push(volume.lattice.clone());
@@ -222,15 +231,15 @@ pub(super) fn load(entries: &[VolumeEntry], file: &SceneFile, input: &Path, opti
     };
     let around = enclosing(members[0].field.lattice(), &lattices).map_err(|e| e.in_file(input))?;
     let mut polygons = surroundings(&file.surroundings, &options.surroundings, folder, &around)
-        .map_err(|e| Error::invalid(input, format!("box: {e}")))?;
-    polygons.extend(context(&file.context, folder).map_err(|e| Error::invalid(input, format!("[[context]]: {e}")))?);
+        .map_err(|e| Error::invalid(source.place(&["box", "kind"]), format!("box: {e}")))?;
+    polygons.extend(context(&file.context, folder, Some(&source))?);
     polygons.extend(standing);
     let policy = match file.policy {
         Some(PolicyName::Independent) => Policy::Independent,
         Some(PolicyName::Joint) | None => Policy::Joint,
     };
     let scene = Scene::with_members(members, policy, polygons).map_err(|e| e.in_file(input))?;
-    Ok(Loaded { volume, companions: volumes.collect(), scene, bake: file.bake.clone() })
+    Ok(Loaded { volume, companions: volumes.collect(), scene, bake: file.bake.clone(), source: Some(source) })
 }
 
 /// A lattice along the axes of the first whose Ω holds those of all; the first itself if that does.

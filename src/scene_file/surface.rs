@@ -92,7 +92,7 @@ impl<'de> Deserialize<'de> for Albedo {
             Some(list) if list.iter().any(toml::Value::is_table) => value.try_into().map(Albedo::Stops).map_err(fail),
             _ => value.try_into().map(Albedo::Uniform).map_err(|_| {
                 serde::de::Error::custom(
-                    "albedo: a colour is one number or [red, green, blue]; colours by isovalue are a list of { isovalue, colour }",
+                    "a colour is one number or [red, green, blue]; colours by isovalue are a list of { isovalue, colour }",
                 )
             }),
         }

@@ -96,6 +96,41 @@ fn bad_input_is_one_clear_line_and_leaves_nothing() {
     refused(dir, &["bake", "s.toml", "-o", "out.vti"], &["s.toml:5", "albdo", "albedo"]);
 }
 
+/// An option that a scene file sets is named by its line, one that a flag sets is not.
+#[test]
+fn options_of_a_bake_out_of_range_are_named_where_they_are_set() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let scene = "[volume]\ngenerator = \"bumps\"\nsize = 9\n[bake]\nlight-points = 17\ngather = 5\n";
+    fs::write(dir.join("s.toml"), scene).unwrap();
+    let bake = ["bake", "s.toml", "-o", "out.vti", "--engine", "sweep"];
+    refused(dir, &bake, &["s.toml:5: light-points 17: must be a power of two"]);
+    refused(dir, &[&bake[..], &["--light-points", "18"]].concat(), &["isolume: light-points 18: must be"]);
+    refused(dir, &[&bake[..], &["--light-points", "16", "--bands", "0"]].concat(), &["isolume: bands 0: must be"]);
+    refused(dir, &["bake", "s.toml", "-o", "out.vti", "--box", "cornel"], &["'cornel'", "did you mean `cornell`?"]);
+}
+
+/// Spacings, by name, before anything is made of them.
+#[test]
+fn spacings_out_of_range_are_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    fs::write(dir.join("r.raw"), (0..27).collect::<Vec<u8>>()).unwrap();
+    let verbs: [&[&str]; 2] =
+        [&["bake", "r.raw", "-o", "out.vti"], &["reference", "r.raw", "--isovalue", "9", "-o", "r.ply"]];
+    for verb in verbs {
+        for [spacing, named] in [
+            ["1e-10,1,1e10", "spacing 1e-10, 1, 10000000000: "],
+            ["1e-17,1,1", "spacing 1e-17, 1, 1: "],
+            ["0,1,1", "spacing 0, 1, 1 "],
+            ["1,1,1e17", "spacing 1, 1, 1e17: "],
+        ] {
+            let raw = ["--raw-dims", "3,3,3", "--raw-spacing", spacing];
+            refused(dir, &[verb, &raw].concat(), &["r.raw: ", named]);
+        }
+    }
+}
+
 /// Its photons would come from all isovalues of the sweep.
 #[test]
 fn photons_of_one_isosurface_that_emits_are_refused() {
