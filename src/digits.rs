@@ -25,8 +25,8 @@ pub fn brief(v: f64) -> Shortest {
     rounded(v, FEWEST)
 }
 
-/// Six digits of a number of the range lo … hi, or as many more as tell a thousandth of the range apart: an offset takes
-/// digits of its own.
+/// Six digits of a number of the range lo … hi, or as many more as tell a thousandth of the range apart: an offset
+/// takes digits of its own.
 pub fn brief_within(v: f64, [lo, hi]: [f64; 2]) -> Shortest {
     let place = |x: f64| x.abs().log10().floor();
     let needed = place(v) - place(1e-3 * (hi - lo)) + 1.0;

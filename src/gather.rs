@@ -79,8 +79,8 @@ pub const CAVITY: f32 = 16.0;
 
 /// Indirect irradiance at `receiver`: π/M Σ L over `rays` cosine-distributed directions. Luminaires count 0, since
 /// direct light is counted apart; what leaves everything carries nothing. \[BB09 Eq. 2\] A receiver that sees nothing
-/// but dark surfaces all around, as inside another field's solid, is known to be dark after a quarter of its rays, but at
-/// least 64, if all `light` is trusted: paths find none now and then where there is some.
+/// but dark surfaces all around, as inside another field's solid, is known to be dark after a quarter of its rays, but
+/// at least 64, if all `light` is trusted: paths find none now and then where there is some.
 pub fn gathered_irradiance<T: Tracer, L: KnownLight>(
     scene: &Scene,
     tracer: &T,
