@@ -23,7 +23,7 @@ pub(super) struct Flatland {
     /// Light the graph as an ordinary surface in R³ too, and put both pictures side by side
     #[arg(long)]
     ordinary: bool,
-    /// Draw this many photons that leave the luminaire at half the sweep's height
+    /// Draw this many photons that leave the luminaire at half the sweep's height, at most 65536
     #[arg(long, default_value_t = 0, value_name = "N")]
     paths: u64,
     /// Pixels across one picture
@@ -37,6 +37,9 @@ pub(super) struct Flatland {
     seed: u64,
 }
 
+/// More would cover the picture.
+const MOST_PATHS: u64 = 1 << 16;
+
 impl Flatland {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
         if !(16..=8192).contains(&self.width) {
@@ -45,7 +48,17 @@ impl Flatland {
         if !(1..=1 << 16).contains(&self.gather) {
             return Err(Error::Invalid(format!("--gather {}: 1 to 65536 directions", self.gather)));
         }
+        if self.paths > MOST_PATHS {
+            return Err(Error::Invalid(format!("--paths {}: 0 to {MOST_PATHS} photons", self.paths)));
+        }
         let scene = load(&self.scene)?;
+        let (gaps, count) = (scene.field.non_finite(), scene.field.samples().len());
+        if gaps > 0 {
+            say!(
+                "warning: {}: {gaps} of {count} samples are not finite; no curve passes the cells that touch them",
+                self.scene.display()
+            );
+        }
         super::folder(&self.output)?;
         let device = super::device()?;
         let begun = Instant::now();

@@ -133,6 +133,11 @@ impl HeightField {
         self.sweep
     }
 
+    /// Samples that are not finite: the cells that touch them hold nothing.
+    pub fn non_finite(&self) -> usize {
+        self.samples.iter().filter(|s| s.is_nan()).count()
+    }
+
     /// Samples in units of the sweep.
     pub fn samples(&self) -> &[f32] {
         &self.samples
@@ -261,7 +266,7 @@ fn thin_slice(volume: &Volume) -> Result<Raster> {
     let Some(thin) = (0..3).rev().find(|&a| dims[a] == 2) else {
         let [x, y, z] = dims;
         return Err(Error::NotSupported(format!(
-            "{}: {x}×{y}×{z} samples; a height field is two samples thick along one axis: cut out a slice",
+            "{}: {x}×{y}×{z} samples; a height field is one sample thick along one axis (.nrrd or .vti), or two: cut out a slice",
             volume.name
         )));
     };

@@ -349,7 +349,7 @@ pub fn write_pictures(
         for look in &looks {
             let waterline: &[f64] = if look.world.transport == Transport::Flattened { &[plane] } else { &[] };
             let mut picture = lit(&view, look, settings.samples, waterline, 0.6);
-            draw_paths(&view, look.world, &mut picture, plane, settings.paths);
+            draw_paths(&view, look.world, &mut picture, plane, settings.paths)?;
             pictures.push(picture);
         }
         unless_interrupted()?;
@@ -360,8 +360,12 @@ pub fn write_pictures(
 }
 
 /// Photons from the luminaire at one height: yellow, then the colour of what reflected them.
-fn draw_paths(view: &View, world: &World, picture: &mut Picture, plane: f64, count: u64) {
+///
+/// # Errors
+/// `Interrupted`.
+fn draw_paths(view: &View, world: &World, picture: &mut Picture, plane: f64, count: u64) -> Result<()> {
     for index in 0..count {
+        unless_interrupted()?;
         let path = world.photon_path(1, index, plane, 3);
         let mut colour = DVec3::new(1.0, 0.75, 0.05);
         for pair in path.windows(2) {
@@ -373,6 +377,7 @@ fn draw_paths(view: &View, world: &World, picture: &mut Picture, plane: f64, cou
             };
         }
     }
+    Ok(())
 }
 
 /// The level sets in the plane with walls and luminaire. \[BB09 Fig. 2\]

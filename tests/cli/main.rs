@@ -10,6 +10,7 @@ mod bad_input;
 mod compare;
 mod engines;
 mod final_gather;
+mod flatland;
 mod outputs;
 mod pictures;
 mod reproducibility;
