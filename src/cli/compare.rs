@@ -83,6 +83,12 @@ impl Compare {
         for ((reference, file), path) in references.iter().zip(&files).zip(&self.references) {
             let origin = Origin::from_comments(&file.comments);
             belongs(&reference.positions, origin.isovalue, &baked.scene.field).map_err(|e| e.in_file(path))?;
+            if origin.of_bake {
+                say!(
+                    "warning: {}: holds the light of a bake (isolume extract), not of a reference; it is taken for exact",
+                    path.display()
+                );
+            }
             let another = |c| origin.light.is_some_and(|known| known != reference::light(&baked.scene, c));
             if origin.isovalue.is_some_and(another) {
                 say!(

@@ -3,9 +3,10 @@
 use super::final_gather::{FinalGatherOptions, light};
 use super::{expect_extension, outputs};
 use crate::error::{Error, Result};
-use crate::export::Mesh;
 use crate::export::bake_file::BakedVolume;
+use crate::export::{Mesh, ply};
 use crate::progress::{Progress, say, unless_interrupted};
+use crate::reference::Origin;
 use crate::scene::Scene;
 use crate::scene_file::{Inputs, SceneOptions, load};
 use crate::series::is_pattern;
@@ -16,7 +17,8 @@ use std::time::Instant;
 #[derive(clap::Args, Debug)]
 #[command(after_help = "\
 From a bake, vertices also hold its light, as colours for the eye (exposed; sRGB-encoded but in .glb, whose colours are linear)
-and, in .ply as `radiance_r`, `radiance_g`, `radiance_b` and in .vtp as `radiance`, linear and not exposed.
+and, in .ply as `radiance_r`, `radiance_g`, `radiance_b` and in .vtp as `radiance`, linear and not exposed. It is the light of the
+outside; that of the inside, of a bake with --sides both, is in the bake's array `radiance_inside` (isolume export).
 
 Examples:
   isolume extract head.nii.gz --isovalue 80 -o head.ply
@@ -81,7 +83,12 @@ impl Extract {
             None => Vec::new(),
         };
         unless_interrupted()?;
-        Mesh { colours: colours.as_deref(), ..mesh.export(&properties) }.write(&self.output)?;
+        let lit = Mesh { colours: colours.as_deref(), ..mesh.export(&properties) };
+        // Where it can be said, for compare.
+        match baked.is_some() && self.output.extension().is_some_and(|e| e.eq_ignore_ascii_case("ply")) {
+            true => ply::write_with_comments(&self.output, &lit, &[Origin::comment_of_bake(self.isovalue)])?,
+            false => lit.write(&self.output)?,
+        }
         if self.json {
             let numbers = serde_json::json!({
                 "file": self.output,

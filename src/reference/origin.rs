@@ -6,6 +6,8 @@ use crate::scene::Scene;
 
 /// How the comment begins that holds it.
 const MARK: &str = "isolume reference";
+/// How that of an isosurface with a bake's light begins.
+const OF_BAKE: &str = "isolume extract";
 
 /// What a reference was made of; what a file leaves out is `None`.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -14,6 +16,8 @@ pub struct Origin {
     pub isovalue: Option<f64>,
     /// Digest of material and box at that isovalue, as [`light`].
     pub light: Option<String>,
+    /// Whether the light is a bake's.
+    pub of_bake: bool,
 }
 
 impl Origin {
@@ -27,12 +31,20 @@ impl Origin {
         format!("{MARK} isovalue={isovalue:?} seed={seed} samples={samples} integrator={integrator} light={light}")
     }
 
+    /// The comment for an isosurface (source units) with a bake's light.
+    pub fn comment_of_bake(isovalue: f64) -> String {
+        format!("{OF_BAKE} isovalue={isovalue:?}")
+    }
+
     /// From the comments of a file, which other programs and older versions leave out.
     pub fn from_comments(comments: &[String]) -> Self {
-        let words = || comments.iter().filter_map(|c| c.strip_prefix(MARK)).flat_map(str::split_ascii_whitespace);
+        let marked = |c: &String| c.strip_prefix(MARK).or_else(|| c.strip_prefix(OF_BAKE)).map(str::to_owned);
+        let marked: Vec<String> = comments.iter().filter_map(marked).collect();
+        let words = || marked.iter().flat_map(|c| c.split_ascii_whitespace());
         let value = |key: &str| words().find_map(|w| w.strip_prefix(key)?.strip_prefix('='));
         let isovalue = value("isovalue").and_then(|v| v.parse().ok()).filter(|c: &f64| c.is_finite());
-        Self { isovalue, light: value("light").map(str::to_owned) }
+        let of_bake = comments.iter().any(|c| c.starts_with(OF_BAKE));
+        Self { isovalue, light: value("light").map(str::to_owned), of_bake }
     }
 }
 

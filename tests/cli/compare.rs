@@ -297,7 +297,10 @@ fn the_mesh_of_errors_holds_them() {
     bake(dir, "b.vti", "lit.vti", &RANGE);
     reference(dir, "lit.vti", "r.ply", &["--isovalue", "47"]);
     ok(dir, &["extract", "lit.vti", "--isovalue", "47", "-o", "t.ply", "-q"]);
-    ok(dir, &["compare", "lit.vti", "r.ply", "-o", "e.ply", "-q"]);
+    let said = text(&ok(dir, &["compare", "lit.vti", "t.ply"]).stderr);
+    assert!(said.contains("warning: t.ply: holds the light of a bake"), "{said}");
+    let said = text(&ok(dir, &["compare", "lit.vti", "r.ply", "-o", "e.ply", "-q"]).stderr);
+    assert_eq!(said, "");
     let exposure = BakedVolume::read(&dir.join("lit.vti")).unwrap().exposure;
     let [t, r, e] = ["t.ply", "r.ply", "e.ply"].map(|f| ply::read(dir.join(f)).unwrap());
     let shown = |m: &PlyMesh| -> Vec<DVec3> {
