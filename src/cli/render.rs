@@ -46,7 +46,7 @@ pub(super) struct Render {
     /// Path-trace the isosurface's triangles instead of using the bake's light
     #[arg(long, conflicts_with_all = ["local", "shadow_rays", "gather_rays"])]
     reference: bool,
-    /// Path-trace the trilinear surface itself instead of triangles, caps included
+    /// With --reference: path-trace the trilinear surface itself instead of triangles, caps included
     #[arg(long, requires = "reference")]
     trilinear: bool,
     /// Pixels from top to bottom
