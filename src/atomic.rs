@@ -28,7 +28,7 @@ impl AtomicFile {
     /// Opens a temporary file beside `path`: an unwritable folder shows now, before hours of work.
     ///
     /// # Errors
-    /// `Io` if the folder does not exist or cannot be written; `Invalid` if `path` has no file name or names something
+    /// `Io` if the folder cannot be written; `Invalid` if it is missing, `path` has no file name or names something
     /// other than a regular file (a folder, a device), which a rename would replace, or a file that nobody may write.
     pub fn create(path: impl AsRef<Path>) -> Result<Self> {
         static COUNT: AtomicU32 = AtomicU32::new(0);
@@ -63,6 +63,13 @@ impl AtomicFile {
                     return Ok(Self { file: Some(BufWriter::new(file)), temporary, target });
                 }
                 Err(e) if e.kind() == io::ErrorKind::AlreadyExists => {} // left by a killed process of the same number
+                Err(e) if e.kind() == io::ErrorKind::NotFound => {
+                    let folder = target.parent().unwrap_or(Path::new("")).display();
+                    return Err(Error::invalid(
+                        path,
+                        format!("its folder {folder} is missing; make it, or name another"),
+                    ));
+                }
                 Err(e) => return Err(Error::io(path, e)),
             }
         }

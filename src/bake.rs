@@ -426,7 +426,7 @@ pub(crate) fn scene_job(scene: &Scene) -> String {
         let lattice = member.field.lattice();
         add("volume", member.name);
         add("lattice", format!("{:?} {:?} {:?}", lattice.dims(), lattice.origin(), lattice.axes()));
-        add("isovalues", format!("{:?}", member.field.sweep()));
+        add("isovalues", member.field.sweep().to_string());
         let mut crc = flate2::Crc::new();
         let part = |samples: &[f32]| {
             let mut crc = flate2::Crc::new();

@@ -21,6 +21,7 @@ use crate::export::bake_file::BakeSummary;
 use crate::isa::Isa;
 use crate::progress::{self, Progress, say};
 use crate::scene_file::{self, Inputs, RawOptions};
+use crate::series::is_pattern;
 use crate::volume::Volume;
 use crate::volume::statistics::VolumeStatistics;
 use crate::volume::vti::VtiFile;
@@ -207,6 +208,18 @@ fn folder(path: &Path) -> Result<()> {
     writable(&path.join("probe"))
 }
 
+/// Fails if `path` is the pattern of a series, for verbs that take one volume.
+fn one_frame(path: &Path) -> Result<()> {
+    if !is_pattern(path) {
+        return Ok(());
+    }
+    Err(Error::invalid(
+        path,
+        "is the pattern of a series, of which this verb takes one frame: name its file (bake, extract, render and reference \
+         take patterns)",
+    ))
+}
+
 fn expect_extension(path: &Path, known: &[&str]) -> Result<()> {
     let found = path.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
     if known.contains(&found.as_str()) {
@@ -223,6 +236,7 @@ fn device() -> Result<Device> {
 
 impl Info {
     fn run(self) -> Result<()> {
+        one_frame(&self.file)?;
         let vti = !self.raw.given() && self.file.extension().is_some_and(|e| e.eq_ignore_ascii_case("vti"));
         let (volume, bake) = if vti {
             let file = VtiFile::read(&self.file)?;

@@ -50,8 +50,13 @@ pub(crate) struct Section {
 /// Opens a file for reading.
 ///
 /// # Errors
-/// `Io` with the path.
+/// `Io` with the path; `Invalid` for a pipe or a device, in which nothing can be found again.
 pub(crate) fn open(path: &Path) -> Result<File> {
+    let kind = std::fs::metadata(path).map_err(|e| Error::io(path, e))?.file_type();
+    // Opened, a pipe would wait for its writer.
+    if !kind.is_file() && !kind.is_dir() {
+        return Err(Error::invalid(path, "is a pipe or a device, not a file; write its content to a file first"));
+    }
     File::open(path).map_err(|e| Error::io(path, e))
 }
 

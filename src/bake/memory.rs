@@ -86,6 +86,14 @@ const FITTED: u64 = 84;
 /// when they are packed.
 const WRITER: u64 = 40 << 20;
 
+/// What lowers the memory of a bake.
+fn remedy(engine: Engine) -> &'static str {
+    match engine {
+        Engine::Photon => "lower --photons or --grid",
+        Engine::Sweep => "lower --grid or --wall-resolution",
+    }
+}
+
 /// Estimated peak memory of a bake, stage by stage, everything that lives then included.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MemoryEstimate {
@@ -144,11 +152,12 @@ impl MemoryEstimate {
     ///
     /// # Errors
     /// `Invalid` with both.
-    pub fn check_machine(&self) -> Result<()> {
+    pub fn check_machine(&self, engine: Engine) -> Result<()> {
         match machine_memory() {
             Some(there) if self.peak() / BEYOND > there => Err(Error::Invalid(format!(
-                "the bake is estimated at {self}; this machine has {}; lower --grid or --wall-resolution",
-                size(there)
+                "the bake is estimated at {self}; this machine has {}; {}",
+                size(there),
+                remedy(engine)
             ))),
             _ => Ok(()),
         }
@@ -163,10 +172,7 @@ impl MemoryEstimate {
             return Ok(());
         }
         let cut = if bands > 1 { format!(", cut into {bands} bands,") } else { String::new() };
-        let remedy = match engine {
-            Engine::Photon => "lower --photons or --grid",
-            Engine::Sweep => "lower --grid or --wall-resolution",
-        };
+        let remedy = remedy(engine);
         Err(Error::Invalid(format!(
             "--max-memory {}: the bake{cut} is estimated at {self}; {remedy}, or allow more",
             limit(most)

@@ -14,6 +14,9 @@ use serde::{Deserialize, Serialize};
 /// More bands than this save nothing.
 pub const MOST_BANDS: usize = 256;
 
+/// More photons than any machine holds or traces.
+const MOST_PHOTONS: u64 = 1 << 40;
+
 /// How much work a bake is worth.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
@@ -454,7 +457,7 @@ impl BakeSettings {
             bands: o.bands.unwrap_or(1),
         };
         let s = &settings;
-        let checks: [(&str, &dyn std::fmt::Display, bool, &str); 10] = [
+        let checks: [(&str, &dyn std::fmt::Display, bool, &str); 11] = [
             (
                 "directions",
                 &s.directions,
@@ -467,6 +470,7 @@ impl BakeSettings {
                 s.light_points.is_power_of_two() && s.light_points <= 1 << 16,
                 "a power of two, at most 65536",
             ),
+            ("photons", &s.photons, s.photons <= MOST_PHOTONS, "at most 1099511627776"),
             ("samples", &0, s.samples != Some(0), "at least 1"),
             (
                 "photons-per-estimate",
@@ -478,7 +482,7 @@ impl BakeSettings {
             ("shadow-rays", &s.shadow_rays, (1..=1 << 20).contains(&s.shadow_rays), "1 to 1048576"),
             ("gather", &s.gather_rays, s.gather_rays <= 1 << 20, "0 to 1048576"),
             ("bands", &s.bands, (1..=MOST_BANDS).contains(&s.bands), "1 to 256"),
-            ("tau", &s.tau, s.tau > 0.0 && s.tau.is_finite(), "above 0"),
+            ("tau", &s.tau, s.tau > 0.0 && s.tau.is_finite(), "above 0 and finite"),
             ("wall-resolution", &s.wall_resolution, (2..=2048).contains(&s.wall_resolution), "2 to 2048"),
         ];
         if settings.engine == Engine::Sweep && settings.bands > 1 {

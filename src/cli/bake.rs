@@ -41,7 +41,7 @@ pub(super) struct Bake {
     /// Output: .vti; of a scene of several volumes .vtm, with a .vti for each beside it
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// Write seconds, rays, counts and settings as JSON
+    /// Write seconds, rays, counts and settings as JSON; of a series NAME_0000.json … for NAME.json
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
     /// Print the same JSON, of a series a list of its frames'; with --dry-run the estimates
@@ -251,7 +251,7 @@ impl Bake {
             }
             None => MemoryEstimate::new(&loaded.scene, &volumes, &settings, &device)?,
         };
-        let fits = memory.check_machine();
+        let fits = memory.check_machine(settings.engine);
         if progress == Progress::Shown || self.dry_run {
             let engine = match settings.engine {
                 Engine::Sweep => "sweep: every isovalue at once",

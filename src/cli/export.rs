@@ -1,6 +1,6 @@
 //! `isolume export`: one array of a bake, or a volume, in another format.
 
-use super::{expect_extension, outputs};
+use super::{expect_extension, one_frame, outputs};
 use crate::error::{Error, Result};
 use crate::export::slices;
 use crate::progress::{Progress, say};
@@ -29,7 +29,7 @@ pub(super) struct Export {
     /// The array to write (default: radiance of a bake, the scalars of a volume)
     #[arg(long, value_name = "NAME")]
     array: Option<String>,
-    /// What the world's axes mean, for the .nrrd: lps, ras or las (default: as the volume's own file said)
+    /// What the world's axes mean, for a .nrrd or .vti: lps, ras or las (default: as the volume's own file said)
     #[arg(long, value_name = "SPACE")]
     space: Option<String>,
     #[command(flatten)]
@@ -48,6 +48,16 @@ struct Array {
 impl Export {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
         expect_extension(&self.output, &["nrrd", "npy", "exr", "vti"])?;
+        one_frame(&self.input)?;
+        let extension = self.output.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        if let (Some(space), "npy" | "exr") = (&self.space, extension.as_str()) {
+            return Err(Error::invalid(
+                &self.output,
+                format!(
+                    "--space {space}: a .{extension} does not say what the axes mean; leave it out, or export a .nrrd or .vti"
+                ),
+            ));
+        }
         outputs([&*self.output], &Inputs::files([&*self.input]))?;
         let space = self.space.as_ref().map(|name| {
             let unknown = || Error::Invalid(format!("--space {name}: give lps, ras or las"));
@@ -59,7 +69,7 @@ impl Export {
         }
         let Array { lattice, space, name, components, samples } = &array;
         let path = &self.output;
-        match path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase().as_str() {
+        match extension.as_str() {
             "nrrd" => nrrd::write(path, lattice, *space, *components, samples.into(), &[("array", name)])?,
             "npy" => npy::write(path, lattice, *components, samples.into())?,
             "exr" => slices::write(path, lattice, *components, samples.into())?,

@@ -1,6 +1,6 @@
 //! `isolume init`: a scene file for a volume, with every key, its default and what it does.
 
-use super::{expect_extension, export};
+use super::{expect_extension, export, one_frame};
 use crate::atomic::AtomicFile;
 use crate::digits::brief_span;
 use crate::error::{Error, Result};
@@ -34,6 +34,7 @@ impl Init {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
         let output = self.output.clone().unwrap_or_else(|| beside(&self.file));
         expect_extension(&output, &["toml"])?;
+        one_frame(&self.file)?;
         if output.exists() {
             return Err(Error::invalid(&output, "exists already; give another name with -o, or remove it first"));
         }

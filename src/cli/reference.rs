@@ -83,6 +83,7 @@ impl ReferenceArgs {
             return Err(Error::Invalid("--photons, --vertices: at least 1; --photons-per-estimate: 2 to 4096".into()));
         }
         let (scene, baked) = open_scene(&self.input, &self.scene, self.field.as_deref())?;
+        let of_bake = baked.is_some();
         baked.map_or(Ok(()), |b| b.whole()).map_err(|e| e.in_file(&self.input))?;
         // Alone, if the scene's volumes give each other no light.
         let scene = scene.lit(scene.number());
@@ -92,7 +93,7 @@ impl ReferenceArgs {
                 "--integrator photon: isosurfaces that emit light are for --integrator path".into(),
             ));
         }
-        let isovalue = unit_isovalue(&scene.field, self.isovalue)?;
+        let isovalue = unit_isovalue(&scene.field, self.isovalue).map_err(|e| other_sweep(e, of_bake))?;
         let settings = ReferenceSettings {
             integrator: self.integrator,
             samples: self.samples,
@@ -130,6 +131,11 @@ impl ReferenceArgs {
         }
         Ok(())
     }
+}
+
+/// `error` of an isovalue outside the sweep, which may be another unless a bake holds it.
+fn other_sweep(error: Error, of_bake: bool) -> Error {
+    if of_bake { error } else { Error::Invalid(format!("{error}, or give a sweep that holds it with --isovalues")) }
 }
 
 /// Mesh and reference of one isosurface, and the rays that departed below its triangles.

@@ -144,7 +144,8 @@ impl Generator {
     /// Samples the field, as f32, on a vertex-centred lattice over `[0,1]³`.
     ///
     /// # Errors
-    /// `Invalid` as [`Lattice::new`], and beyond [`Generator::MOST`] samples along an edge.
+    /// `Invalid` as [`Lattice::new`], beyond [`Generator::MOST`] samples along an edge, and for samples that f32 does
+    /// not hold or tell apart.
     pub fn sample(&self, dims: [usize; 3]) -> Result<Volume> {
         if let Some(n) = dims.into_iter().find(|&n| n > Self::MOST) {
             return Err(Error::Invalid(format!("size {n}: at most {} samples along each edge", Self::MOST)));
@@ -158,7 +159,15 @@ impl Generator {
             self.value(DVec3::new(along(i, dims[0]), along(j, dims[1]), along(k, dims[2]))) as f32
         };
         let samples = (0..lattice.len()).into_par_iter().map(at).collect();
-        Volume::new(self.name(), lattice, Samples::F32(samples))
+        let volume = Volume::new(self.name(), lattice, Samples::F32(samples))?;
+        if volume.non_finite() > 0 || volume.range().is_none_or(|(lo, hi)| lo == hi) {
+            return Err(Error::Invalid(format!(
+                "generator `{}`: its samples are infinite or all the same as 32-bit floats; give parameters between 1e-30 and 1e30, \
+                 or more samples",
+                self.name()
+            )));
+        }
+        Ok(volume)
     }
 }
 

@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::files::{self, Packing, Section};
-use crate::volume::{ElementType, Endian, Lattice, Samples, Volume};
+use crate::volume::{ElementType, Endian, Lattice, READ, Samples, Volume};
 use glam::DVec3;
 use std::path::Path;
 
@@ -38,6 +38,15 @@ impl RawLayout {
         let bytes = (lattice.len() as u64).saturating_mul(self.element.size() as u64);
         let [nx, ny, nz] = self.dims;
         let (found, wanted) = (files::length(path)?, bytes.saturating_add(self.header_bytes));
+        let headed = path.extension().map(|e| format!(".{}", e.to_string_lossy().to_ascii_lowercase()));
+        if let Some(e) = headed.filter(|e| found != wanted && READ.split([',', ' ']).any(|known| known == e)) {
+            return Err(Error::invalid(
+                path,
+                format!(
+                    "has {found} bytes instead of {wanted}: a {e} has a header that says its layout; leave --raw-… out"
+                ),
+            ));
+        }
         if found != wanted {
             return Err(Error::invalid(
                 path,

@@ -131,6 +131,49 @@ fn spacings_out_of_range_are_named() {
     }
 }
 
+/// What is asked of a file of another kind, or with a number beyond use, is told what to do instead.
+#[test]
+fn messages_say_what_to_do_instead() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "sphere", "--size", "9", "-o", "b.npy", "-q"]);
+    refused(dir, &["info", "b.npy", "--raw-dims", "9,9,9"], &["b.npy", ".npy has a header", "leave --raw-… out"]);
+    for verb in [
+        &["info", "rho_%04d.npy"][..],
+        &["info", "rho_%04d.vti"],
+        &["init", "rho_%04d.npy", "-o", "r.toml"],
+        &["export", "rho_%04d.npy", "-o", "out.vti"],
+        &["export", "rho_%d.vti", "-o", "out.vti"],
+    ] {
+        refused(dir, verb, &["rho_%", "takes one frame"]);
+    }
+    let outside = ["reference", "b.npy", "--isovalue", "0.0001", "-o", "r.ply"];
+    refused(dir, &outside, &["--isovalue 0.0001: outside the sweep", "--isovalues"]);
+    let bake = ["bake", "b.npy", "-o", "out.vti", "-q"];
+    refused(dir, &[&bake[..], &["--tau", "inf"]].concat(), &["tau inf: must be above 0 and finite"]);
+    refused(
+        dir,
+        &[&bake[..], &["--photons", "18446744073709551615"]].concat(),
+        &["photons 18446744073709551615: must be at most"],
+    );
+    let trillion = [&bake[..], &["--photons", "1099511627776"]].concat();
+    refused(dir, &trillion, &["this machine has", "lower --photons"]);
+    refused(dir, &["bake", "b.npy", "-o", "nodir/x.vti"], &["nodir/x.vti: its folder nodir is missing"]);
+    for name in ["q.npy", "q.exr"] {
+        let export = ["export", "b.npy", "--space", "ras", "-o", name];
+        refused(dir, &export, &[name, "--space ras", ".nrrd or .vti"]);
+        assert!(!dir.join(name).exists());
+    }
+    for formula in ["linear:1e308,1e308,1e308", "linear:1e-320,0,0", "linear:1e39,0,0"] {
+        refused(dir, &["generate", formula, "--size", "3", "-o", "out.vti"], &["linear", "infinite or all the same"]);
+    }
+    #[cfg(unix)]
+    {
+        assert!(std::process::Command::new("mkfifo").arg(dir.join("f.npy")).status().unwrap().success());
+        refused(dir, &["info", "f.npy"], &["f.npy", "pipe"]);
+    }
+}
+
 /// Its photons would come from all isovalues of the sweep.
 #[test]
 fn photons_of_one_isosurface_that_emits_are_refused() {
