@@ -1,11 +1,14 @@
 //! Files that appear only when they are complete.
 
 use crate::error::{Error, Result};
-use std::ffi::OsString;
+use std::ffi::OsStr;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering};
+
+/// Bytes of a file's name that its temporary one repeats, to be told by: names may have 255 in all, or fewer.
+const MOST_STEM: usize = 80;
 
 /// As many links one after another as Linux follows.
 const MOST_LINKS: usize = 40;
@@ -14,8 +17,8 @@ const MOST_LINKS: usize = 40;
 ///
 /// Whoever reads the file's own name sees the old content or the complete new one, never a part. Dropped without
 /// commit, the temporary file is removed and the old content stays; only a killed process leaves it behind (hidden,
-/// named `.<name>.<process>-<count>.tmp`). A symbolic link is followed: the file it names is replaced, or made, not the
-/// link. What is replaced hands its mode on.
+/// named `.<name>.<machine>-<process>-<count>.tmp`, of long names the beginning). A symbolic link is followed: the file
+/// it names is replaced, or made, not the link. What is replaced hands its mode on.
 #[derive(Debug)]
 pub struct AtomicFile {
     /// `None` once closed.
@@ -51,11 +54,10 @@ impl AtomicFile {
         };
         // A name of its own per process and call, and create_new: two writers never share a temporary file.
         loop {
-            let mut hidden = OsString::from(".");
-            hidden.push(name);
-            hidden.push(format!(".{}-{}.tmp", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed)));
-            let temporary = target.with_file_name(hidden);
-            match OpenOptions::new().write(true).create_new(true).open(&temporary) {
+            let (machine, process) = (machine().unwrap_or_default(), std::process::id());
+            let count = COUNT.fetch_add(1, Ordering::Relaxed);
+            let temporary = target.with_file_name(format!(".{}.{machine}-{process}-{count}.tmp", stem(name)));
+            match OpenOptions::new().read(true).write(true).create_new(true).open(&temporary) {
                 Ok(file) => {
                     if let Some(old) = &old {
                         take_over(&file, old);
@@ -102,7 +104,14 @@ impl AtomicFile {
         let mut file = if self.file.is_some() { self.complete()? } else { self };
         fs::rename(&file.temporary, &file.target).map_err(|e| Error::io(&file.target, e))?;
         file.temporary.clear();
+        sync_folder(&file.target);
         Ok(())
+    }
+
+    /// The file once more, for reading and writing: it stays open when this is closed, and has its name once this has
+    /// been committed.
+    pub(crate) fn handle(&mut self) -> io::Result<File> {
+        self.open()?.get_ref().try_clone()
     }
 
     /// Completes what `written` says was written well; its failure becomes an [`Error::Io`] at the file.
@@ -137,6 +146,38 @@ fn take_over(file: &File, old: &fs::Metadata) {
 #[cfg(not(unix))]
 fn take_over(_: &File, _: &fs::Metadata) {}
 
+/// Writes to the disk which names the folder of `path` holds: until then a power cut could take the new one back, when
+/// what it was made from may be deleted already.
+#[cfg(unix)]
+fn sync_folder(path: &Path) {
+    // Some folders cannot be read and some file systems refuse; the file is whole and in its place all the same.
+    let _ = File::open(folder_of(path)).and_then(|folder| folder.sync_all());
+}
+
+#[cfg(not(unix))]
+fn sync_folder(_: &Path) {}
+
+fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
+/// What a temporary file's name says of that of its target.
+fn stem(name: &OsStr) -> String {
+    let mut stem = name.to_string_lossy().into_owned();
+    let end = (0..=MOST_STEM.min(stem.len())).rfind(|&n| stem.is_char_boundary(n)).unwrap_or(0);
+    stem.truncate(end);
+    stem
+}
+
+/// Where process numbers mean the same processes: a boot of a machine, and in it a namespace (a container). `None`
+/// where the system does not say.
+fn machine() -> Option<String> {
+    let boot = fs::read_to_string("/proc/sys/kernel/random/boot_id").ok()?;
+    let space = fs::read_link("/proc/self/ns/pid").ok()?;
+    let digits = |text: &str| text.chars().filter(char::is_ascii_alphanumeric).collect::<String>();
+    Some(digits(boot.trim().rsplit('-').next()?) + &digits(space.to_str()?.strip_prefix("pid:")?))
+}
+
 /// The file that writing `path` would replace or make.
 fn resolved(path: &Path) -> io::Result<PathBuf> {
     if path.exists() { fs::canonicalize(path) } else { followed(path) }
@@ -155,21 +196,19 @@ fn followed(path: &Path) -> io::Result<PathBuf> {
     Err(io::Error::other("is a symbolic link that leads to itself"))
 }
 
-/// Removes the temporary files of `path` whose processes are gone; only where the system lists its processes.
+/// Removes the temporary files of `path` whose processes are gone. Those of other machines, which may share the folder,
+/// stay: whether their processes live is not known here.
 pub(crate) fn remove_orphans(path: &Path) {
-    let processes = Path::new("/proc");
     // Temporary files stand beside what a link leads to.
     let Ok(path) = resolved(path) else { return };
-    let (Some(name), true) = (path.file_name().and_then(|n| n.to_str()), processes.join("self").exists()) else {
-        return;
-    };
-    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+    let (Some(name), Some(machine)) = (path.file_name(), machine()) else { return };
+    let own = format!(".{}.{machine}-", stem(name));
+    for entry in fs::read_dir(folder_of(&path)).into_iter().flatten().flatten() {
         let owner = entry.file_name().to_str().and_then(|n| {
-            let middle = n.strip_prefix('.')?.strip_prefix(name)?.strip_prefix('.')?.strip_suffix(".tmp")?;
-            middle.split_once('-').filter(|(_, count)| count.parse::<u32>().is_ok())?.0.parse::<u32>().ok()
+            let (process, count) = n.strip_prefix(&own)?.strip_suffix(".tmp")?.split_once('-')?;
+            count.parse::<u32>().is_ok().then_some(process)?.parse::<u32>().ok()
         });
-        if owner.is_some_and(|process| !processes.join(process.to_string()).exists()) {
+        if owner.is_some_and(|process| !Path::new("/proc").join(process.to_string()).exists()) {
             let _ = fs::remove_file(entry.path());
         }
     }
@@ -204,6 +243,7 @@ impl Drop for AtomicFile {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::ffi::OsString;
 
     fn entries(folder: &Path) -> Vec<OsString> {
         let mut names: Vec<_> = fs::read_dir(folder).unwrap().map(|e| e.unwrap().file_name()).collect();
@@ -255,20 +295,42 @@ mod tests {
     #[test]
     fn only_orphans_are_removed() {
         let folder = tempfile::tempdir().unwrap();
+        let inside = |name: &str| folder.path().join(name);
         // No process has number 0, and ours lives.
-        let ours = format!(".a.bin.{}-3.tmp", std::process::id());
-        for name in [".a.bin.0-1.tmp", &ours, ".a.bin.0-x.tmp", ".b.bin.0-1.tmp", "a.bin"] {
-            fs::write(folder.path().join(name), "x").unwrap();
+        let [orphan, other] = ["a.bin", "b.bin"].map(|name| {
+            let temporary = AtomicFile::create(inside(name)).unwrap().temporary.clone();
+            let ours = temporary.file_name().unwrap().to_str().unwrap().to_owned();
+            let at = ours.rfind(&format!("{}-", std::process::id())).unwrap();
+            inside(&(ours[..at].to_owned() + "0-1.tmp"))
+        });
+        let living = AtomicFile::create(inside("a.bin")).unwrap();
+        // Of other machines: their processes are not listed here.
+        for name in [".a.bin.0-1.tmp", ".a.bin.0123456789abf0000001-0-1.tmp", ".a.bin.0-x.tmp", "a.bin"] {
+            fs::write(inside(name), "x").unwrap();
         }
-        remove_orphans(&folder.path().join("a.bin"));
-        assert_eq!(entries(folder.path()).len(), 4);
-        assert!(!folder.path().join(".a.bin.0-1.tmp").exists());
+        [&orphan, &other].iter().for_each(|path| fs::write(path, "x").unwrap());
+        remove_orphans(&inside("a.bin"));
+        assert_eq!(entries(folder.path()).len(), 6);
+        assert!(!orphan.exists() && living.temporary.exists() && other.exists());
         // By way of a link from elsewhere.
-        let (elsewhere, orphan) = (tempfile::tempdir().unwrap(), folder.path().join(".b.bin.0-1.tmp"));
-        std::os::unix::fs::symlink(folder.path().join("b.bin"), elsewhere.path().join("link")).unwrap();
-        assert!(orphan.exists());
+        let elsewhere = tempfile::tempdir().unwrap();
+        std::os::unix::fs::symlink(inside("b.bin"), elsewhere.path().join("link")).unwrap();
         remove_orphans(&elsewhere.path().join("link"));
-        assert!(!orphan.exists());
+        assert!(!other.exists());
+    }
+
+    #[test]
+    fn names_as_long_as_they_may_be_are_written() {
+        let folder = tempfile::tempdir().unwrap();
+        // Of letters of two bytes, cut anywhere.
+        for name in ["n".repeat(255), "é".repeat(127), "né".repeat(85)] {
+            let path = folder.path().join(name);
+            let mut file = AtomicFile::create(&path).unwrap();
+            file.write_all(b"new").unwrap();
+            assert!(file.temporary.to_str().is_some());
+            file.commit().unwrap();
+            assert_eq!(fs::read(&path).unwrap(), b"new");
+        }
     }
 
     #[cfg(unix)]
