@@ -210,7 +210,7 @@ pub fn bake_fields(
     checkpoint: Option<&Checkpoint>,
 ) -> Result<Vec<Bake>> {
     supported(scene, settings)?;
-    let digest = digest(&job(scene, settings));
+    let digest = digest(&job(scene, settings, &device.version()));
     let job = |number: u32| -> Result<Job> {
         let scene = scene.lit(number as usize);
         let lattice = grid_of(&scene, settings)?;
@@ -400,10 +400,11 @@ pub fn digest(job: &str) -> String {
     format!("{:08x}", crc.sum())
 }
 
-/// What determines a bake's bits, as lines of `key: value`: for [`Checkpoint::new`].
-pub fn job(scene: &Scene, settings: &BakeSettings) -> String {
-    let version = format!("version: {} ({})\n", env!("CARGO_PKG_VERSION"), env!("ISOLUME_COMMIT"));
-    version + &settings_job(settings) + &scene_job(scene)
+/// What determines a bake's bits, as lines of `key: value`: for [`Checkpoint::new`]. `embree` is the version of the
+/// library that is loaded ([`Device::version`]): others round otherwise.
+pub fn job(scene: &Scene, settings: &BakeSettings, embree: &str) -> String {
+    let (version, commit) = (env!("CARGO_PKG_VERSION"), env!("ISOLUME_COMMIT"));
+    format!("version: {version} ({commit})\nembree: {embree}\n") + &settings_job(settings) + &scene_job(scene)
 }
 
 /// The part of a [`job`] that settings determine.

@@ -12,6 +12,7 @@ use crate::error::{Error, Result};
 use crate::progress::say;
 use log::{Beginning, Key, Log};
 use std::collections::BTreeMap;
+use std::fs::OpenOptions;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
@@ -26,7 +27,8 @@ const WRITING_SHARE: u32 = 20;
 /// Between writing, at most: a year, since the end of time can be computed from now.
 const LONGEST: Duration = Duration::from_secs(365 * 24 * 60 * 60);
 
-/// A checkpoint of one job.
+/// A checkpoint of one job. From resuming or the first writing on its file is held against others (by an advisory lock,
+/// where the file system has locks) until the checkpoint is dropped.
 #[derive(Debug)]
 pub struct Checkpoint {
     path: PathBuf,
@@ -110,10 +112,15 @@ impl Checkpoint {
     /// `job` says what determines the blocks' bits, in lines of `key: value`.
     ///
     /// # Errors
-    /// `Invalid` if there is a file at `path` that is no checkpoint: it is not to be overwritten.
+    /// `Invalid` if there is a file at `path` that is no checkpoint, which is not to be overwritten, or that another
+    /// checkpoint holds.
     pub fn new(path: &Path, job: String, every: Duration) -> Result<Self> {
-        if path.exists() && matches!(log::beginning(path)?, Beginning::Foreign) {
-            return Err(Error::invalid(path, "exists and is no checkpoint; give --checkpoint another name"));
+        if path.exists() {
+            if matches!(log::beginning(path)?, Beginning::Foreign) {
+                return Err(Error::invalid(path, "exists and is no checkpoint; give --checkpoint another name"));
+            }
+            // Only to know: what is there may have to stay as it is.
+            log::hold(path, OpenOptions::new().read(true))?;
         }
         let every = every.min(LONGEST);
         let due = Instant::now() + every;
@@ -125,8 +132,8 @@ impl Checkpoint {
     /// killed runs are removed.
     ///
     /// # Errors
-    /// `Io`; `Invalid` if the file is damaged, of another version or of another job; the message names the first
-    /// difference.
+    /// `Io`; `Invalid` if another checkpoint holds the file, or if it is damaged, of another version or of another job;
+    /// the message names the first difference.
     pub fn resume(&self) -> Result<bool> {
         atomic::remove_orphans(&self.path);
         if !self.path.exists() {
@@ -217,7 +224,7 @@ impl Checkpoint {
     /// Writes what is finished. True if the file holds it.
     ///
     /// # Errors
-    /// `Io`, for example on a full disk; the last checkpoint stays.
+    /// `Io`, for example on a full disk; `Invalid` if another checkpoint holds the file. The last checkpoint stays.
     pub fn save(&self) -> Result<bool> {
         match self.state.lock() {
             Ok(mut state) => {
@@ -255,7 +262,8 @@ impl Checkpoint {
     }
 
     fn remove_if(&self, chosen: impl FnOnce(&State) -> bool) {
-        if self.state.lock().is_ok_and(|s| s.log.is_some() && chosen(&s)) {
+        let ours = |s: &State| s.log.as_ref().is_some_and(|log| log.stands_at(&self.path));
+        if self.state.lock().is_ok_and(|s| ours(&s) && chosen(&s)) {
             // It does no harm if it stays.
             let _ = std::fs::remove_file(&self.path);
         }
@@ -300,6 +308,7 @@ mod tests {
         first.stage(2).save(7, || vec![4]);
         assert!(!path.exists(), "not due yet");
         assert!(first.save().unwrap());
+        drop(first);
         let again = Checkpoint::new(&path, job(1), Duration::ZERO).unwrap();
         assert!(again.resume().unwrap());
         assert_eq!(again.stage(1).load(7, 3), Some(vec![1, 2, 3]));
@@ -307,10 +316,11 @@ mod tests {
             (again.stage(1).load(7, 4), again.stage(1).load(8, 3), Stage::UNSAVED.load(7, 3)),
             (None, None, None)
         );
-        let message = Checkpoint::new(&path, job(2), Duration::ZERO).unwrap().resume().unwrap_err().to_string();
-        assert!(message.contains("photons: 1") && message.contains("photons: 2"), "{message}");
         // Due at once: written with each block.
         again.stage(3).save(0, || vec![9]);
+        drop(again);
+        let message = Checkpoint::new(&path, job(2), Duration::ZERO).unwrap().resume().unwrap_err().to_string();
+        assert!(message.contains("photons: 1") && message.contains("photons: 2"), "{message}");
         let third = Checkpoint::new(&path, job(1), Duration::ZERO).unwrap();
         assert!(third.resume().unwrap() && third.blocks() == 3);
         std::fs::write(folder.path().join("data.nrrd"), "precious data that is longer than a magic word").unwrap();
@@ -330,6 +340,7 @@ mod tests {
         let saved = open(1);
         saved.stage(1).save(0, || vec![3]);
         saved.save().unwrap();
+        drop(saved);
         assert_eq!([1, 2].map(|n| open(n).held().unwrap()), [Held::This, Held::Another]);
         let bytes = std::fs::read(&path).unwrap();
         for n in ANY_MAGIC.len()..MAGIC.len() + 8 + job(1).len() + 4 {
@@ -363,6 +374,7 @@ mod tests {
         }
         let whole = held(&first);
         assert_eq!(whole.len(), 3);
+        drop(first);
         let bytes = std::fs::read(&path).unwrap();
         let resumed = |bytes: &[u8]| {
             std::fs::write(&path, bytes).unwrap();
@@ -384,6 +396,7 @@ mod tests {
                 // What is appended then stands behind the last whole block.
                 cut.stage(2).save(9, || vec![1, 2]);
                 cut.save().unwrap();
+                drop(cut);
                 let after = held(&resumed(&std::fs::read(&path).unwrap()).unwrap());
                 assert_eq!((after.len(), after.get(&(2, 9))), (left + 1, Some(&vec![1, 2])));
             }
@@ -391,6 +404,69 @@ mod tests {
             bad[n] ^= 0x10;
             assert!(resumed(&bad).is_none(), "bit of byte {n}");
         }
+    }
+
+    #[test]
+    fn a_file_is_written_by_one_at_a_time() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.checkpoint");
+        let open = || Checkpoint::new(&path, job(1), Duration::MAX);
+        let (first, second, third) = (open().unwrap(), open().unwrap(), open().unwrap());
+        let save = |c: &Checkpoint, n: u8| {
+            c.stage(1).save(0, || vec![n; 40]);
+            c.save()
+        };
+        assert!(save(&first, 1).unwrap());
+        // Later ones, those that were there before its file was, and those of another job.
+        let refused = [open().map(|_| false), second.resume(), save(&third, 3), save(&third, 4)];
+        for message in refused.map(|r| r.unwrap_err().to_string()) {
+            assert!(message.contains("a.checkpoint") && message.contains("another bake writes it"), "{message}");
+        }
+        // Rewritten now and then, the file is another one of the same name.
+        for n in 0..10 {
+            assert!(save(&first, n).unwrap());
+            assert!(open().is_err() && second.resume().is_err());
+        }
+        third.remove();
+        assert_eq!(first.stage(1).load(0, 40), Some(vec![9; 40]));
+        drop(first);
+        assert!(second.resume().unwrap());
+        assert_eq!(second.stage(1).load(0, 40), Some(vec![9; 40]));
+        assert!(open().is_err());
+    }
+
+    /// As on file systems that know no locks.
+    #[test]
+    fn what_others_wrote_into_the_file_is_no_block_of_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.checkpoint");
+        let c = Checkpoint::new(&path, job(1), Duration::MAX).unwrap();
+        (0..3).for_each(|n| c.stage(1).save(n, || vec![n as u8; 40]));
+        c.save().unwrap();
+        let bytes = std::fs::read(&path).unwrap();
+        let start = MAGIC.len() + 8 + job(1).len() + 4;
+        // The same blocks in another order, all of them whole.
+        let mut turned = bytes.clone();
+        turned[start..].rotate_left(HEAD + 40);
+        std::fs::write(&path, &turned).unwrap();
+        assert!((0..3).all(|n| c.stage(1).load(n, 40).is_none()));
+        for n in 0..HEAD + 40 {
+            let mut bad = bytes.clone();
+            bad[start + n] ^= 0x10;
+            std::fs::write(&path, &bad).unwrap();
+            assert_eq!((c.stage(1).load(0, 40), c.stage(1).load(1, 40)), (None, Some(vec![1; 40])), "byte {n}");
+        }
+        std::fs::write(&path, &bytes[..start + HEAD + 39]).unwrap();
+        assert!((0..3).all(|n| c.stage(1).load(n, 40).is_none()));
+        // None of it goes into the next file.
+        c.stage(1).save(2, || vec![7; 400]);
+        c.stage(1).save(1, || vec![8; 400]);
+        c.save().unwrap();
+        assert_eq!((c.stage(1).load(0, 40), c.stage(1).load(1, 400)), (None, Some(vec![8; 400])));
+        drop(c);
+        let next = Checkpoint::new(&path, job(1), Duration::MAX).unwrap();
+        assert!(next.resume().unwrap());
+        assert_eq!(next.blocks(), 2);
     }
 
     #[test]

@@ -4,6 +4,7 @@
 
 use isolume::bake::{BakeOptions, BakeSettings, Engine, Preset, job};
 use isolume::checkpoint::Checkpoint;
+use isolume::embree::Device;
 use isolume::rng::{Rng, Stage};
 use isolume::scene_file::{SceneOptions, load};
 use isolume::volume::Samples;
@@ -255,13 +256,19 @@ fn pictures_and_meshes_can_be_interrupted_and_keep_older_ones() {
     }
 }
 
-/// A bake that no resuming can help: no grid point holds anything of its sweep.
-fn hopeless(dir: &Path, more: &[&str]) -> String {
+/// What is said of a bake that is refused.
+fn refused(dir: &Path, more: &[&str]) -> String {
     let mut command = Command::new(PROGRAM);
     command.current_dir(dir).args(["bake", "b.vti", "-o", "out.vti", "--isovalues", "50", "50.00000001"]);
     command.args(["--engine", "sweep", "--preset", "preview"]).args(more);
     let (output, text) = finish(command.stderr(Stdio::piped()).spawn().unwrap());
     assert_eq!(output.status.code(), Some(2), "{text}");
+    text
+}
+
+/// A bake that no resuming can help: no grid point holds anything of its sweep.
+fn hopeless(dir: &Path, more: &[&str]) -> String {
+    let text = refused(dir, more);
     assert!(text.contains("no grid point lies on"), "{text}");
     text
 }
@@ -288,9 +295,20 @@ fn what_can_never_succeed_leaves_no_checkpoint_and_spares_older_ones() {
     let scene = SceneOptions { isovalues: Some(vec![50.0, 50.00000001]), ..SceneOptions::default() };
     let scene = load(&dir.join("b.vti"), &scene).unwrap().scene;
     let options = BakeOptions { engine: Some(Engine::Sweep), preset: Some(Preset::Preview), ..BakeOptions::default() };
-    let job = job(&scene, &BakeSettings::new(&options, &scene).unwrap());
-    let interrupted = Checkpoint::new(&checkpoint, job, Duration::ZERO).unwrap();
-    interrupted.stage(99).save(0, || vec![7; 100]);
+    let settings = BakeSettings::new(&options, &scene).unwrap();
+    let of = |embree: &str| Checkpoint::new(&checkpoint, job(&scene, &settings, embree), Duration::ZERO).unwrap();
+    // By another Embree, which gives other bits.
+    of("4.0.0").stage(99).save(0, || vec![7; 100]);
+    let text = refused(dir, &["--resume"]);
+    assert!(text.contains("another bake: it has `embree: 4.0.0`"), "{text}");
+    let embree = Device::new(1).unwrap().version();
+    let running = of(&embree);
+    running.stage(99).save(0, || vec![7; 100]);
+    for more in [&[][..], &["--resume"]] {
+        let text = refused(dir, more);
+        assert!(text.contains("out.vti.checkpoint: another bake writes it"), "{text}");
+    }
+    drop(running);
     let notes = [&[][..], &["--seed", "8"]].map(|more| hopeless(dir, more));
     assert!(notes[0].contains("--resume would go on with it"), "{}", notes[0]);
     assert!(notes[1].contains("unfinished bake of other settings"), "{}", notes[1]);
@@ -299,7 +317,7 @@ fn what_can_never_succeed_leaves_no_checkpoint_and_spares_older_ones() {
         assert!(text.contains("1 finished blocks") || every == "0", "{text}");
         assert!(checkpoint.exists(), "{text}");
     }
-    assert!(interrupted.resume().unwrap(), "whole");
+    assert!(of(&embree).resume().unwrap(), "whole");
 }
 
 #[test]

@@ -1,11 +1,12 @@
-//! The file of a checkpoint: magic, job, and blocks, each with its checksum.
+//! The file of a checkpoint: magic, job, and blocks, each with its checksum. Whoever writes it holds its lock.
 
+use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
 use crate::files;
 use flate2::Crc;
 use std::collections::BTreeMap;
-use std::fs::{File, OpenOptions};
-use std::io::{BufReader, BufWriter, Read, Seek, SeekFrom, Write};
+use std::fs::{File, OpenOptions, TryLockError};
+use std::io::{BufReader, BufWriter, ErrorKind, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
 pub(super) const MAGIC: &[u8] = b"isolume checkpoint 16\n";
@@ -15,7 +16,7 @@ pub(super) const ANY_MAGIC: &[u8] = b"isolume checkpoint ";
 /// Stage and number of a block.
 pub(super) type Key = (u32, u64);
 
-/// A checkpoint's file.
+/// A checkpoint's file, held against other writers.
 #[derive(Debug)]
 pub(super) struct Log {
     file: File,
@@ -61,6 +62,46 @@ fn small(bytes: &[u8]) -> Option<u32> {
     bytes.try_into().map(u32::from_le_bytes).ok()
 }
 
+/// Holds `file`, of `path`, against other writers as long as it is open.
+fn lock(file: &File, path: &Path) -> Result<()> {
+    match file.try_lock() {
+        Err(TryLockError::WouldBlock) => Err(Error::invalid(
+            path,
+            "another bake writes it; wait until that has ended, or give --checkpoint another name",
+        )),
+        // File systems without locks refuse in many ways. There the checksums of blocks have to do.
+        Ok(()) | Err(TryLockError::Error(_)) => Ok(()),
+    }
+}
+
+/// The file at `path`, held against other writers.
+///
+/// # Errors
+/// `Io`; `Invalid` if another one holds it.
+pub(super) fn hold(path: &Path, how: &OpenOptions) -> Result<File> {
+    loop {
+        let file = how.open(path).map_err(|e| Error::io(path, e))?;
+        lock(&file, path)?;
+        // Who held it until now may have put another one in its place.
+        if stands_at(&file, path) {
+            return Ok(file);
+        }
+    }
+}
+
+/// Whether `path` names `file`, and not another that has since been put there.
+#[cfg(unix)]
+fn stands_at(file: &File, path: &Path) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    let number = |found: std::io::Result<std::fs::Metadata>| found.map(|m| (m.dev(), m.ino())).ok();
+    number(file.metadata()) == number(std::fs::metadata(path))
+}
+
+#[cfg(not(unix))]
+fn stands_at(_: &File, _: &Path) -> bool {
+    true
+}
+
 /// What a file of the name of a checkpoint begins with.
 pub(super) enum Beginning {
     /// The job of this version.
@@ -101,9 +142,13 @@ fn job(from: &mut impl Read) -> std::io::Result<Option<String>> {
 impl Log {
     /// Writes a file of the blocks of an older one that are not replaced, and of `new` ones.
     pub(super) fn create(path: &Path, job: &str, old: Option<&Self>, new: &BTreeMap<Key, Vec<u8>>) -> Result<Self> {
+        let mut out = AtomicFile::create(path)?;
+        // Held before it has the name by which others find it.
+        let file = out.handle().map_err(|e| Error::io(path, e))?;
+        lock(&file, path)?;
         let mut blocks = BTreeMap::new();
         let mut length = 0;
-        files::write_atomically(path, |out| {
+        let mut write = || -> std::io::Result<()> {
             let mut put = |bytes: &[u8]| -> std::io::Result<u64> {
                 out.write_all(bytes)?;
                 length += bytes.len() as u64;
@@ -129,16 +174,26 @@ impl Log {
                 }
             }
             Ok(())
-        })?;
-        let file = OpenOptions::new().read(true).write(true).open(path).map_err(|e| Error::io(path, e))?;
+        };
+        let written = write();
+        let out = out.complete_if(written)?;
+        // Not in place of one that another bake began meanwhile; an older one of this is held.
+        let _replaced =
+            (old.is_none() && path.exists()).then(|| hold(path, OpenOptions::new().read(true))).transpose()?;
+        out.commit()?;
         Ok(Self { file, blocks, length, dead: 0 })
     }
 
     /// The job of a file and its blocks; `None` if anything is wrong but an end that is missing.
     pub(super) fn open(path: &Path) -> Result<Option<(String, Self)>> {
-        let file = OpenOptions::new().read(true).write(true).open(path).map_err(|e| Error::io(path, e))?;
+        let file = hold(path, OpenOptions::new().read(true).write(true))?;
         let found = Self::scan(BufReader::with_capacity(1 << 20, &file)).map_err(|e| Error::io(path, e))?;
         Ok(found.map(|(job, blocks, length, dead)| (job, Self { file, blocks, length, dead })))
+    }
+
+    /// Whether this is the file of that name.
+    pub(super) fn stands_at(&self, path: &Path) -> bool {
+        stands_at(&self.file, path)
     }
 
     /// The job, where the blocks are, the bytes that are whole and those of blocks since replaced.
@@ -213,13 +268,15 @@ impl Log {
         Ok(())
     }
 
-    /// A block, if there is one.
+    /// A block, if there is one and it stands where it was written: where there are no locks, others may have written.
     pub(super) fn load(&self, key: Key) -> std::io::Result<Option<Vec<u8>>> {
         let Some(&(start, count)) = self.blocks.get(&key) else { return Ok(None) };
-        let mut bytes = vec![0; count];
+        let (mut found, mut bytes) = ([0; HEAD], vec![0; count]);
         let mut file = &self.file;
-        file.seek(SeekFrom::Start(start))?;
-        file.read_exact(&mut bytes)?;
-        Ok(Some(bytes))
+        file.seek(SeekFrom::Start(start - HEAD as u64))?;
+        match file.read_exact(&mut found).and_then(|()| file.read_exact(&mut bytes)) {
+            Err(e) if e.kind() == ErrorKind::UnexpectedEof => Ok(None),
+            read => read.map(|()| (found == head(key, &bytes)).then_some(bytes)),
+        }
     }
 }

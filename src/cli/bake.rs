@@ -280,7 +280,7 @@ impl Bake {
             return Ok((sweep, json));
         }
         fits?;
-        let job = job(&loaded.scene, &settings);
+        let job = job(&loaded.scene, &settings, &device.version());
         // Of a series, what is there.
         let whole = (self.resume && self.scene.time.is_some()).then(|| self.whole()).flatten();
         let same = |report: &serde_json::Value| report.get("job").and_then(|j| j.as_str()) == Some(&digest(&job));
