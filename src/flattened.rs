@@ -4,9 +4,11 @@
 //! stand in the world, and t is the same number in every affine frame.
 
 use glam::{DVec3, Vec3};
+use serde::{Deserialize, Serialize};
 
 /// Which side of a level set: the side where h < c or the one where h ≥ c.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Side {
     /// Where h < c; a surface's normal on this side points along −∇h.
     Lower,
@@ -21,6 +23,14 @@ impl Side {
         match self {
             Side::Lower => Side::Higher,
             Side::Higher => Side::Lower,
+        }
+    }
+
+    /// `lower` or `higher`, as files and options call it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Side::Lower => "lower",
+            Side::Higher => "higher",
         }
     }
 

@@ -39,7 +39,7 @@ struct Description {
     /// Stops, if any, in units of the sweep.
     albedo: Reflectance,
     emission: DVec3,
-    outside: String,
+    outside: Side,
     both_sides: bool,
     capped: bool,
     polygons: Vec<PolygonDescription>,
@@ -66,6 +66,25 @@ struct TextureDescription {
     /// Texels of the array before it.
     #[serde(default)]
     start: usize,
+}
+
+impl TextureDescription {
+    /// The texture, of the colours of its array.
+    fn of(&self, array: &[[f32; 3]]) -> Result<FlatTexture> {
+        let [nu, nv, nc] = self.dims;
+        let count = nu.checked_mul(nv).and_then(|n| n.checked_mul(nc)).filter(|&n| n > 0);
+        let count = count.ok_or_else(|| self.wrong(format!("dims {:?} are those of no texture", self.dims)))?;
+        let end =
+            self.start.checked_add(count).filter(|&end| end <= array.len()).ok_or_else(|| {
+                self.wrong(format!("holds {} colours, not {count} from {} on", array.len(), self.start))
+            })?;
+        let texels = array[self.start..end].to_vec();
+        Ok(FlatTexture { dims: self.dims, axis: IsovalueAxis::around(self.middle), texels })
+    }
+
+    fn wrong(&self, what: impl std::fmt::Display) -> Error {
+        Error::Invalid(format!("the array '{}', texture of flat {}: {what}; bake anew", self.array, self.flat))
+    }
 }
 
 /// [`IsovalueAxis::middle`] of even texels.
@@ -104,8 +123,8 @@ impl Description {
 pub struct BakeSummary {
     /// Ends of the sweep, in source units.
     pub isovalues: [f64; 2],
-    /// The side that is outside: `lower` or `higher`.
-    pub outside: String,
+    /// The side that is outside.
+    pub outside: Side,
     /// Whether the inside has light too.
     pub both_sides: bool,
     /// Whether isosurfaces are closed at the volume's faces.
@@ -131,7 +150,7 @@ impl BakeSummary {
 
     /// Lines of a key and what it says, in columns as those of a volume's statistics.
     pub fn to_text(&self) -> String {
-        let sides = if self.both_sides { "both sides".into() } else { format!("the {} side", self.outside) };
+        let sides = if self.both_sides { "both sides".into() } else { format!("the {} side", self.outside.name()) };
         let ends = if self.capped { "capped" } else { "open" };
         let said = |pointer: &str| match self.report.pointer(pointer) {
             None => "unknown".into(),
@@ -237,7 +256,7 @@ fn completed(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
         exposure: bake.exposure,
         albedo: scene.surface.albedo.clone(),
         emission: scene.surface.emission,
-        outside: if scene.surface.outside == Side::Lower { "lower" } else { "higher" }.into(),
+        outside: scene.surface.outside,
         both_sides: scene.surface.both_sides,
         capped: scene.boundary == Boundary::Capped,
         polygons: scene
@@ -432,8 +451,7 @@ impl BakedVolume {
             Err(Error::Invalid(format!("the array '{name}' holds {} values, not {count} floats", v.len())))
         };
         let triples = |v: Vec<f32>| -> Vec<[f32; 3]> { v.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect() };
-        let outside = if d.outside == "higher" { Side::Higher } else { Side::Lower };
-        let surface = Surface { albedo: d.albedo, emission: d.emission, outside, both_sides: d.both_sides };
+        let surface = Surface { albedo: d.albedo, emission: d.emission, outside: d.outside, both_sides: d.both_sides };
         let mut sides = Vec::new();
         for (i, side) in surface.stored_sides().into_iter().enumerate() {
             let s = suffix(i);
@@ -491,21 +509,14 @@ impl BakedVolume {
         let mut flats = vec![None; flat::count(&scene)];
         let mut read: Option<(String, Vec<[f32; 3]>)> = None;
         for t in d.textures {
-            let count = t.dims.iter().product::<usize>();
+            let number = flats.len();
+            let slot = flats.get_mut(t.flat).ok_or_else(|| t.wrong(format!("there are {number} flats")))?;
             let texels = match &read {
                 Some((name, texels)) if *name == t.array => texels,
                 _ => &read.insert((t.array.clone(), triples(all(&file.field_data, &t.array)?))).1,
             };
-            let own = texels.get(t.start..).and_then(|rest| rest.get(..count)).ok_or_else(|| {
-                Error::Invalid(format!(
-                    "the array '{}' holds {} colours, not {count} from {} on",
-                    t.array,
-                    texels.len(),
-                    t.start
-                ))
-            })?;
-            if let Some(slot) = flats.get_mut(t.flat) {
-                *slot = Some(FlatTexture { dims: t.dims, axis: IsovalueAxis::around(t.middle), texels: own.to_vec() });
+            if slot.replace(t.of(texels)?).is_some() {
+                return Err(t.wrong("another one is of the same flat"));
             }
         }
         let (exposure, report) = (d.exposure, d.report);
@@ -584,3 +595,6 @@ impl BakedVolume {
         Some(grid.radiance_at(&self.scene, self.lattice(), p, side))
     }
 }
+
+#[cfg(test)]
+mod tests;

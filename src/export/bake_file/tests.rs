@@ -1,0 +1,80 @@
+use super::*;
+use serde_json::{Value, json};
+
+/// Reads a bake of 3³ points and one wall, whose description is `changed`.
+fn read(changed: impl FnOnce(&mut Value)) -> Result<BakedVolume> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.vti");
+    let lattice = Lattice::aligned([3; 3], DVec3::ZERO, DVec3::ONE).unwrap();
+    let mut description = json!({
+        "isovalues": [0.5, 1.5], "exposure": 1.0, "albedo": [0.5, 0.5, 0.5], "emission": [0.0, 0.0, 0.0],
+        "outside": "lower", "both_sides": false, "capped": false,
+        "polygons": [{
+            "name": "a", "albedo": [0.5, 0.5, 0.5], "emission": [0.0, 0.0, 0.0],
+            "vertices": [[0.0, 0.0, -1.0], [2.0, 0.0, -1.0], [2.0, 2.0, -1.0], [0.0, 2.0, -1.0]],
+        }],
+        "textures": [{ "flat": 0, "array": "wall_a", "dims": [2, 2, 2] }],
+        "report": {},
+    });
+    changed(&mut description);
+    let writer = VtiWriter::new(&lattice)
+        .computed("value", 1, |o| (o % 3) as f32)
+        .computed("radiance", 3, |_| 0.25)
+        .computed("std_error", 1, |_| 0.0)
+        .computed_bytes("mask", 1, |_| 1)
+        .field_data("wall_a", 3, &[0.125f32; 24][..])
+        .field_string(DESCRIPTION, &description.to_string());
+    writer.write(&path).unwrap();
+    BakedVolume::read(&path)
+}
+
+#[test]
+fn descriptions_that_do_not_hold_are_refused() {
+    let read_back = read(|_| ()).unwrap();
+    assert_eq!(read_back.flats[0].as_ref().unwrap().lookup([0.5; 3]), DVec3::splat(0.125));
+    let huge = 1u64 << 32;
+    for (key, value, what) in [
+        ("dims", json!([0, 8, 8]), "dims"),
+        ("dims", json!([2, 2, 0]), "dims"),
+        ("dims", json!([huge, huge, 1]), "dims"),
+        ("dims", json!([huge, huge, huge]), "dims"),
+        ("dims", json!([2, 2, 3]), "8 colours"),
+        ("dims", json!([2, -2, 2]), "-2"),
+        ("start", json!(1), "8 colours"),
+        ("start", json!(u64::MAX), "8 colours"),
+        ("flat", json!(7), "flat 7"),
+        ("flat", json!(u64::MAX), "flat"),
+        ("array", json!("wall_b"), "wall_b"),
+    ] {
+        let found = read(|d| d["textures"][0][key] = value.clone());
+        let Err(error) = found else { panic!("{key} = {value} is accepted") };
+        let message = error.to_string();
+        assert!(matches!(error, Error::Invalid(_)) && message.contains("a.vti"), "{key} = {value}: {message}");
+        assert!(message.contains(what), "{key} = {value}: {message}");
+        assert!(!["dims", "8 colours", "flat 7"].contains(&what) || message.contains("wall_a"), "{message}");
+    }
+    // One flat has one texture.
+    let Err(error) = read(|d| {
+        let again = d["textures"][0].clone();
+        d["textures"].as_array_mut().unwrap().push(again);
+    }) else {
+        panic!("two textures of one flat are accepted")
+    };
+    assert!(error.to_string().contains("flat 0"), "{error}");
+    // Caps, which open volumes do not have, count among the flats.
+    for flat in 1..7 {
+        let found = read(|d| d["textures"][0]["flat"] = json!(flat));
+        assert!(found.is_ok(), "{flat}: {:?}", found.err());
+    }
+}
+
+#[test]
+fn sides_are_told_by_their_names() {
+    let outside = |name: &str| read(|d| d["outside"] = json!(name)).map(|b| b.scene.surface.outside);
+    assert_eq!(outside("lower").unwrap(), Side::Lower);
+    assert_eq!(outside("higher").unwrap(), Side::Higher);
+    for name in ["Higher", "upper", ""] {
+        let message = outside(name).unwrap_err().to_string();
+        assert!(message.contains("a.vti") && message.contains("higher"), "{name}: {message}");
+    }
+}
