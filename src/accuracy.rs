@@ -40,27 +40,66 @@ impl ReferenceMesh {
     /// missing.
     ///
     /// # Errors
-    /// `Invalid` if positions or radiance are missing.
+    /// `Invalid` if positions or radiance are missing, or if anything is no finite number.
     pub fn from_ply(mesh: &PlyMesh) -> Result<Self> {
-        let triple = |names: [&str; 3]| -> Option<Vec<DVec3>> {
+        let triple = |names| -> Option<Vec<DVec3>> {
             let values = mesh.triple(names)?;
             Some(values.into_iter().map(DVec3::from_array).collect())
         };
         let missing = |what: &str| Error::Invalid(format!("has no {what}; make it with `isolume reference`"));
-        let radiance = triple(["radiance_r", "radiance_g", "radiance_b"])
-            .ok_or_else(|| missing("vertex properties radiance_r, radiance_g, radiance_b"))?;
-        Ok(Self {
-            positions: triple(["x", "y", "z"]).ok_or_else(|| missing("positions"))?,
+        let radiance =
+            triple(RADIANCE).ok_or_else(|| missing("vertex properties radiance_r, radiance_g, radiance_b"))?;
+        let flags = mesh.property("sampled").map_or_else(|| vec![1.0; radiance.len()], <[f64]>::to_vec);
+        finite(["sampled"], flags.iter().map(|&flag| [flag]))?;
+        let read = Self {
+            positions: triple(POSITION).ok_or_else(|| missing("positions"))?,
             triangles: mesh.triangles.clone(),
-            variance: triple(["variance_r", "variance_g", "variance_b"])
-                .unwrap_or_else(|| vec![DVec3::ZERO; radiance.len()]),
-            sampled: match mesh.property("sampled") {
-                Some(flags) => flags.iter().map(|&f| f > 0.0).collect(),
-                None => vec![true; radiance.len()],
-            },
+            variance: triple(VARIANCE).unwrap_or_else(|| vec![DVec3::ZERO; radiance.len()]),
+            sampled: flags.into_iter().map(|flag| flag > 0.0).collect(),
             radiance,
-        })
+        };
+        read.check()?;
+        Ok(read)
     }
+
+    /// Refuses what is no reference: every vertex has its numbers, all of them finite, and triangles have vertices.
+    fn check(&self) -> Result<()> {
+        let n = self.positions.len();
+        for (what, found) in
+            [("radiance", self.radiance.len()), ("variance", self.variance.len()), ("sampled", self.sampled.len())]
+        {
+            if found != n {
+                return Err(Error::Invalid(format!(
+                    "has {n} vertices, but {found} values of {what}; give one to each"
+                )));
+            }
+        }
+        if let Some(t) = self.triangles.iter().position(|t| t.iter().any(|&v| v as usize >= n)) {
+            let corners = self.triangles[t];
+            return Err(Error::Invalid(format!("triangle {t} has vertices {corners:?}, but there are only {n}")));
+        }
+        finite(POSITION, self.positions.iter().map(DVec3::to_array))?;
+        finite(RADIANCE, self.radiance.iter().map(DVec3::to_array))?;
+        finite(VARIANCE, self.variance.iter().map(DVec3::to_array))
+    }
+}
+
+/// Vertex properties of references.
+const POSITION: [&str; 3] = ["x", "y", "z"];
+const RADIANCE: [&str; 3] = ["radiance_r", "radiance_g", "radiance_b"];
+const VARIANCE: [&str; 3] = ["variance_r", "variance_g", "variance_b"];
+
+/// Refuses values that are no finite numbers: clamped to what is displayed they would be black.
+fn finite<const N: usize>(names: [&str; N], values: impl Iterator<Item = [f64; N]>) -> Result<()> {
+    for (v, found) in values.enumerate() {
+        if let Some(c) = found.iter().position(|x| !x.is_finite()) {
+            return Err(Error::Invalid(format!(
+                "{} of vertex {v} is {}, no finite number; make it anew",
+                names[c], found[c]
+            )));
+        }
+    }
+    Ok(())
 }
 
 /// A bake's distance from its reference. Percentages are of the display range [0, 1].
@@ -116,12 +155,20 @@ fn noise(reference: &ReferenceMesh, v: usize, exposure: f64) -> f64 {
 /// numbers and |Δ| per vertex against the references' mean (0 where not sampled).
 ///
 /// # Errors
-/// `Invalid` without references or common vertices, or if meshes differ.
+/// `Invalid` without references or common vertices, if meshes differ, or if something is missing or no finite number.
 pub fn compare(texture: &[DVec3], references: &[ReferenceMesh], exposure: f64) -> Result<(Accuracy, Vec<f64>)> {
     let Some(first) = references.first() else {
         return Err(Error::Invalid("no reference given".into()));
     };
+    references.iter().try_for_each(ReferenceMesh::check)?;
     let n = first.positions.len();
+    if texture.len() != n {
+        return Err(Error::Invalid(format!(
+            "{} colours were given to compare with a mesh of {n} vertices",
+            texture.len()
+        )));
+    }
+    finite(["red", "green", "blue"], texture.iter().map(DVec3::to_array))?;
     for other in &references[1..] {
         let same = other.positions.len() == n
             && other.triangles == first.triangles

@@ -6,6 +6,7 @@ use isolume::accuracy::{ReferenceMesh, compare, interpolation_floor};
 use isolume::brdf::reflected;
 use isolume::direct::{Receiver, luminance};
 use isolume::embree::{Device, GraphTracer, SurfaceTracer};
+use isolume::export::ply::PlyMesh;
 use isolume::field::{Field, Sweep};
 use isolume::flattened::{Departure, FlattenedRay, Side, Target};
 use isolume::illumination_grid::GridSize;
@@ -410,6 +411,42 @@ fn compare_computes_what_it_says() {
     assert!(compare(&texture, &[black], 2.0).unwrap().0.percent_rms > 0.0, "one is enough");
     refuses(&[reference.clone(), ReferenceMesh { triangles: Vec::new(), ..reference.clone() }], "different meshes");
     refuses(&[ReferenceMesh { sampled: vec![false; 4], ..reference }], "no vertex");
+}
+
+#[test]
+fn what_is_no_number_or_missing_is_no_reference() {
+    let names =
+        ["x", "y", "z", "radiance_r", "radiance_g", "radiance_b", "variance_r", "variance_g", "variance_b", "sampled"];
+    let mesh = |name: &str, value: f64| PlyMesh {
+        vertices: 3,
+        properties: names
+            .map(|n| (n.to_owned(), (0..3).map(|v| if n == name && v == 2 { value } else { 0.5 }).collect()))
+            .to_vec(),
+        triangles: vec![[0, 1, 2]],
+        comments: Vec::new(),
+    };
+    ReferenceMesh::from_ply(&mesh("", 0.0)).unwrap();
+    for name in names {
+        for value in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
+            let Err(e) = ReferenceMesh::from_ply(&mesh(name, value)) else { panic!("{name} may be {value}") };
+            let message = e.to_string();
+            assert!(message.contains("vertex 2") && message.contains(name), "{name} {value}: {message}");
+        }
+    }
+    let good = flat([0.2; 4], 1e-6);
+    let texture = [DVec3::splat(0.3); 4];
+    let refused = |texture: &[DVec3], bad: ReferenceMesh, what: &str| {
+        let message = compare(texture, &[bad], 2.0).unwrap_err().to_string();
+        assert!(message.contains(what), "{what}: {message}");
+    };
+    refused(&texture[..3], good.clone(), "3 colours");
+    refused(&[DVec3::splat(0.3), DVec3::NAN, DVec3::ONE, DVec3::ONE], good.clone(), "vertex 1");
+    refused(&texture, ReferenceMesh { radiance: vec![DVec3::ONE; 3], ..good.clone() }, "radiance");
+    refused(&texture, ReferenceMesh { variance: Vec::new(), ..good.clone() }, "variance");
+    refused(&texture, ReferenceMesh { sampled: vec![true; 5], ..good.clone() }, "sampled");
+    refused(&texture, ReferenceMesh { radiance: vec![DVec3::NAN; 4], ..good.clone() }, "radiance_r");
+    refused(&texture, ReferenceMesh { positions: vec![DVec3::INFINITY; 4], ..good.clone() }, "x of vertex 0");
+    refused(&texture, ReferenceMesh { triangles: vec![[0, 1, 4]], ..good }, "triangle 0");
 }
 
 #[test]

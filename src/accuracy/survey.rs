@@ -67,11 +67,11 @@ pub struct Survey {
     pub confidence: [f64; 2],
     /// Points of the grid that took part: those beside the others that hold light of their own level set.
     pub grid_points: usize,
-    /// The error of these, each compared on its own level set: what is not due to interpolation. 0 without any; more
-    /// where a fit chose what interpolates best.
-    pub percent_rms_grid_points: f64,
+    /// The error of these, each compared on its own level set: what is not due to interpolation; more where a fit chose
+    /// what interpolates best. `None` without any.
+    pub percent_rms_grid_points: Option<f64>,
     /// Its interval.
-    pub confidence_grid_points: [f64; 2],
+    pub confidence_grid_points: Option<[f64; 2]>,
     /// 100 ⟨t − r⟩ over channels: the sign of the error.
     pub bias: f64,
     /// The error in fifths of the sweep.
@@ -93,8 +93,9 @@ const CANDIDATES: usize = 32;
 
 /// Compares `grid` (over `lattice`, of the outside) with paths through `scene`, of whose field it is: at points on
 /// isosurfaces what is `shown` there, given index coordinates of `lattice` and the point's number; at the grid's own
-/// what it holds. `tick(n)` reports n of 2 · points done; returning false stops early, with a result that is worth
-/// nothing.
+/// what it holds. rgb = radiance × `exposure`, which is the bake's: that of `scene`, as it is lit, may leave out
+/// volumes that were baked with it. `tick(n)` reports n of 2 · points done; returning false stops early, with a result
+/// that is worth nothing.
 ///
 /// # Errors
 /// `Invalid` if no isosurface of the sweep is found.
@@ -103,6 +104,7 @@ pub fn survey<T: Tracer>(
     tracer: &T,
     (lattice, grid): (&Lattice, &IlluminationGrid),
     shown: &(dyn Fn(DVec3, u64) -> DVec3 + Sync),
+    exposure: f64,
     settings: &SurveySettings,
     tick: &(dyn Fn(u64) -> bool + Sync),
 ) -> Result<Survey> {
@@ -110,7 +112,7 @@ pub fn survey<T: Tracer>(
     if chosen.is_empty() {
         return Err(Error::Invalid("no isosurface of its sweep was found; bake a sweep that has some".into()));
     }
-    let (exposure, side) = (scene.exposure(), scene.surface.outside);
+    let side = scene.surface.outside;
     let scale = lattice.far() / scene.lattice().far();
     let rays = AtomicU64::new(0);
     let compare = |p: DVec3, shown: [DVec3; 2], index: usize| {
@@ -138,7 +140,7 @@ pub fn survey<T: Tracer>(
         .collect();
     let [all, at_points]: [Vec<Deviation>; 2] = [0, 1].map(|k| found.iter().filter_map(|f| f[k]).collect());
     let (square, confidence) = mean_square(&all);
-    let (square_grid_points, confidence_grid_points) = mean_square(&at_points);
+    let of_grid_points = (!at_points.is_empty()).then(|| mean_square(&at_points));
     let sweep = scene.field.sweep();
     let parts = (0..PARTS).map(|n| {
         let ends = [n, n + 1].map(|i| i as f64 / PARTS as f64);
@@ -158,8 +160,8 @@ pub fn survey<T: Tracer>(
         percent_rms_sqrt3: percent(square / 3.0),
         confidence: confidence.map(percent),
         grid_points: at_points.len(),
-        percent_rms_grid_points: percent(square_grid_points),
-        confidence_grid_points: confidence_grid_points.map(percent),
+        percent_rms_grid_points: of_grid_points.map(|(square, _)| percent(square)),
+        confidence_grid_points: of_grid_points.map(|(_, confidence)| confidence.map(percent)),
         bias: 100.0 * all.iter().map(|d| d.bias).sum::<f64>() / (all.len() as f64).max(1.0),
         parts: parts.collect(),
         left_out: chosen.len() - all.len(),
@@ -313,7 +315,7 @@ mod tests {
         let tracer = GraphTracer::new(&device, scene).unwrap();
         let settings = SurveySettings { points, paths: 1, seed: 3 };
         let shown = |p, _| grid.interpolate(lattice, p);
-        survey(scene, &tracer, (lattice, &grid), &shown, &settings, &|_| true).unwrap()
+        survey(scene, &tracer, (lattice, &grid), &shown, scene.exposure(), &settings, &|_| true).unwrap()
     }
 
     #[test]
@@ -321,7 +323,7 @@ mod tests {
         let scene = scene(|x| 1.0 - x.length(), [0.1, 0.7]);
         let s = surveyed(&scene, |_| 0.1, 300);
         let expected = 100.0 * 0.1 * 3f64.sqrt();
-        for found in [s.percent_rms, s.percent_rms_grid_points, 3f64.sqrt() * s.percent_rms_sqrt3]
+        for found in [s.percent_rms, s.percent_rms_grid_points.unwrap(), 3f64.sqrt() * s.percent_rms_sqrt3]
             .into_iter()
             .chain(s.confidence)
             .chain(s.parts.iter().map(|p| p.percent_rms))
@@ -357,7 +359,10 @@ mod tests {
     #[test]
     fn grid_points_without_light_of_their_own_do_not_count() {
         let s = surveyed(&scene(|x| x.x, [0.01, 0.04]), |_| 0.1, 200);
-        assert_eq!((s.points, s.grid_points, s.percent_rms_grid_points), (200, 0, 0.0));
+        assert_eq!((s.points, s.grid_points), (200, 0));
+        assert_eq!((s.percent_rms_grid_points, s.confidence_grid_points), (None, None));
+        let json = serde_json::to_value(&s).unwrap();
+        assert!(json["percent_rms_grid_points"].is_null() && json["confidence_grid_points"].is_null(), "{json}");
     }
 
     /// A roof whose one side is four times as steep: each isosurface is two planes, one on either side, of the same

@@ -161,7 +161,8 @@ impl Compare {
             light.expect("the outside is stored")
         };
         let stage = progress.stage("paths", 2 * self.points as u64);
-        let found = survey(&scene, &tracer, (baked.lattice(), grid), &shown, &settings, &|n| stage.tick(n));
+        let found =
+            survey(&scene, &tracer, (baked.lattice(), grid), &shown, baked.exposure, &settings, &|n| stage.tick(n));
         stage.end()?;
         let found = found.map_err(in_file)?;
         if self.json {
@@ -191,9 +192,9 @@ fn everywhere(s: &Survey, advice: Option<(&str, bool)>) -> String {
             format!("  isovalues        {:8.3}   ({}; {} points)\n", p.percent_rms, brief_span(p.isovalues), p.points)
         })
         .collect();
-    let at_points = match s.grid_points {
-        0 => format!("{:>8}   (none holds light of its own level set)", "–"),
-        _ => format!("{:8.3}   {}", s.percent_rms_grid_points, interval(s.confidence_grid_points)),
+    let at_points = match s.percent_rms_grid_points.zip(s.confidence_grid_points) {
+        Some((percent, confidence)) => format!("{percent:8.3}   {}", interval(confidence)),
+        None => format!("{:>8}   (none holds light of its own level set)", "–"),
     };
     let texture = match s.percent_rms_texture == s.percent_rms {
         true => String::new(),
@@ -201,7 +202,7 @@ fn everywhere(s: &Survey, advice: Option<(&str, bool)>) -> String {
             format!("  radiance alone   {:8.3}   (as a 3D texture, direct light included)\n", s.percent_rms_texture)
         }
     };
-    let between = s.grid_points > 0 && 2.0 * s.percent_rms_grid_points.powi(2) < s.percent_rms.powi(2);
+    let between = s.percent_rms_grid_points.is_some_and(|at| 2.0 * at.powi(2) < s.percent_rms.powi(2));
     let advice = advice.filter(|_| between).map_or_else(String::new, |(finer, can_split)| {
         let splitting = if can_split { ", and --split in pictures, meshes and pages" } else { "" };
         format!(

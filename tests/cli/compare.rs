@@ -161,7 +161,15 @@ fn all_isosurfaces_are_compared_with_paths() {
     grid.radiance.as_flattened_mut().iter_mut().for_each(|x| *x *= 0.9);
     let settings = SurveySettings { points: 1500, paths: 64, seed: 1 };
     let shown = |p, _| grid.interpolate(baked.lattice(), p);
-    let dim = isolume::accuracy::survey(&scene, &tracer, (baked.lattice(), &grid), &shown, &settings, &|_| true);
+    let dim = isolume::accuracy::survey(
+        &scene,
+        &tracer,
+        (baked.lattice(), &grid),
+        &shown,
+        baked.exposure,
+        &settings,
+        &|_| true,
+    );
     let dim = dim.unwrap();
     let missing = number(&found, "bias") - dim.bias;
     assert!((1.0..8.0).contains(&missing) && dim.percent_rms > number(&found, "percent_rms") + 1.0, "{dim:?}");
@@ -264,6 +272,32 @@ fn several_volumes_are_compared_one_by_one_with_all_of_them_there() {
     assert!(first == left && left != right, "{left} {right}");
     refused(dir, &["compare", "two-left.vti"], &["two-left.vti", "name the .vtm"]);
     refused(dir, &["compare", "two.vtm", "--field", "middle"], &["two.vtm", "left", "right"]);
+}
+
+/// Errors are measured in the colours of the bake. Its exposure is that of the brighter volume, too, which path tracing
+/// the other one does not need.
+#[test]
+fn volumes_that_see_nothing_of_each_other_are_compared_in_the_colours_of_both() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
+    let volume = |name: &str, albedo: f64| {
+        format!("[[volume]]\nname = \"{name}\"\nfile = \"b.vti\"\nisovalues = [3.6, 95.0]\nalbedo = {albedo}\n")
+    };
+    fs::write(dir.join("two.toml"), "policy = \"independent\"\n".to_owned() + &volume("a", 0.9) + &volume("b", 0.3))
+        .unwrap();
+    fs::write(dir.join("one.toml"), volume("b", 0.3)).unwrap();
+    bake(dir, "two.toml", "two.vtm", &["--engine", "photon"]);
+    bake(dir, "one.toml", "one.vti", &["--engine", "photon"]);
+    let exposure = |file: &str| BakedVolume::read(&dir.join(file)).unwrap().exposure;
+    let brighter = exposure("one.vti") / exposure("two.vtm");
+    assert!((brighter - 3.0).abs() < 1e-6, "{brighter}");
+    let few = ["--points", "1000", "--paths", "32"];
+    let [of_two, alone] = [["two.vtm", "b"], ["one.vti", "b"]].map(|[file, field]| {
+        survey(dir, file, &[&few[..], &["--field", field]].concat())["percent_rms"].as_f64().unwrap()
+    });
+    // Less than three times as much: colours end at white.
+    assert!((2.0..3.3).contains(&(alone / of_two)), "{alone} {of_two}");
 }
 
 #[test]

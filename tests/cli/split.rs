@@ -22,7 +22,7 @@ fn surveyed(baked: &BakedVolume, grid: &IlluminationGrid) -> Survey {
     let tracer = GraphTracer::new(&device, &scene).unwrap();
     let settings = SurveySettings { points: 2000, paths: 64, seed: 1 };
     let shown = |p, _| grid.radiance_at(&baked.scene, baked.lattice(), p, baked.scene.surface.outside);
-    survey(&scene, &tracer, (baked.lattice(), grid), &shown, &settings, &|_| true).unwrap()
+    survey(&scene, &tracer, (baked.lattice(), grid), &shown, baked.exposure, &settings, &|_| true).unwrap()
 }
 
 /// By either engine, on the volume's own grid, on both sides of a finer one, and where some grid points are fitted: at
