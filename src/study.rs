@@ -105,8 +105,9 @@ impl Study {
         }
     }
 
-    /// Digests of what determines the rows of each subject besides their keys: its scene, what `base` sets for bakes by
-    /// either engine, and `quick`. Rows of `table` that bear a subject's name must be of its digest.
+    /// What determines the rows of each subject besides their keys, as tables' last columns have it: a digest of its
+    /// scene, of what `base` sets for bakes by either engine, and of `quick`; and [`provenance`]. Rows of `table` that
+    /// bear a subject's name must be of its digest, and all of this program and machine.
     ///
     /// # Errors
     /// `Invalid` if some are not, if two scenes that differ have one name, if neither engine takes what `base` sets, or
@@ -117,7 +118,7 @@ impl Study {
         subjects: &[Subject],
         base: &BakeOptions,
         varies: &[impl AsRef<str>],
-    ) -> Result<Vec<String>> {
+    ) -> Result<Vec<[String; 2]>> {
         if let Some(option) = base.set().iter().find(|o| varies.iter().any(|v| v.as_ref() == *o)) {
             return Err(Error::Invalid(format!("--{option}: this study gives it values of its own; leave it out")));
         }
@@ -139,7 +140,9 @@ impl Study {
             }
             table.expect(&subject.name, job)?;
         }
-        Ok(jobs)
+        let program = provenance(self);
+        table.expect_program(&program)?;
+        Ok(jobs.into_iter().map(|job| [job, program.clone()]).collect())
     }
 
     /// Two independent references on a fixed subset of the vertices of the isosurface at `isovalue` (source units),
@@ -196,17 +199,15 @@ fn exactly(isovalue: f64) -> String {
     format!("{isovalue:?}")
 }
 
-/// The accuracy of a bake in memory against references of one isosurface.
+/// The accuracy of a bake of `scene` in memory against references of one isosurface: of what the bake shows there, a
+/// split one's direct light included.
 ///
 /// # Errors
 /// As [`compare`].
-pub fn accuracy_of(bake: &Bake, references: &[ReferenceMesh]) -> Result<Accuracy> {
-    let grid = &bake.sides[0].1;
-    let texture: Vec<DVec3> = references[0]
-        .positions
-        .par_iter()
-        .map(|&x| grid.interpolate(&bake.lattice, bake.lattice.to_index(x)))
-        .collect();
+pub fn accuracy_of(scene: &Scene, bake: &Bake, references: &[ReferenceMesh]) -> Result<Accuracy> {
+    let (side, grid) = &bake.sides[0];
+    let shown = |&x: &DVec3| grid.radiance_at(scene, &bake.lattice, scene.lattice().to_index(x), *side);
+    let texture: Vec<DVec3> = references[0].positions.par_iter().map(shown).collect();
     Ok(compare(&texture, references, bake.exposure)?.0)
 }
 
@@ -231,6 +232,8 @@ fn provenance(study: &Study) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::bake::Preset;
+    use crate::export::bake_file::BakedVolume;
     use crate::field::{Field, Sweep};
     use crate::scene::{Boundary, Surface, cornell_box};
     use crate::volume::generate::Generator;
@@ -246,6 +249,31 @@ mod tests {
         let surface = Surface { albedo: DVec3::splat(albedo).into(), ..Surface::default() };
         let scene = Scene::new(field, surface, Boundary::Open, walls).unwrap();
         Subject { name: "s".into(), scene, isovalue: None }
+    }
+
+    #[test]
+    fn split_bakes_are_measured_as_they_are_shown() {
+        let dir = tempfile::tempdir().unwrap();
+        let study = Study::new(dir.path().into(), Device::new(1).unwrap(), Progress::Quiet, true).unwrap();
+        let subject = subject(0.5);
+        let references = study.references(&subject, 47e-6, Effort::Table).unwrap();
+        let options = BakeOptions {
+            engine: Some(Engine::Sweep),
+            preset: Some(Preset::Preview),
+            split: Some(true),
+            ..BakeOptions::default()
+        };
+        let settings = BakeSettings::new(&options, &subject.scene).unwrap();
+        let bake = study.bake(&subject, &settings).unwrap().0;
+        let found = accuracy_of(&subject.scene, &bake, &references).unwrap();
+        let baked = BakedVolume::new(subject.scene.resampled(&bake.lattice), bake);
+        let (side, grid) = &baked.sides[0];
+        let of = |light: &dyn Fn(DVec3) -> DVec3| {
+            let there = references[0].positions.iter().map(|&x| light(baked.lattice().to_index(x)));
+            compare(&there.collect::<Vec<_>>(), &references, baked.exposure).unwrap().0.percent_rms
+        };
+        assert_eq!(found.percent_rms, of(&|p| baked.radiance(*side, p).unwrap()));
+        assert_ne!(found.percent_rms, of(&|p| grid.interpolate(baked.lattice(), p)));
     }
 
     #[test]

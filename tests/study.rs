@@ -62,6 +62,15 @@ fn what_another_scene_or_other_settings_left_is_refused_and_the_same_study_adds_
     assert!(study(&["sa/s.toml"], &[]).status.success());
     assert!(content(&dir.join("st")) == before, "the same command again added something");
 
+    // Figures of another version are not for this one's table, whatever the scene.
+    let rows = dir.join("st/datasets.csv");
+    fs::write(&rows, table.replace("isolume 0.", "isolume 99.")).unwrap();
+    refused(&["sa/s.toml"], &[], &["datasets.csv", "`isolume 99.", "`isolume 0.", "another folder"]);
+    refused(&["sb/s.toml"], &[], &["datasets.csv", "another folder"]);
+    fs::write(&rows, table.replace(" threads, ", "0 threads, ")).unwrap();
+    refused(&["sa/s.toml"], &[], &["datasets.csv", "0 threads", "another folder"]);
+    fs::write(&rows, &table).unwrap();
+
     refused(&["sb/s.toml"], &[], &["datasets.csv", "'s'", "another folder"]);
     refused(&["sa/s.toml"], &["--preset", "preview"], &["datasets.csv", "'s'", "another folder"]);
     scene(&dir.join("sa"), 0.2);

@@ -5,7 +5,7 @@ use crate::bake::{BakeOptions, BakeSettings, Engine, StrategyName, TimeEstimate}
 use crate::error::Result;
 use crate::plot::{Plot, Series};
 
-const COLUMNS: [&str; 13] = [
+const COLUMNS: [&str; 14] = [
     "scene",
     "way",
     "photons",
@@ -19,6 +19,7 @@ const COLUMNS: [&str; 13] = [
     "cpu_seconds",
     "rays_per_second",
     "job",
+    "program",
 ];
 
 /// One way to bake.
@@ -110,7 +111,7 @@ pub fn curve(study: &Study, subjects: &[Subject], base: &BakeOptions, limit: Opt
             let (bake, seconds) = study.bake(subject, &settings)?;
             let (mut sum, mut worst) = (0.0, 0f64);
             for r in &references {
-                let a = accuracy_of(&bake, r)?;
+                let a = accuracy_of(&subject.scene, &bake, r)?;
                 sum += a.percent_rms * a.percent_rms;
                 worst = worst.max(a.percent_rms);
             }
@@ -122,8 +123,8 @@ pub fn curve(study: &Study, subjects: &[Subject], base: &BakeOptions, limit: Opt
                 format!("{:.3}", seconds[0]),
                 format!("{:.3}", seconds[1]),
                 format!("{:.0}", bake.report.rays_per_second),
-                job.clone(),
             ]);
+            row.extend(job.clone());
             table.push(row)?;
         }
     }

@@ -13,7 +13,7 @@ use crate::scene::Scene;
 use crate::surface_mesh::SurfaceMesh;
 use std::time::Instant;
 
-const COLUMNS: [&str; 26] = [
+const COLUMNS: [&str; 27] = [
     "scene",
     "mode",
     "isovalue",
@@ -40,6 +40,7 @@ const COLUMNS: [&str; 26] = [
     "extract_s",
     "picture_s",
     "job",
+    "program",
 ];
 
 /// Each data set at its main isovalue: straight from the map, with uniform samples as BB09 and with samples at the
@@ -100,7 +101,7 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
             }
             let settings = BakeSettings::new(&options.clone().or(base), scene)?;
             let (bake, seconds) = study.bake(subject, &settings)?;
-            let a = accuracy_of(&bake, &references)?;
+            let a = accuracy_of(scene, &bake, &references)?;
             let s = bake.report.seconds;
             let [nx, ny, nz] = bake.lattice.dims();
             let mut row = key(mode);
@@ -127,7 +128,7 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
                 picture_seconds,
             ];
             row.extend(numbers.map(|x| format!("{x:.4}")));
-            row.push(job.clone());
+            row.extend(job.clone());
             table.push(row)?;
         }
     }

@@ -8,7 +8,7 @@ use crate::illumination_grid::GridSize;
 use crate::mask::{Mask, masks};
 use crate::plot::{Plot, Series};
 
-const COLUMNS: [&str; 15] = [
+const COLUMNS: [&str; 16] = [
     "scene",
     "samples",
     "strategy",
@@ -24,6 +24,7 @@ const COLUMNS: [&str; 15] = [
     "seconds",
     "cpu_seconds",
     "job",
+    "program",
 ];
 
 const STRATEGIES: [(StrategyName, &str); 4] = [
@@ -58,7 +59,8 @@ pub fn strategies(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Re
 /// What is measured of a subject.
 struct Work<'a> {
     subject: &'a Subject,
-    job: String,
+    /// The rows' last columns.
+    job: [String; 2],
     /// Where bakes are compared, source units.
     isovalues: Vec<f64>,
 }
@@ -88,7 +90,7 @@ fn measure(study: &Study, works: &[Work], base: &BakeOptions, counts: &[u64], ta
                     }
                     let effort = if is_in_table(subject, c) { Effort::Table } else { Effort::Curve };
                     let references = study.references(subject, c, effort)?;
-                    let a = accuracy_of(&bake, &references)?;
+                    let a = accuracy_of(&subject.scene, &bake, &references)?;
                     let mut row = key(c);
                     row.push(bake.report.samples.to_string());
                     let numbers = [
@@ -103,7 +105,7 @@ fn measure(study: &Study, works: &[Work], base: &BakeOptions, counts: &[u64], ta
                         seconds[1],
                     ];
                     row.extend(numbers.map(|x| format!("{x:.4}")));
-                    row.push(job.clone());
+                    row.extend(job.clone());
                     table.push(row)?;
                 }
                 if strategy != StrategyName::Nodes && count == counts[1] {

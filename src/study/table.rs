@@ -7,7 +7,8 @@ use std::fmt::Write as _;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
-/// Rows of text under named columns; the first `keys` columns tell rows apart, the last one is the digest of their job.
+/// Rows of text under named columns; the first `keys` columns tell rows apart, the last two are the digest of their
+/// job, and what made them.
 pub struct Table {
     path: PathBuf,
     columns: Vec<&'static str>,
@@ -38,12 +39,12 @@ impl Table {
         self.rows.iter().any(|r| r[..self.keys] == *keys)
     }
 
-    /// Refuses rows of `scene` (the first column) that another job left: their last column is not `job`.
+    /// Refuses rows of `scene` (the first column) that another job left: their last column but one is not `job`.
     ///
     /// # Errors
     /// `Invalid`.
     pub fn expect(&self, scene: &str, job: &str) -> Result<()> {
-        let of_another = |r: &&Vec<String>| r[0] == scene && r.last().is_some_and(|found| found != job);
+        let of_another = |r: &&Vec<String>| r[0] == scene && r[r.len() - 2] != job;
         match self.rows.iter().find(of_another) {
             None => Ok(()),
             Some(row) => Err(Error::invalid(
@@ -51,7 +52,24 @@ impl Table {
                 format!(
                     "holds rows of '{scene}' that are of another scene, volume or settings (job {}, this one is {job}); \
                      choose another folder, or move the table away",
-                    row[row.len() - 1]
+                    row[row.len() - 2]
+                ),
+            )),
+        }
+    }
+
+    /// Refuses rows that something other than `program` made: figures of two programs or machines are not for one
+    /// table.
+    ///
+    /// # Errors
+    /// `Invalid`.
+    pub fn expect_program(&self, program: &str) -> Result<()> {
+        match self.rows.iter().filter_map(|r| r.last()).find(|found| *found != program) {
+            None => Ok(()),
+            Some(found) => Err(Error::invalid(
+                &self.path,
+                format!(
+                    "holds rows made by `{found}`, this is `{program}`; choose another folder, or move the table away"
                 ),
             )),
         }
@@ -91,15 +109,15 @@ impl Table {
         self.columns.iter().position(|c| *c == column).map_or("", |i| &row[i])
     }
 
-    /// The table as Markdown, under `heading`, with `notes` below.
+    /// The table as Markdown, under `heading`, with `notes` below, which say what made all rows.
     ///
     /// # Errors
     /// `Io`.
     pub fn write_markdown(&self, path: &Path, heading: &str, notes: &str) -> Result<()> {
-        let mut text =
-            format!("# {heading}\n\n| {} |\n|{}\n", self.columns.join(" | "), "---|".repeat(self.columns.len()));
+        let shown = self.columns.len() - 1;
+        let mut text = format!("# {heading}\n\n| {} |\n|{}\n", self.columns[..shown].join(" | "), "---|".repeat(shown));
         for row in &self.rows {
-            writeln!(text, "| {} |", row.join(" | ")).expect("strings take all that is written");
+            writeln!(text, "| {} |", row[..shown].join(" | ")).expect("strings take all that is written");
         }
         write!(text, "\n{notes}\n").expect("strings take all that is written");
         write_text(path, &text)
@@ -153,15 +171,15 @@ mod tests {
     fn a_table_goes_on_where_it_stopped() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("t.csv");
-        let open = || Table::open(path.clone(), &["name", "c", "error"], 2);
+        let open = || Table::open(path.clone(), &["name", "c", "error", "job", "program"], 2);
         let mut t = open().unwrap();
         let names = ["a, b", "a  b", "say \"a\", or b", "", "two\r\nlines\n", "plain"];
         for name in names {
             assert!(!t.has(&[name.into(), "1".into()]), "{name:?}");
-            t.push(vec![name.into(), "1".into(), "0.5".into()]).unwrap();
+            t.push(["", "1", "0.5", "j", "p"].map(|v| if v.is_empty() { name } else { v }.into()).to_vec()).unwrap();
         }
         let before = std::fs::read_to_string(&path).unwrap();
-        assert!(before.ends_with("\nplain,1,0.5\n"), "{before}");
+        assert!(before.ends_with("\nplain,1,0.5,j,p\n"), "{before}");
         drop(t);
         let mut t = open().unwrap();
         for (row, name) in t.rows().iter().zip(names) {
@@ -170,8 +188,15 @@ mod tests {
         }
         assert_eq!(t.rows().len(), names.len());
         assert_eq!(t.number(&t.rows()[0], "error"), 0.5);
-        t.push(vec!["last".into(), "1".into(), "0.5".into()]).unwrap();
-        assert_eq!(std::fs::read_to_string(&path).unwrap(), before + "last,1,0.5\n");
+        t.push(["last", "1", "0.5", "j", "p"].map(String::from).to_vec()).unwrap();
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), before + "last,1,0.5,j,p\n");
         assert!(Table::open(path.clone(), &["other"], 1).is_err());
+        assert!(t.expect("last", "j").is_ok() && t.expect("none", "k").is_ok() && t.expect_program("p").is_ok());
+        assert!(t.expect("last", "k").unwrap_err().to_string().contains("(job j, this one is k)"));
+        assert!(t.expect_program("q").unwrap_err().to_string().contains("made by `p`, this is `q`"));
+        let (shown, notes) = (dir.path().join("t.md"), "made by p");
+        t.write_markdown(&shown, "t", notes).unwrap();
+        let shown = std::fs::read_to_string(shown).unwrap();
+        assert!(shown.contains("| error | job |\n|---|---|---|---|\n") && shown.contains("| last | 1 | 0.5 | j |\n"));
     }
 }
