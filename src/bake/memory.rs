@@ -94,6 +94,11 @@ fn remedy(engine: Engine) -> &'static str {
     }
 }
 
+/// Bytes of the photons, and of their maps, at most, and samples that are counted: more than fits any machine, and so
+/// few that no sum of what they take overflows.
+const MOST: f64 = (1u64 << 56) as f64;
+const MOST_SAMPLES: u64 = 1 << 46;
+
 /// Estimated peak memory of a bake, stage by stage, everything that lives then included.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MemoryEstimate {
@@ -266,11 +271,12 @@ impl Parts {
             // Volume, field, the pyramid of min and max, the masks of volume and grid.
             base += own_voxels * (element + 4 + 1) + own_voxels * 33 / 16 + own_points;
             let spread = own_filled * STAND_INS as u64;
-            samples += match (settings.strategy, settings.samples) {
+            let own_samples = match (settings.strategy, settings.samples) {
                 (StrategyName::Nodes, _) => own + spread,
                 (_, Some(n)) => n,
                 (_, None) => ((own + own_filled) as f64 * settings.samples_per_point) as u64,
             };
+            samples = own_samples.saturating_add(samples).min(MOST_SAMPLES);
             if smoothing {
                 halves += own * PACKED * sides;
                 let [nx, ny, nz] = lattice.dims().map(|n| n as u64);
@@ -318,8 +324,8 @@ impl Parts {
             base,
             // For gathers, of photons maybe others from within solids, and for pictures.
             flats: texels * if settings.engine == Engine::Photon && scene.gathers_within() { 36 } else { 24 },
-            photons: (landings * photon) as u64,
-            maps: ((lower + higher) * MAP) as u64,
+            photons: (landings * photon).min(MOST) as u64,
+            maps: ((lower + higher) * MAP).min(MOST) as u64,
             cached: if gather { 2 } else { 0 },
             levels,
             voxels,
@@ -425,5 +431,38 @@ impl std::fmt::Display for MemoryEstimate {
             write!(f, "{}{name} {}", if n > 0 { ", " } else { "" }, size(*bytes))?;
         }
         write!(f, ")")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bake::BakeOptions;
+    use crate::field::{Field, Sweep};
+    use crate::scene::{Boundary, Surface, cornell_box};
+    use crate::volume::generate::Generator;
+
+    #[test]
+    fn estimates_of_too_much_are_large_however_much_it_is() {
+        let bumps = Generator::from_name("bumps").unwrap().sample([8; 3]).unwrap();
+        let field = Field::new(&bumps, Sweep::new(3.6, 95.0).unwrap()).unwrap();
+        let walls = cornell_box(field.lattice(), 0.0).unwrap();
+        let scene = Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap();
+        let device = Device::new(1).unwrap();
+        let options = BakeOptions { strategy: Some(StrategyName::Uniform), ..BakeOptions::default() };
+        let of = |photons: Option<u64>, samples: Option<u64>, interpolation| {
+            let mut settings = BakeSettings::with_engine(&options, Engine::Photon).unwrap();
+            settings.photons = photons.unwrap_or(1000);
+            (settings.samples, settings.interpolation) = (samples.or(Some(1000)), interpolation);
+            MemoryEstimate::new(&scene, &[&bumps], &settings, &device).unwrap().peak()
+        };
+        for interpolation in [Interpolation::Shepard, Interpolation::Fit, Interpolation::Irradiance] {
+            let little = of(None, None, interpolation);
+            assert!(little < 1 << 30, "{little}");
+            for most in [1 << 40, 1 << 62, u64::MAX] {
+                let [photons, samples] = [of(Some(most), None, interpolation), of(None, Some(most), interpolation)];
+                assert!(photons > 1 << 40 && samples > 1 << 40, "{most}: {photons} {samples}");
+            }
+        }
     }
 }

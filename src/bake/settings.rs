@@ -14,8 +14,8 @@ use serde::{Deserialize, Serialize};
 /// More bands than this save nothing.
 pub const MOST_BANDS: usize = 256;
 
-/// More photons than any machine holds or traces.
-const MOST_PHOTONS: u64 = 1 << 40;
+/// Photons, and samples, at most: more than any machine holds, and so few that what they take can be estimated.
+const MOST_COUNTED: u64 = 1 << 40;
 
 /// How much work a bake is worth.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
@@ -457,6 +457,7 @@ impl BakeSettings {
             bands: o.bands.unwrap_or(1),
         };
         let s = &settings;
+        let samples = s.samples.unwrap_or(1);
         let checks: [(&str, &dyn std::fmt::Display, bool, &str); 11] = [
             (
                 "directions",
@@ -470,8 +471,8 @@ impl BakeSettings {
                 s.light_points.is_power_of_two() && s.light_points <= 1 << 16,
                 "a power of two, at most 65536",
             ),
-            ("photons", &s.photons, s.photons <= MOST_PHOTONS, "at most 1099511627776"),
-            ("samples", &0, s.samples != Some(0), "at least 1"),
+            ("samples", &samples, (1..=MOST_COUNTED).contains(&samples), "1 to 1099511627776"),
+            ("photons", &s.photons, s.photons <= MOST_COUNTED, "at most 1099511627776"),
             (
                 "photons-per-estimate",
                 &s.photons_per_estimate,
@@ -539,53 +540,4 @@ impl BakeSettings {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// More directions than 32 bits count were none at all.
-    #[test]
-    fn directions_and_points_have_a_most() {
-        let fails = |directions, light_points| {
-            let o =
-                BakeOptions { directions: Some(directions), light_points: Some(light_points), ..Default::default() };
-            BakeSettings::with_engine(&o, Engine::Sweep).err().map(|e| e.to_string())
-        };
-        assert_eq!(fails(1 << 20, 1 << 16), None);
-        assert!(
-            fails(1 << 32, 64)
-                .is_some_and(|e| e.contains("directions 4294967296: must be a power of two, 8 to 1048576"))
-        );
-        assert!(
-            fails(64, 1 << 33)
-                .is_some_and(|e| e.contains("light-points 8589934592: must be a power of two, at most 65536"))
-        );
-    }
-
-    #[test]
-    fn options_without_effect_are_named() {
-        let idle = |o: &BakeOptions, engine| o.idle(&BakeSettings::with_engine(o, engine).unwrap()).join("; ");
-        let all = BakeOptions {
-            directions: Some(64),
-            photons: Some(1000),
-            samples: Some(1000),
-            strategy: Some(StrategyName::Nodes),
-            gather_rays: Some(0),
-            smoothing: Some(true),
-            tau: Some(0.1),
-            ..BakeOptions::default()
-        };
-        assert_eq!(
-            idle(&all, Engine::Sweep),
-            "photons, samples, strategy, smoothing have no effect with engine = \"sweep\""
-        );
-        let photon = "directions has no effect with engine = \"photon\"; samples has no effect with strategy = \"nodes\" \
-                      (uniform, level-set and planes scatter samples); smoothing has no effect with fewer than 2 gather rays";
-        assert_eq!(idle(&all, Engine::Photon), photon);
-        let scattered = BakeOptions { samples: Some(10), neighbours: Some(8), ..BakeOptions::default() };
-        assert_eq!(idle(&scattered, Engine::Photon), "");
-        let smoothed = BakeOptions { smoothing: Some(true), ..scattered };
-        assert_eq!(idle(&smoothed, Engine::Photon), "smoothing has no effect with scattered samples");
-        let smoothed = BakeOptions { smoothing: Some(true), ..BakeOptions::default() };
-        assert_eq!(idle(&smoothed, Engine::Photon), "");
-    }
-}
+mod tests;
