@@ -32,8 +32,12 @@ pub struct Camera {
 }
 
 impl Camera {
+    /// Pixels across, and down, at most.
+    pub const MOST: usize = 1 << 14;
+
     /// The default view: on the box's axis, looking along +y with z up, vertical field of view 40°, as far out as lets
-    /// the front face just fill the frame; `height` pixels tall, aspect Lx : Lz.
+    /// the front face just fill the frame; `height` pixels tall, aspect Lx : Lz, which may be wider than
+    /// [`Camera::MOST`].
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "pixel counts")]
     pub fn facing(scene: &Scene, height: usize) -> Self {
         let [lo, hi] = scene.bounds();
@@ -45,18 +49,25 @@ impl Camera {
         Self { eye, target: centre, up: DVec3::Z, fov, size: [width, height] }
     }
 
-    /// Unit direction through image coordinates: x from the left, y from the top, in pixels.
+    /// The unit direction of the view, and the steps of a pixel to the right and up on the plane one unit before the
+    /// eye. Sums of these are directions of rays, of no unit length.
     ///
     /// # Errors
-    /// `Invalid` if eye and target coincide or the view runs along up.
+    /// `Invalid` if eye and target coincide or the view runs along up, for an impossible field of view, and for a
+    /// picture that is empty or larger than [`Camera::MOST`].
     fn basis(&self) -> Result<[DVec3; 3]> {
         let fail = || Error::Invalid("camera: the eye, the target and up must span a plane".into());
         let forward = (self.target - self.eye).try_normalize().ok_or_else(fail)?;
         let right = forward.cross(self.up).try_normalize().ok_or_else(fail)?;
-        if !(self.fov > 0.0 && self.fov < 179.0) || self.size.contains(&0) {
+        let size = self.size.iter().all(|n| (1..=Self::MOST).contains(n));
+        if !(size && self.fov > 0.0 && self.fov < 179.0) {
             return Err(Error::Invalid(format!(
-                "camera: a field of view of {}° over {}×{} pixels; it must be above 0 and below 179, the picture not empty",
-                self.fov, self.size[0], self.size[1]
+                "camera: a field of view of {}° over {}×{} pixels; it must be above 0 and below 179, the picture 1 to {} \
+                 pixels wide and tall",
+                self.fov,
+                self.size[0],
+                self.size[1],
+                Self::MOST
             )));
         }
         let scale = f64::to_radians(0.5 * self.fov).tan() * 2.0 / self.size[1] as f64;

@@ -69,10 +69,14 @@ impl Export {
         }
         let Array { lattice, space, name, components, samples } = &array;
         let path = &self.output;
+        let mut written = samples.element_type();
         match extension.as_str() {
             "nrrd" => nrrd::write(path, lattice, *space, *components, samples.into(), &[("array", name)])?,
             "npy" => npy::write(path, lattice, *components, samples.into())?,
-            "exr" => slices::write(path, lattice, *components, samples.into())?,
+            "exr" => {
+                slices::write(path, lattice, *components, samples.into())?;
+                written = slices::ELEMENT;
+            }
             _ => VtiWriter::new(lattice)
                 .point_data(name, *components, samples)
                 .active_scalars(name)
@@ -81,7 +85,7 @@ impl Export {
         }
         if progress == Progress::Shown {
             let [x, y, z] = lattice.dims();
-            say!("{}: `{name}`, {x}×{y}×{z} × {components} {}", path.display(), samples.element_type().name());
+            say!("{}: `{name}`, {x}×{y}×{z} × {components} {}", path.display(), written.name());
         }
         Ok(())
     }

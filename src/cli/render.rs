@@ -103,8 +103,9 @@ impl Render {
         expect_extension(&self.output, &["png", "exr"])?;
         outputs([&*self.output], &Inputs::of(&self.file, &self.scene)?)?;
         let begun = Instant::now();
-        if !(1..=16384).contains(&self.height) || self.width.is_some_and(|w| !(1..=16384).contains(&w)) {
-            return Err(Error::Invalid("--height, --width: 1 to 16384 pixels".into()));
+        let pixels = 1..=Camera::MOST;
+        if !pixels.contains(&self.height) || self.width.is_some_and(|w| !pixels.contains(&w)) {
+            return Err(Error::Invalid(format!("--height, --width: 1 to {} pixels", Camera::MOST)));
         }
         if !(1..=1 << 16).contains(&self.samples) {
             return Err(Error::Invalid("--samples: 1 to 65536 rays per pixel".into()));
@@ -131,6 +132,14 @@ impl Render {
         camera.fov = self.fov;
         if let Some(width) = self.width {
             camera.size[0] = width;
+        }
+        let [width, height] = camera.size;
+        if !pixels.contains(&width) {
+            return Err(Error::Invalid(format!(
+                "--height {height}: of the box's proportions the picture would be {width} pixels wide, more than {}; give \
+                 --width, or lower --height",
+                Camera::MOST
+            )));
         }
         if let Some(up) = triple(self.up.as_ref(), "up")? {
             camera.up = up;

@@ -2,8 +2,8 @@
 
 use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
-use crate::volume::Lattice;
 use crate::volume::vti::SamplesRef;
+use crate::volume::{ElementType, Lattice};
 use exr::meta::attribute::{AttributeValue, Text};
 use exr::prelude::WritableImage;
 use exr::prelude::{
@@ -12,16 +12,20 @@ use exr::prelude::{
 };
 use std::path::Path;
 
+/// What files hold, whatever they are made from.
+pub const ELEMENT: ElementType = ElementType::F32;
+
 /// Writes one layer per slice along the third axis, `z0000`, `z0001` …, each nx × ny pixels of 32-bit floats (scan
 /// lines, ZIP), with the channels `R`, `G`, `B` for three components and `Y` for one. Row j of a layer is sample j: the
-/// first row, which viewers show on top, is the one at the lattice's origin. The values are written as they are.
+/// first row, which viewers show on top, is the one at the lattice's origin. The values are written as they are,
+/// rounded to [`ELEMENT`].
 ///
 /// Each layer's text attributes `isolume:origin` (world position of sample (0, 0, 0)) and `isolume:axes` (the three
 /// steps, one axis after the other) place the pixels.
 ///
 /// # Errors
-/// `Invalid` if the count is not the lattice's samples × `components`, or for other component counts than 1 and 3;
-/// `Io`.
+/// `Invalid` if the count is not the lattice's samples × `components`, for other component counts than 1 and 3, or for
+/// a number that 32-bit floats do not reach; `Io`.
 pub fn write(path: &Path, lattice: &Lattice, components: usize, values: SamplesRef<'_>) -> Result<()> {
     values.check(lattice, components).map_err(|e| Error::invalid(path, e))?;
     let names: &[&str] = match components {
@@ -29,6 +33,15 @@ pub fn write(path: &Path, lattice: &Lattice, components: usize, values: SamplesR
         3 => &["R", "G", "B"],
         n => return Err(Error::invalid(path, format!("arrays of {n} components: EXR slices hold 1 or 3"))),
     };
+    if let SamplesRef::F64(values) = values
+        && let Some(n) = values.iter().position(|x| x.is_finite() && x.abs() > f64::from(f32::MAX))
+    {
+        let (place, value) = (lattice.ijk(n / components), values[n]);
+        let message = format!(
+            "the value at sample {place:?} is {value:e}, and EXR holds 32-bit floats; write .nrrd, .npy or .vti"
+        );
+        return Err(Error::invalid(path, message));
+    }
     let [nx, ny, nz] = lattice.dims();
     let text = |s: &str| Text::from_slice_unchecked(s.as_bytes());
     let numbers = |v: &[f64]| v.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");

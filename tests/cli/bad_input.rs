@@ -72,6 +72,27 @@ fn bad_input_is_one_clear_line_and_leaves_nothing() {
         }
     }
 
+    // A thin slice is as wide as its box.
+    let slice = Lattice::aligned([57, 2, 2], glam::DVec3::ZERO, glam::DVec3::ONE).unwrap();
+    let samples = Samples::F64((0..228).map(f64::from).collect());
+    Volume::new("slice", slice.clone(), samples).unwrap().write(dir.join("slice.nrrd")).unwrap();
+    let picture = ["render", "slice.nrrd", "--isovalue", "100.5", "-o", "out.png", "--local", "--samples", "1"];
+    refused(dir, &picture, &["--height 600", "33600 pixels wide", "--width"]);
+    ok(dir, &[&picture[..], &["--width", "16", "--height", "8", "-q"]].concat());
+    fs::remove_file(dir.join("out.png")).unwrap();
+
+    // EXR has no 64-bit floats.
+    let far = |value: f64| {
+        let samples = Samples::F64((0..228).map(|n| if n == 60 { value } else { f64::from(n) }).collect());
+        Volume::new("far", slice.clone(), samples).unwrap().write(dir.join("far.nrrd")).unwrap();
+    };
+    far(-1e39);
+    refused(dir, &["export", "far.nrrd", "-o", "out.exr"], &["out.exr", "[3, 1, 0]", "-1e39", ".nrrd"]);
+    far(3e38);
+    let said = text(&ok(dir, &["export", "far.nrrd", "-o", "out.exr"]).stderr);
+    assert!(said.contains("57×2×2 × 1 f32"), "{said}");
+    fs::remove_file(dir.join("out.exr")).unwrap();
+
     refused(dir, &["generate", "bumps", "--size", "100000", "-o", "out.vti"], &["100000", "2048"]);
     refused(dir, &with(&["--checkpoint-every=-1"]), &["--checkpoint-every", "0 or more"]);
 
