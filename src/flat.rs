@@ -262,7 +262,8 @@ impl FlatTexture {
     }
 
     /// Texel-centred trilinear lookup at (u, v, c) ∈ [0, 1]³, continued linearly over the outer half texels (a constant
-    /// there would darken what a wall sends, since radiance peaks beside its neighbours); never negative.
+    /// there would darken what a wall sends, since radiance peaks beside its neighbours). Where light falls off steeply
+    /// that may lead below 0.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the texture")]
     pub fn lookup(&self, [u, v, c]: [f64; 3]) -> DVec3 {
         let uvc = [u, v, if self.axis.is_even() { c } else { f64::from(self.axis.place(c as f32)) }];

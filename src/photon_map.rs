@@ -66,14 +66,12 @@ pub enum Estimator {
     Splat,
 }
 
-/// Ways to turn photon power into irradiance. The first is right; the others are kept for comparison.
+/// Ways to turn photon power into irradiance. The first is right; the other is kept for comparison.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Normalisation {
     /// Σ w K / ∫_A K |∇h| dV over the accepted set A.
     #[default]
     Accepted,
-    /// Σ w K/|∇h(x_i)| with a kernel normalised over the whole ball: unbounded variance, ½ at a face of Ω.
-    PerPhoton,
     /// Σ w K with the kernel normalised over the ball and no |∇h|: wrong by 0.1× to 1.9×, to show that the factor
     /// matters.
     WithoutGradient,

@@ -79,7 +79,8 @@ pub fn ball([u, v]: [f64; 2], w: f64) -> DVec3 {
     sphere([u, v]) * w.cbrt()
 }
 
-/// Barycentric weights of the second and third corner, uniform over a triangle; folds the square along its diagonal.
+/// Barycentric weights of the second and third corner, uniform over a triangle: √u is how far from the first corner,
+/// v where across.
 #[inline]
 pub fn triangle([u, v]: [f64; 2]) -> [f64; 2] {
     let r = u.sqrt();

@@ -35,7 +35,6 @@ struct MappedPhoton {
     power: Vec3,
     isovalue: f32,
     normal: Vec3,
-    slope: f32,
 }
 
 impl<'a> PhotonPoints<'a> {
@@ -59,12 +58,10 @@ impl<'a> PhotonPoints<'a> {
             .par_iter()
             .map(|&n| {
                 let p = kept[n as usize];
-                let g = scene.field.gradient(p.position.as_dvec3());
                 MappedPhoton {
                     power: p.power * p.foreshortening,
                     isovalue: p.isovalue,
-                    normal: g.normalize_or_zero().as_vec3(),
-                    slope: g.length() as f32,
+                    normal: scene.field.gradient(p.position.as_dvec3()).normalize_or_zero().as_vec3(),
                 }
             })
             .collect();
@@ -115,18 +112,14 @@ impl<'a> PhotonPoints<'a> {
         let (mut power, mut squares) = (DVec3::ZERO, 0.0);
         for &(d2, slot) in found {
             let p = &self.photons[slot as usize];
-            let mut w = f64::from((1.0 - d2 / r2).max(0.0));
-            if self.settings.normalisation == Normalisation::PerPhoton {
-                w /= f64::from(p.slope);
-            }
+            let w = f64::from((1.0 - d2 / r2).max(0.0));
             let contribution = p.power.as_dvec3() * w;
             power += contribution;
             squares += crate::direct::luminance(contribution).powi(2);
         }
-        let full = 8.0 * std::f64::consts::PI * radius.powi(3) / 15.0;
         let measure = match self.settings.normalisation {
             Normalisation::Accepted => self.footprint(position, isovalue, normal, radius),
-            Normalisation::PerPhoton | Normalisation::WithoutGradient => full,
+            Normalisation::WithoutGradient => 8.0 * std::f64::consts::PI * radius.powi(3) / 15.0,
         };
         if !(measure > 0.0) {
             return Irradiance { radius, ..Irradiance::default() };

@@ -280,7 +280,7 @@ impl<'a> VtiWriter<'a> {
         let l = self.lattice;
         let cells = l.cells();
         let extent = format!("0 {} 0 {} 0 {}", cells[0], cells[1], cells[2]);
-        let (origin, mut spacing, axes) = (l.origin(), l.spacing(), l.axes());
+        let (origin, spacing, axes) = (l.origin(), l.spacing(), l.axes());
         let diagonal = glam::DMat3::from_diagonal(spacing);
         let mut direction = String::new();
         if axes != diagonal {
@@ -288,8 +288,6 @@ impl<'a> VtiWriter<'a> {
             let d = axes * glam::DMat3::from_diagonal(spacing.recip());
             let rows = d.transpose().to_cols_array().map(|v| v.to_string());
             direction = format!(" Direction=\"{}\"", rows.join(" "));
-        } else {
-            spacing = axes.diagonal();
         }
         let mut d = Document::new("ImageData");
         d.text(&format!(
