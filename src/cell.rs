@@ -1,6 +1,7 @@
 //! One hexahedron of the graph: 8 samples, the cubic along a ray, and signs on its faces that neighbours share.
 
 use crate::cubic::Cubic;
+use crate::field::trilinear;
 use glam::DVec3;
 
 /// The 8 samples of a cell; bit a of the position says which end along axis a.
@@ -22,9 +23,7 @@ impl Cell {
     /// h at cell-local `p` in [0, 1]³; exact at the corners.
     #[inline(always)]
     pub fn value(&self, p: DVec3) -> f64 {
-        let s = self.s.map(f64::from);
-        let x = |a: usize| lerp(s[a], s[a + 1], p.x);
-        lerp(lerp(x(0), x(2), p.y), lerp(x(4), x(6), p.y), p.z)
+        trilinear(&self.s.map(f64::from), p)
     }
 
     /// dh/dt at cell-local `p` along `d`. Each difference is weighted by what it counts for there.

@@ -363,9 +363,10 @@ impl Field {
     }
 }
 
-/// A cell's samples interpolated at `u`.
-#[inline]
-fn trilinear(s: &[f64; 8], u: DVec3) -> f64 {
+/// A cell's samples interpolated at `u` in [0, 1]³, bit a of their position being the end along axis a; exact at the
+/// corners.
+#[inline(always)]
+pub(crate) fn trilinear(s: &[f64; 8], u: DVec3) -> f64 {
     // By weights: a corner that does not count leaves no rounding behind, however large it is.
     let lerp = |a: f64, b: f64, u: f64| (1.0 - u) * a + u * b;
     let x = |a: usize| lerp(s[a], s[a + 1], u.x);

@@ -196,9 +196,12 @@ impl Polygon {
 
     /// Whether texture coordinates cover the polygon exactly.
     pub fn is_parallelogram(&self) -> bool {
-        let v = &self.vertices;
-        v.len() == 4 && (v[0] + v[2] - v[1] - v[3]).length() <= 1e-12 * (v[2] - v[0]).length()
+        is_parallelogram(&self.vertices)
     }
+}
+
+fn is_parallelogram(v: &[DVec3]) -> bool {
+    v.len() == 4 && (v[0] + v[2] - v[1] - v[3]).length() <= 1e-12 * (v[2] - v[0]).length()
 }
 
 /// Area of triangle `i` of the fan of a planar convex polygon.
@@ -228,7 +231,7 @@ pub fn sample_convex(v: &[DVec3], u: [f64; 2]) -> DVec3 {
 
 /// Corner and edges of the texture of a planar polygon.
 fn parametrise(v: &[DVec3], normal: DVec3) -> (DVec3, [DVec3; 2]) {
-    if v.len() == 4 && (v[0] + v[2] - v[1] - v[3]).length() <= 1e-12 * (v[2] - v[0]).length() {
+    if is_parallelogram(v) {
         return (v[0], [v[1] - v[0], v[3] - v[0]]);
     }
     let s = (v[1] - v[0]).normalize();

@@ -181,6 +181,12 @@ impl Lattice {
     pub fn far(&self) -> DVec3 {
         DVec3::from_array(self.cells().map(|n| n as f64))
     }
+
+    /// Whether index coordinates lie in Ω, or as near as rounding puts what stands on its faces (10⁻⁶ of a step).
+    #[inline]
+    pub fn holds(&self, p: DVec3) -> bool {
+        p.cmpge(DVec3::splat(-1e-6)).all() && p.cmple(self.far() + 1e-6).all()
+    }
 }
 
 /// Samples in the type of the file. x fastest.

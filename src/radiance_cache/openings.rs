@@ -69,8 +69,7 @@ impl<'a> Solid<'a> {
         let p = self.scene.lattice().to_index(self.flat.at(uv));
         let mut open = [f64::NEG_INFINITY, f64::INFINITY];
         let mut close = |number: Option<u8>, field: &Field, p: DVec3, outside: Side| {
-            let within = p.cmpge(DVec3::splat(-1e-6)).all() && p.cmple(field.lattice().far() + 1e-6).all();
-            let h = if within { field.value(p) } else { f64::NAN };
+            let h = if field.lattice().holds(p) { field.value(p) } else { f64::NAN };
             // A cap is the outer side of what is higher.
             let below = outside == Side::Lower && self.capped != Some(number);
             // NaN: nothing is there.

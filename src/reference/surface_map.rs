@@ -252,10 +252,8 @@ impl SurfaceMap {
     fn wall_area(&self, scene: &Scene, id: u32, world: DVec3, at: &Receiver, radius: f64) -> f64 {
         let (polygon, lattice) = (&scene.polygons()[id as usize], scene.lattice());
         let frame = Frame::new(polygon.normal());
-        let higher_in = |field: &Field, p: DVec3| {
-            let inside = p.cmpge(DVec3::splat(-1e-6)).all() && p.cmple(field.lattice().far() + 1e-6).all();
-            inside && field.value(p) >= f64::from(self.isovalue)
-        };
+        let higher_in =
+            |field: &Field, p: DVec3| field.lattice().holds(p) && field.value(p) >= f64::from(self.isovalue);
         // On which side of each field's level set, as bits.
         let higher = |p: DVec3| {
             let others = scene.companions().iter().map(|c| higher_in(&c.member.field, c.to_index(p)));

@@ -257,8 +257,7 @@ fn walls(
                         continue;
                     }
                     let (lx, ly) = (lattice.to_index(x), lattice.to_index(y));
-                    let within = (0..3).all(|a| lx[a] >= -1e-6 && lx[a] <= far[a] + 1e-6);
-                    let here = if within && id < caps && !capped(scene) { below(h(lx)) } else { 0 };
+                    let here = if lattice.holds(lx) && id < caps && !capped(scene) { below(h(lx)) } else { 0 };
                     all.add(g, here, here);
                     if blockers.block(number, receiver, ly, lx) {
                         continue;
