@@ -44,6 +44,7 @@ mod settling;
 #[allow(unsafe_code, reason = "vector instructions: measured to pay, chosen at run time")]
 mod simd;
 mod slits;
+mod solid;
 mod state;
 mod totals;
 
@@ -254,7 +255,8 @@ pub fn sweep_resumable(
     let stored = scene.surface.stored_sides();
     let sides = swept_sides(scene);
     let replicates = settings.replicates.max(1);
-    let mut flats = Flats::new(scene, settings.flat_resolution.0.max(2), settings.flat_resolution.1.max(2));
+    let (across, isovalues) = settings.flat_resolution;
+    let mut flats = Flats::new(scene, &sides, across.max(2), isovalues.max(2));
     let mut state = State::new(&sides, stored.len(), [geometry.h.len(), geometry.places()], replicates);
     let mut passes = saved.read(0, |bytes| state.restore(bytes, sides.len(), &mut flats)).flatten();
     if state.counts.valid == 0 {
@@ -298,14 +300,9 @@ pub fn sweep_resumable(
     if !stopped {
         saved.save(0, || state.bytes(None, &flats));
     }
-    let State { done, total, flats: sums, bounces, residual, counts } = state;
-    let flats = flats.textures.iter().zip(sums).map(|(texture, sum)| {
-        texture.as_ref().zip(sum).map(|(t, mut sum)| {
-            sum.iter_mut().for_each(|x| *x /= done.max(1) as f32);
-            t.export(&sum)
-        })
-    });
-    let flats = flats.collect();
+    let State { done, total, flats: mut sums, bounces, residual, counts } = state;
+    sums.iter_mut().flatten().flatten().for_each(|x| *x /= done.max(1) as f32);
+    let flats = flats.export(&sums);
     let mut sides = total.finish(&rows, &Focus { dims, lit: |at| lit[at] }, done, settings.direct);
     let world = |o: usize| scene.lattice().to_world(DVec3::from_array(scene.lattice().ijk(o).map(|i| i as f64)));
     let dark = slits.hidden.iter().map(|hidden| hidden.0).filter(|&o| scene.covers(world(o)));

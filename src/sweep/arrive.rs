@@ -232,9 +232,9 @@ impl<'a> Walls<'a> {
         let (pf, qf) = (p as f64, q as f64);
         for (wall, forward) in self.ends.fronts(pf, qf) {
             let Some(flat) = wall.flat else { continue };
-            let next = self.ends.stop(pf, qf, wall.tau, forward, Some(flat));
+            let next = self.ends.stop(pf, qf, wall.tau, forward, Some(wall.polygon));
             // What is covered shows to nobody: a texel is the mean of the rest.
-            if next.is_some_and(|n| n.covers == Some(flat)) {
+            if next.is_some_and(|n| n.covers == Some(wall.polygon)) {
                 continue;
             }
             let reach = next.map_or(if forward { f64::INFINITY } else { f64::NEG_INFINITY }, |s| s.tau);
@@ -420,7 +420,8 @@ impl<'a> Walls<'a> {
         let x = face % 3;
         let uv = [(x + 1) % 3, (x + 2) % 3].map(|b| (local[b] / far[b]).clamp(0.0, 1.0) as f32);
         #[allow(clippy::cast_possible_truncation, reason = "six caps")]
-        Stop { tau, flat: Some(self.caps + face as u32), uv, covers: None }
+        let cap = self.caps + face as u32;
+        Stop { tau, polygon: cap, flat: Some(cap), uv, covers: None }
     }
 
     /// What the caps at a line's entry and exit see outside Ω.

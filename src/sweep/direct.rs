@@ -13,6 +13,7 @@ use super::planes::{Planes, Spare};
 use super::points::Points;
 use super::receivers::Emitter;
 use super::segments::Segments;
+use super::solid::FREE;
 use crate::flat;
 use crate::flattened::Side;
 use crate::isa::Isa;
@@ -225,8 +226,10 @@ fn walls(
     let h = |p: DVec3| {
         if clearance.is_none() || geometry.reaches(p) { scene.field.value(p) as f32 } else { f32::NEG_INFINITY }
     };
-    for (id, texture) in flats.textures.iter_mut().enumerate() {
+    for (texture_number, texture) in flats.textures.iter_mut().enumerate() {
         let Some(texture) = texture else { continue };
+        let (id, within) = (texture_number % flats.count, texture_number >= flats.count);
+        let solid = flats.solid.get(id).and_then(Option::as_ref);
         let flat = flat::flat(scene, id).expect("textured flats exist");
         let receiver = (id < caps).then(|| u32::try_from(id).expect("fewer than 2¹⁶ polygons"));
         let corners: Vec<DVec3> = [[0., 0.], [1., 0.], [0., 1.], [1., 1.]].map(|uv| flat.at(uv)).to_vec();
@@ -284,6 +287,10 @@ fn walls(
                     lit.add(g, open, below(segments.least[lane]).min(open));
                 }
             }
+            let [lower, higher] = match solid {
+                Some(solid) if solid[texel] != FREE => [!within, within],
+                _ => [lower, higher],
+            };
             let even = [1.0; 2].map(|x| vec![x; nc]);
             let lit = lit.sums(lower, higher, if id < caps { &corrections } else { &even });
             let all = all.sums(lower, higher, &even);

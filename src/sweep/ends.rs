@@ -5,6 +5,7 @@
 use super::directions::Shear;
 use super::flats::{Flats, Stop};
 use super::pack::LANES;
+use crate::flattened::Side;
 use crate::scene::Scene;
 use glam::DVec3;
 
@@ -19,6 +20,8 @@ fn at(f: &Affine, p: f64, q: f64) -> f64 {
 /// A polygon met by the parallel lines of one family: everything is affine in the line's numbers (p, q).
 struct Met {
     number: u32,
+    /// Its texture.
+    flat: u32,
     tau: Affine,
     uv: [Affine; 2],
     /// Inside is where none of these is below −slack.
@@ -57,7 +60,8 @@ pub(super) struct Ends {
 }
 
 impl Ends {
-    pub(super) fn new(scene: &Scene, flats: &Flats, shear: &Shear, standing: &[Standing]) -> Self {
+    /// As `side` of the level sets sees them.
+    pub(super) fn new(scene: &Scene, (flats, side): (&Flats, Side), shear: &Shear, standing: &[Standing]) -> Self {
         let lattice = scene.lattice();
         let [u, v, a] = shear.layout.axes;
         let [e, f, g] = [u, v, a].map(|x| lattice.axes().col(x));
@@ -88,8 +92,10 @@ impl Ends {
                         affine(&|x| normal.dot(x - x0))
                     })
                     .collect();
+                let number = u32::try_from(i).expect("scenes hold fewer than 2¹⁶ polygons");
                 Some(Met {
-                    number: u32::try_from(i).expect("scenes hold fewer than 2¹⁶ polygons"),
+                    number,
+                    flat: flats.number(number, side),
                     tau,
                     uv: [affine(&|x| p.texture(x)[0]), affine(&|x| p.texture(x)[1])],
                     edges,
@@ -184,7 +190,7 @@ impl Ends {
                     uv[a][l] = at(&m.uv[a], first + l as f64, q).clamp(0.0, 1.0) as f32;
                 }
             }
-            let there = flats.places(m.number, &uv, random);
+            let there = flats.places(m.flat, &uv, random);
             for l in 0..LANES {
                 places[l] = if which[l] == number as u32 { there[l] } else { places[l] };
             }
@@ -225,7 +231,7 @@ impl Met {
         let front = self.front_plus == forward;
         let uv = [0, 1].map(|a| at(&self.uv[a], p, q).clamp(0.0, 1.0) as f32);
         let covers = if front { None } else { self.standing.covers };
-        Stop { tau, flat: (front && self.reflects).then_some(self.number), uv, covers }
+        Stop { tau, polygon: self.number, flat: (front && self.reflects).then_some(self.flat), uv, covers }
     }
 }
 
@@ -278,7 +284,7 @@ mod tests {
         // Some whose backs stop lines, too.
         walls.iter_mut().step_by(2).for_each(|w| w.opaque_back = true);
         let scene = crate::scene::Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap();
-        let mut flats = Flats::new(&scene, 8, 5);
+        let mut flats = Flats::new(&scene, &[Side::Lower], 8, 5);
         let mut rng = Rng::stream(5, Stage::Test, 0);
         for t in flats.textures.iter_mut().flatten() {
             t.radiance.iter_mut().for_each(|b| *b = rng.unit() as f32);
@@ -289,7 +295,7 @@ mod tests {
         for _ in 0..40 {
             let omega = crate::warp::sphere(rng.unit2());
             let plan = Plan::new(Shear::new(scene.lattice(), omega, rng.unit2()), 1.0);
-            let ends = Ends::new(&scene, &flats, &plan.shear, &standing);
+            let ends = Ends::new(&scene, (&flats, Side::Lower), &plan.shear, &standing);
             let (first, q) = ((rng.unit() * 12.0).floor() - 8.0, (rng.unit() * 12.0).floor());
             let random: [f32; LANES] = std::array::from_fn(|_| rng.unit() as f32);
             for forward in [true, false] {

@@ -6,6 +6,7 @@ use super::grid::Geometry;
 use super::half::{Half4, colour, encode};
 use super::pack::{LANES, Pack};
 use super::scan::Light;
+use crate::flattened::Side;
 use crate::polygon::Polygon;
 use crate::scene::{ON, Scene};
 use glam::DVec3;
@@ -138,9 +139,9 @@ impl<'a> Touching<'a> {
         Self { scene, walls }
     }
 
-    /// What is there now, times the scale that [`Flats::packed`] has.
+    /// What `side` of the level sets sees there now, times the scale that [`Flats::packed`] has.
     #[allow(clippy::cast_possible_truncation, reason = "texture coordinates")]
-    pub(super) fn now(&self, geometry: &Geometry, flats: &Flats) -> Touched<'_> {
+    pub(super) fn now(&self, geometry: &Geometry, flats: &Flats, side: Side) -> Touched<'_> {
         let (lattice, dims) = (self.scene.lattice(), geometry.dims);
         let stands = Light { b: &[], flats: &flats.packed, isovalues: flats.isovalues, axis: &flats.axis };
         let radiance = std::array::from_fn(|face| {
@@ -149,7 +150,7 @@ impl<'a> Touching<'a> {
                 let [i, j, k] = node(dims, face, at);
                 let c = geometry.h[i + dims[0] * (j + dims[1] * k)];
                 let uv = wall.texture(lattice.to_world(DVec3::new(i as f64, j as f64, k as f64)));
-                let texels = flats.texels(u32::from(number), uv.map(|x| x.clamp(0.0, 1.0) as f32));
+                let texels = flats.texels(flats.number(u32::from(number), side), uv.map(|x| x.clamp(0.0, 1.0) as f32));
                 let shows = texels.into_iter().flatten().map(|(start, w)| stands.end(start, c).map(|b| w * b));
                 let [r, g, b] = shows.fold([0.0; 3], |sum, b| std::array::from_fn(|c| sum[c] + b[c]));
                 [encode(r), encode(g), encode(b), 0]

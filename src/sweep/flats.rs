@@ -4,7 +4,10 @@
 
 use super::gather::local_bounds;
 use super::half::{Half4, encode};
+use super::solid::{FREE, solid};
+use super::swept_sides;
 use crate::flat::{self, Flat, FlatTexture};
+use crate::flattened::Side;
 use crate::isa::Isa;
 use crate::isovalue_axis::IsovalueAxis;
 use crate::scene::{Boundary, Scene};
@@ -44,10 +47,6 @@ impl Texture {
     /// Isovalues.
     pub(super) fn isovalues(&self) -> usize {
         self.dims[2]
-    }
-
-    fn sums(&self) -> usize {
-        self.dims.iter().product::<usize>() * 3
     }
 
     /// Writes B at (u, v) for every isovalue to `out`: three channels of `isovalues()` numbers.
@@ -131,9 +130,15 @@ impl Arrivals {
     }
 }
 
-/// All flats of a scene, by flat number; `None` where nothing is reflected.
+/// All flats of a scene; `None` where nothing is reflected.
 pub(super) struct Flats {
+    /// By flat number; where both sides of level sets end on flats what the lower one shows, then what the higher one
+    /// does: light does not pass from side to side within a texel.
     pub textures: Vec<Option<Texture>>,
+    /// Flats.
+    pub count: usize,
+    /// Of each flat as [`solid`] has it, if the sides are kept apart.
+    pub solid: Vec<Option<Vec<u32>>>,
     /// Isovalue texels of every texture.
     pub isovalues: usize,
     /// Where they stand.
@@ -172,9 +177,10 @@ pub(super) fn sinks(dims: [usize; 2]) -> [usize; 2] {
     dims.map(|n| n.div_ceil(2))
 }
 
-/// Texels of all flats of a scene.
+/// Texels of all flats of a scene, of both sides of the level sets where these may be kept apart.
 pub(crate) fn texels(scene: &Scene, across: usize, isovalues: usize) -> usize {
-    shapes(scene, across).flatten().map(|(_, [u, v])| u * v * isovalues).sum()
+    let sides = if capped(scene) { 1 } else { swept_sides(scene).len() };
+    sides * shapes(scene, across).flatten().map(|(_, [u, v])| u * v * isovalues).sum::<usize>()
 }
 
 /// How many of `n` isovalues that stand along `axis` are at or below h.
@@ -186,20 +192,28 @@ pub(super) fn below(axis: &IsovalueAxis, n: usize, h: f32) -> usize {
 
 impl Flats {
     #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
-    pub(super) fn new(scene: &Scene, across: usize, isovalues: usize) -> Self {
+    pub(super) fn new(scene: &Scene, sides: &[Side], across: usize, isovalues: usize) -> Self {
         let axis = IsovalueAxis::of([scene.field.samples()]);
         let centres = axis.centres(isovalues);
+        let shapes: Vec<_> = shapes(scene, across).collect();
+        let solid = |(flat, dims): &(Flat, _)| solid(scene, flat, *dims, &axis, isovalues);
+        let solid: Vec<_> = match sides {
+            [_, _] if !capped(scene) => shapes.iter().map(|shape| shape.as_ref().map(solid)).collect(),
+            _ => Vec::new(),
+        };
+        let apart = solid.iter().flatten().flatten().any(|n| *n != FREE);
         // Black comes first.
         let mut next = isovalues;
-        let textures = shapes(scene, across)
+        let textures = shapes.iter().cycle().take(if apart { 2 } else { 1 } * shapes.len());
+        let textures = textures
             .map(|shape| {
-                let (flat, [u, v]) = shape?;
+                let (flat, [u, v]) = shape.as_ref()?;
                 let texels = u * v;
                 let n = 3 * texels * isovalues;
                 next += texels * isovalues;
-                let sink = sinks([u, v]);
+                let sink = sinks([*u, *v]);
                 Some(Texture {
-                    dims: [u, v, isovalues],
+                    dims: [*u, *v, isovalues],
                     sink,
                     axis,
                     albedo: centres.iter().map(|&c| flat.albedo.at(c).as_vec3().to_array()).collect(),
@@ -215,7 +229,15 @@ impl Flats {
             })
             .collect();
         let centres = centres.into_iter().map(|c| c as f32).collect();
-        Self { textures, isovalues, axis, centres, packed: vec![[0; 4]; next] }
+        let (count, solid) = (shapes.len(), if apart { solid } else { Vec::new() });
+        Self { textures, count, solid, isovalues, axis, centres, packed: vec![[0; 4]; next] }
+    }
+
+    /// The number of the texture that a side of the level sets sees of a flat.
+    #[allow(clippy::cast_possible_truncation, reason = "fewer than 2¹⁶ flats")]
+    pub(super) fn number(&self, flat: u32, side: Side) -> u32 {
+        let apart = !self.solid.is_empty() && side == Side::Higher;
+        flat + if apart { self.count as u32 } else { 0 }
     }
 
     /// Whether nothing reflects.
@@ -370,7 +392,43 @@ impl Flats {
                 spread(weight, &sink.weight);
             });
         }
+        self.join();
         self.normalise();
+    }
+
+    /// Texels that no level set tells apart take what either side brings.
+    fn join(&mut self) {
+        let (lower, higher) = self.textures.split_at_mut(self.count);
+        for ((lower, higher), solid) in lower.iter_mut().zip(higher).zip(&self.solid) {
+            let (Some(lower), Some(higher), Some(solid)) = (lower, higher, solid) else { continue };
+            let nc = lower.isovalues();
+            for texel in (0..solid.len()).filter(|&texel| solid[texel] == FREE) {
+                let both = |a: &mut [f32], b: &mut [f32]| {
+                    a.iter_mut().zip(b).for_each(|(a, b)| {
+                        *a += *b;
+                        *b = *a;
+                    })
+                };
+                let light = 3 * texel * nc..3 * (texel + 1) * nc;
+                both(&mut lower.indirect[light.clone()], &mut higher.indirect[light]);
+                let weights = texel * nc..(texel + 1) * nc;
+                both(&mut lower.weight[weights.clone()], &mut higher.weight[weights]);
+            }
+        }
+    }
+
+    /// Radiances of the textures as pictures show them: of each texel and isovalue the side that its centre is on.
+    pub(super) fn export(&self, radiance: &[Option<Vec<f32>>]) -> Vec<Option<FlatTexture>> {
+        let (lower, higher) = radiance.split_at(self.count.min(radiance.len()));
+        let of = |(flat, lower): (usize, &Option<Vec<f32>>)| {
+            let (texture, lower) = (self.textures[flat].as_ref()?, lower.as_ref()?);
+            let apart = higher.get(flat).and_then(Option::as_ref).zip(self.solid.get(flat).and_then(Option::as_ref));
+            Some(texture.export(|texel, isovalue| match apart {
+                Some((higher, solid)) if isovalue < solid[texel] as usize => higher,
+                _ => lower,
+            }))
+        };
+        lower.iter().enumerate().map(of).collect()
     }
 
     /// Irradiance = π Σ w L / Σ w, which is exact for equal L however unevenly lines fell on the texels.
@@ -488,16 +546,16 @@ impl Texture {
         self.radiance = new;
     }
 
-    /// `values` (isovalues fastest) in the order of [`FlatTexture`].
-    pub(super) fn export(&self, values: &[f32]) -> FlatTexture {
+    /// Those of the values (isovalues fastest) that `pick` says, in the order of [`FlatTexture`].
+    fn export<'a>(&self, pick: impl Fn(usize, usize) -> &'a Vec<f32>) -> FlatTexture {
         let [nu, nv, nc] = self.dims;
         let mut out = FlatTexture { axis: self.axis, ..FlatTexture::black(self.dims) };
         for texel in 0..nu * nv {
             for i in 0..nc {
+                let values = pick(texel, i);
                 out.texels[i * nu * nv + texel] = std::array::from_fn(|c| values[(3 * texel + c) * nc + i]);
             }
         }
-        debug_assert_eq!(self.sums(), 3 * out.texels.len());
         out
     }
 }
@@ -507,7 +565,9 @@ impl Texture {
 pub(super) struct Stop {
     /// τ along the line, in slices.
     pub tau: f64,
-    /// The flat, or `None` for a black back.
+    /// The polygon.
+    pub polygon: u32,
+    /// The number of the texture that it shows, or `None` for a black back.
     pub flat: Option<u32>,
     /// Texture coordinates there.
     pub uv: [f32; 2],

@@ -102,7 +102,7 @@ impl Pass<'_> {
         tick: &mut dyn FnMut() -> bool,
     ) -> (Planes, bool) {
         let mut e = self.spare.black(self.geometry.places());
-        let touched = self.touching.now(self.geometry, flats);
+        let touched = self.touching.now(self.geometry, flats, side);
         let split = lines.partition_point(|s| !s.layout.transposed);
         let mut complete = true;
         // Walls receive what one family brought while the next is under way.
@@ -168,7 +168,7 @@ impl Pass<'_> {
     ) -> Vec<Arrivals> {
         let sign = if side == Side::Lower { 1.0 } else { -1.0 };
         let plan = Plan::new(*shear, sign);
-        let ends = Ends::new(self.scene, flats, shear, self.standing);
+        let ends = Ends::new(self.scene, (flats, side), shear, self.standing);
         let walls = arrive::Walls::new(self, &plan, &ends, flats, side, lines, 1.0 / scale);
         let share = 4.0 * std::f64::consts::PI / (2 * lines) as f64 / f64::from(scale);
         let family = Family {

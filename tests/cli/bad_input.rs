@@ -340,7 +340,8 @@ fn scene_flags_are_refused_where_the_input_is_a_bake() {
     assert!(!text(&fs::read(dir.join("m.ply")).unwrap()).contains("radiance"));
 }
 
-/// A sweep of which f32 tells no two places of a cell apart is refused before any light is computed, by trial runs, too.
+/// A sweep of which f32 tells no two places of a cell apart is refused before any light is computed, by trial runs,
+/// too.
 #[test]
 fn a_sweep_that_is_too_thin_is_refused_beforehand() {
     let dir = tempfile::tempdir().unwrap();
