@@ -256,17 +256,25 @@ fn pictures_and_meshes_can_be_interrupted_and_keep_older_ones() {
     }
 }
 
+/// A sweep so thin that it holds one sample of `b.vti` and, between samples, no place that f32 tells apart.
+fn thin(dir: &Path) -> [f64; 2] {
+    let value = load(&dir.join("b.vti"), &SceneOptions::default()).unwrap().volume.samples().get(6 + 17 * (7 + 17 * 9));
+    [value, value + 1e-8]
+}
+
 /// What is said of a bake that is refused.
 fn refused(dir: &Path, more: &[&str]) -> String {
     let mut command = Command::new(PROGRAM);
-    command.current_dir(dir).args(["bake", "b.vti", "-o", "out.vti", "--isovalues", "50", "50.00000001"]);
-    command.args(["--engine", "sweep", "--preset", "preview"]).args(more);
+    let [lo, hi] = thin(dir).map(|c| format!("{c:?}"));
+    command.current_dir(dir).args(["bake", "b.vti", "-o", "out.vti", "--isovalues", &lo, &hi]);
+    // Every other sample, and not that one.
+    command.args(["--engine", "sweep", "--preset", "preview", "--grid", "9,9,9"]).args(more);
     let (output, text) = finish(command.stderr(Stdio::piped()).spawn().unwrap());
     assert_eq!(output.status.code(), Some(2), "{text}");
     text
 }
 
-/// A bake that no resuming can help: no grid point holds anything of its sweep.
+/// A bake that no resuming can help: no grid point holds anything of its sweep, which is seen at its end.
 fn hopeless(dir: &Path, more: &[&str]) -> String {
     let text = refused(dir, more);
     assert!(text.contains("no grid point lies on"), "{text}");
@@ -292,9 +300,14 @@ fn what_can_never_succeed_leaves_no_checkpoint_and_spares_older_ones() {
     assert!(text.contains("unfinished bake of another version"), "{text}");
     fs::remove_file(&checkpoint).unwrap();
     // Its own, of an interrupted run, however much this one adds.
-    let scene = SceneOptions { isovalues: Some(vec![50.0, 50.00000001]), ..SceneOptions::default() };
+    let scene = SceneOptions { isovalues: Some(thin(dir).to_vec()), ..SceneOptions::default() };
     let scene = load(&dir.join("b.vti"), &scene).unwrap().scene;
-    let options = BakeOptions { engine: Some(Engine::Sweep), preset: Some(Preset::Preview), ..BakeOptions::default() };
+    let options = BakeOptions {
+        engine: Some(Engine::Sweep),
+        preset: Some(Preset::Preview),
+        grid: Some("9,9,9".parse().unwrap()),
+        ..BakeOptions::default()
+    };
     let settings = BakeSettings::new(&options, &scene).unwrap();
     let of = |embree: &str| Checkpoint::new(&checkpoint, job(&scene, &settings, embree), Duration::ZERO).unwrap();
     // By another Embree, which gives other bits.
