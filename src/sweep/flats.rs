@@ -197,8 +197,11 @@ impl Flats {
         let centres = axis.centres(isovalues);
         let shapes: Vec<_> = shapes(scene, across).collect();
         let solid = |(flat, dims): &(Flat, _)| solid(scene, flat, *dims, &axis, isovalues);
+        // Where samples are missing rays come to walls on the side that they did not leave.
         let solid: Vec<_> = match sides {
-            [_, _] if !capped(scene) => shapes.iter().map(|shape| shape.as_ref().map(solid)).collect(),
+            [_, _] if !capped(scene) && !scene.field.has_gaps() => {
+                shapes.iter().map(|shape| shape.as_ref().map(solid)).collect()
+            }
             _ => Vec::new(),
         };
         let apart = solid.iter().flatten().flatten().any(|n| *n != FREE);

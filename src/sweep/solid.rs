@@ -7,7 +7,7 @@ use crate::scene::Scene;
 use glam::DVec3;
 use rayon::prelude::*;
 
-/// Off Ω, and beside samples that are not finite, there is one light for all.
+/// Off Ω there is one light for all.
 pub(super) const FREE: u32 = u32::MAX;
 
 /// How many of `n` isovalues along `axis` lie in the solid at the centre of each texel of a flat, or [`FREE`].
@@ -18,8 +18,46 @@ pub(super) fn solid(scene: &Scene, flat: &Flat, [nu, nv]: [usize; 2], axis: &Iso
         let uv = [((texel % nu) as f64 + 0.5) / nu as f64, ((texel / nu) as f64 + 0.5) / nv as f64];
         let p = scene.lattice().to_index(flat.at(uv));
         let within = p.cmpge(DVec3::splat(-1e-6)).all() && p.cmple(far + 1e-6).all();
-        let h = if within { scene.field.value(p) as f32 } else { f32::NAN };
-        if h.is_nan() { FREE } else { below(axis, n, h) as u32 }
+        if within { below(axis, n, scene.field.value(p) as f32) as u32 } else { FREE }
     };
     (0..nu * nv).into_par_iter().with_min_len(256).map(of).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::{Field, Sweep};
+    use crate::flattened::Side;
+    use crate::scene::{Boundary, Surface, cornell_box};
+    use crate::sweep::flats::Flats;
+    use crate::volume::{Lattice, Samples, Volume};
+
+    /// Where level sets end on walls and both sides are swept; not off Ω, nor if rays come through missing samples to
+    /// walls on the side that they did not leave.
+    #[test]
+    fn sides_are_kept_apart_in_faces_of_whole_volumes() {
+        let flats = |sides: &[Side], margin: f64, gap: bool| {
+            let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::splat(0.125)).unwrap();
+            let height = |o: usize| if gap && o == 364 { f32::NAN } else { lattice.ijk(o)[2] as f32 };
+            let samples = Samples::F32((0..lattice.len()).map(height).collect());
+            let volume = Volume::new("planes", lattice.clone(), samples).unwrap();
+            let field = Field::new(&volume, Sweep::new(0.0, 8.0).unwrap()).unwrap();
+            let walls = cornell_box(&lattice, margin).unwrap();
+            let scene = Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap();
+            let left = scene.polygons().iter().position(|p| p.name == "x_min").unwrap();
+            (Flats::new(&scene, sides, 8, 8), left)
+        };
+        let both = [Side::Lower, Side::Higher];
+        let (apart, left) = flats(&both, 0.0, false);
+        assert_eq!((apart.textures.len(), apart.number(3, Side::Higher)), (2 * apart.count, 3 + apart.count as u32));
+        // Eight rows of texels, each a step higher.
+        let mut solid = apart.solid[left].clone().unwrap();
+        solid.sort_unstable();
+        solid.dedup();
+        assert!(solid.len() == 8 && solid.iter().all(|n| *n <= 8), "{solid:?}");
+        for (sides, margin, gap) in [(&both[..1], 0.0, false), (&both, 0.1, false), (&both, 0.0, true)] {
+            let (one, _) = flats(sides, margin, gap);
+            assert_eq!((one.textures.len(), one.number(3, Side::Higher)), (one.count, 3), "{sides:?} {margin} {gap}");
+        }
+    }
 }
