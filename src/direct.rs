@@ -64,7 +64,7 @@ pub fn open_irradiance(scene: &Scene, p: DVec3, n: DVec3) -> DVec3 {
 /// No budget is cut below this.
 const LEAST_RAYS: u32 = 8;
 /// Fewer rays that agree do not speak for the rest: ending there takes slivers of light away and brings none back.
-const LEAST_UNANIMOUS: u32 = 64;
+pub(crate) const LEAST_UNANIMOUS: u32 = 64;
 
 /// Shadow rays for a receiver that may get the irradiance `open` (luminance), of at most `shadow_rays`: all from half
 /// the scene's E₀ on, and down to an eighth where there is less to get, so that light is equally certain everywhere.

@@ -1,7 +1,7 @@
 //! Final gather: one bounce of rays into light that is known, as a radiance cache holds it, more where surfaces of
 //! several fields cross, within capped solids, and where none is known. \[Jensen01; Christensen99\]
 
-use crate::direct::{Estimate, Receiver, direct_once, luminance};
+use crate::direct::{Estimate, LEAST_UNANIMOUS, Receiver, direct_once, luminance};
 use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target};
 use crate::landing::{Landing, MOST_LANDINGS, landing};
 use crate::radiance_cache::RadianceCache;
@@ -71,8 +71,6 @@ const CORNERS: usize = 4;
 const SHARE: u64 = 8;
 /// Fewest rays that show a receiver to be sealed off from all that is far.
 const PILOT: u32 = 16;
-/// Fewest dark rays that speak for the rest: ending there takes slivers of light away and brings none back.
-const LEAST_UNANIMOUS: u32 = 64;
 /// A receiver whose first rays all end on level sets within this many cells is in a cavity, which may have closed or
 /// opened between the isovalues that its light is interpolated from: nothing nearer than they are is trusted there.
 pub const CAVITY: f32 = 16.0;

@@ -49,12 +49,10 @@ mod state;
 mod totals;
 
 use crate::checkpoint::Stage;
-use crate::direct::luminance;
 use crate::error::{Error, Result};
 use crate::flat::FlatTexture;
 use crate::flattened::Side;
 use crate::isa::Isa;
-use crate::rng::{self, Sobol};
 use crate::scene::{Boundary, Scene};
 pub(crate) use arrive::reports;
 use flats::Flats;
@@ -62,6 +60,7 @@ pub(crate) use flats::texels;
 use glam::DVec3;
 use grid::Geometry;
 use lit_rows::LitRows;
+use open_share::open_over_sweep;
 use planes::Spare;
 use points::Points;
 use rayon::prelude::*;
@@ -336,31 +335,7 @@ pub(crate) fn swept_sides(scene: &Scene) -> Vec<Side> {
 /// rays would show lit.
 pub fn leaves_walls_dark(scene: &Scene) -> bool {
     let shown = scene.boundary == Boundary::Open && scene.polygons().iter().any(|p| p.albedo != DVec3::ZERO);
-    matches!(swept_sides(scene)[..], [side] if shown && light_on(scene, side) < 0.5)
-}
-
-/// Points of a luminaire that tell where it stands.
-const STANDING: u32 = 1 << 10;
-
-/// The share of what luminaires emit over all isovalues that leaves them on one side of the level sets; 1 if there are
-/// none.
-fn light_on(scene: &Scene, side: Side) -> f64 {
-    let (lattice, far) = (scene.lattice(), scene.lattice().far());
-    let set = Sobol::set(0, rng::Stage::Sweep, 0);
-    let (mut all, mut own) = (0.0, 0.0);
-    for &number in scene.luminaires() {
-        let light = &scene.polygons()[number as usize];
-        let flux = light.area() * luminance(light.emission) / f64::from(STANDING);
-        for i in 0..STANDING {
-            let y = lattice.to_index(light.sample(set.point2(i, 0)));
-            let within = y.cmpge(DVec3::ZERO).all() && y.cmple(far).all();
-            // Outside of Ω, and in gaps, nothing is higher.
-            let higher = if within { scene.field.value(y).clamp(0.0, 1.0).max(0.0) } else { 0.0 };
-            all += flux;
-            own += flux * if side == Side::Lower { 1.0 - higher } else { higher };
-        }
-    }
-    if all > 0.0 { own / all } else { 1.0 }
+    matches!(swept_sides(scene)[..], [side] if shown && open_over_sweep(scene, side) < 0.5)
 }
 
 /// What the replicates of one sweep share.

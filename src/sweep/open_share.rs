@@ -1,14 +1,18 @@
 //! The share of a luminaire outside the matter. A luminaire may stand in the volume; then part of it lies within the
 //! solid of an isovalue, and how much its points say of that is the same error at all receivers.
 
+use crate::direct::luminance;
 use crate::field::Field;
 use crate::flattened::Side;
 use crate::polygon::Polygon;
-use crate::rng::Sobol;
+use crate::rng::{Sobol, Stage};
+use crate::scene::Scene;
 use glam::DVec3;
 
 /// Points that tell the share itself: their error is small beside that of any luminaire points.
 const POINTS: u32 = 1 << 14;
+/// Points that tell where a luminaire stands.
+const ROUGHLY: u32 = 1 << 10;
 
 /// Of a luminaire: its open share over what its points say it is.
 pub(super) struct OpenShare {
@@ -19,20 +23,15 @@ pub(super) struct OpenShare {
 
 impl OpenShare {
     /// `points`: those that light, of all replicates; `set`: where others come from.
-    #[allow(clippy::cast_possible_truncation, reason = "h is f32")]
     pub(super) fn new(field: &Field, light: &Polygon, points: &[DVec3], set: &Sobol) -> Self {
-        let far = field.lattice().far();
-        let read = |points: &mut dyn ExactSizeIterator<Item = DVec3>| {
-            let count = points.len();
-            let local = points.map(|y| field.lattice().to_index(y));
-            let inside = local.filter(|y| y.cmpge(DVec3::ZERO).all() && y.cmple(far).all());
-            let mut h: Vec<f32> = inside.map(|y| field.value(y) as f32).filter(|h| !h.is_nan()).collect();
+        let read = |mut h: Vec<f32>| {
             h.sort_unstable_by(f32::total_cmp);
-            (count, h)
+            h
         };
+        let many = (0..POINTS).map(|i| light.sample(set.point2(i, 0)));
         Self {
-            many: read(&mut (0..POINTS as usize).map(|i| light.sample(set.point2(i as u32, 0)))),
-            few: read(&mut points.iter().copied()),
+            many: (POINTS as usize, read(heights(field, many).collect())),
+            few: (points.len(), read(heights(field, points.iter().copied()).collect())),
         }
     }
 
@@ -52,11 +51,34 @@ impl OpenShare {
     }
 }
 
+/// h at those of the points that lie within Ω, where it is known.
+#[allow(clippy::cast_possible_truncation, reason = "h is f32")]
+fn heights(field: &Field, points: impl Iterator<Item = DVec3>) -> impl Iterator<Item = f32> {
+    let (lattice, far) = (field.lattice(), field.lattice().far());
+    let inside = points.map(|y| lattice.to_index(y)).filter(move |y| y.cmpge(DVec3::ZERO).all() && y.cmple(far).all());
+    inside.map(|y| field.value(y) as f32).filter(|h| !h.is_nan())
+}
+
+/// The share of what a scene's luminaires emit over the whole sweep that is open on one side; 1 if there are none.
+pub(super) fn open_over_sweep(scene: &Scene, side: Side) -> f64 {
+    let set = Sobol::set(0, Stage::Sweep, 0);
+    let (mut all, mut closed) = (0.0, 0.0);
+    for &number in scene.luminaires() {
+        let light = &scene.polygons()[number as usize];
+        let flux = light.area() * luminance(light.emission);
+        // At h a point is closed below c = h on the lower side, above it on the higher one.
+        let share = |h: f32| f64::from(if side == Side::Lower { h.clamp(0.0, 1.0) } else { 1.0 - h.clamp(0.0, 1.0) });
+        let points = (0..ROUGHLY).map(|i| light.sample(set.point2(i, 0)));
+        closed += flux * heights(&scene.field, points).map(share).sum::<f64>() / f64::from(ROUGHLY);
+        all += flux;
+    }
+    if all > 0.0 { 1.0 - closed / all } else { 1.0 }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::field::Sweep;
-    use crate::rng::Stage;
     use crate::volume::{Lattice, Samples, Volume};
 
     /// h = x on the unit cube, a luminaire from x = 0.5 to 1.5 across its face: at isovalue c the part c < x < 1 lies

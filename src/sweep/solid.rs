@@ -4,7 +4,6 @@ use super::flats::below;
 use crate::flat::Flat;
 use crate::isovalue_axis::IsovalueAxis;
 use crate::scene::Scene;
-use glam::DVec3;
 use rayon::prelude::*;
 
 /// Off Ω there is one light for all.
@@ -13,12 +12,10 @@ pub(super) const FREE: u32 = u32::MAX;
 /// How many of `n` isovalues along `axis` lie in the solid at the centre of each texel of a flat, or [`FREE`].
 #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32 and few")]
 pub(super) fn solid(scene: &Scene, flat: &Flat, [nu, nv]: [usize; 2], axis: &IsovalueAxis, n: usize) -> Vec<u32> {
-    let far = scene.lattice().far();
     let of = |texel: usize| {
         let uv = [((texel % nu) as f64 + 0.5) / nu as f64, ((texel / nu) as f64 + 0.5) / nv as f64];
         let p = scene.lattice().to_index(flat.at(uv));
-        let within = p.cmpge(DVec3::splat(-1e-6)).all() && p.cmple(far + 1e-6).all();
-        if within { below(axis, n, scene.field.value(p) as f32) as u32 } else { FREE }
+        if scene.lattice().holds(p) { below(axis, n, scene.field.value(p) as f32) as u32 } else { FREE }
     };
     (0..nu * nv).into_par_iter().with_min_len(256).map(of).collect()
 }
@@ -31,6 +28,7 @@ mod tests {
     use crate::scene::{Boundary, Surface, cornell_box};
     use crate::sweep::flats::Flats;
     use crate::volume::{Lattice, Samples, Volume};
+    use glam::DVec3;
 
     /// Where level sets end on walls and both sides are swept; not off Ω, nor if rays come through missing samples to
     /// walls on the side that they did not leave.
