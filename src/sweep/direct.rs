@@ -174,7 +174,7 @@ impl Staircases {
     }
 
     /// Light of each texel, of the sides that count, times the factors of the lower and the higher one.
-    fn sums(self, lower: bool, higher: bool, factors: &[Vec<f64>; 2]) -> Vec<f64> {
+    fn sums(&self, lower: bool, higher: bool, factors: &[Vec<f64>; 2]) -> Vec<f64> {
         let n = self.from.len() - 1;
         let mut out = vec![0.0; n];
         if lower {
@@ -226,16 +226,21 @@ fn walls(
     let h = |p: DVec3| {
         if clearance.is_none() || geometry.reaches(p) { scene.field.value(p) as f32 } else { f32::NEG_INFINITY }
     };
-    for (texture_number, texture) in flats.textures.iter_mut().enumerate() {
+    let (textures, others) = flats.textures.split_at_mut(flats.count);
+    for (id, texture) in textures.iter_mut().enumerate() {
         let Some(texture) = texture else { continue };
-        let (id, within) = (texture_number % flats.count, texture_number >= flats.count);
+        // What the higher side sees, if the sides are kept apart.
+        let other = others.get_mut(id).and_then(Option::as_mut);
+        let mut others: Vec<_> = other.map_or(Vec::new(), |t| t.direct.chunks_mut(3 * nc).map(Some).collect());
+        others.resize_with(texture.direct.len() / (3 * nc), || None);
         let solid = flats.solid.get(id).and_then(Option::as_ref);
         let flat = flat::flat(scene, id).expect("textured flats exist");
         let receiver = (id < caps).then(|| u32::try_from(id).expect("fewer than 2¹⁶ polygons"));
         let corners: Vec<DVec3> = [[0., 0.], [1., 0.], [0., 1.], [1., 1.]].map(|uv| flat.at(uv)).to_vec();
         let blockers = Blockers::new(scene, number, &corners);
         let [nu, nv, _] = texture.dims;
-        texture.direct.par_chunks_mut(3 * nc).enumerate().with_max_len(32).for_each(|(texel, out)| {
+        let texels = texture.direct.par_chunks_mut(3 * nc).zip(others).enumerate().with_max_len(32);
+        texels.for_each(|(texel, (out, other))| {
             let (i, j) = (texel % nu, texel / nu);
             let place = |a: f64, b: f64| flat.at([(i as f64 + a) / nu as f64, (j as f64 + b) / nv as f64]);
             let e = unoccluded(light, place(0.5, 0.5), flat.normal);
@@ -287,19 +292,21 @@ fn walls(
                     lit.add(g, open, below(segments.least[lane]).min(open));
                 }
             }
-            let [lower, higher] = match solid {
-                Some(solid) if solid[texel] != FREE => [!within, within],
-                _ => [lower, higher],
-            };
             let even = [1.0; 2].map(|x| vec![x; nc]);
-            let lit = lit.sums(lower, higher, if id < caps { &corrections } else { &even });
-            let all = all.sums(lower, higher, &even);
             let rgb = (light.emission * e).to_array();
-            for c in 0..3 {
-                for t in (0..nc).filter(|&t| all[t] > 0.0) {
-                    out[c * nc + t] += (rgb[c] * lit[t].max(0.0) / all[t]) as f32;
+            let add = |out: &mut [f32], [lower, higher]: [bool; 2]| {
+                let lit = lit.sums(lower, higher, if id < caps { &corrections } else { &even });
+                let all = all.sums(lower, higher, &even);
+                for c in 0..3 {
+                    for t in (0..nc).filter(|&t| all[t] > 0.0) {
+                        out[c * nc + t] += (rgb[c] * lit[t].max(0.0) / all[t]) as f32;
+                    }
                 }
-            }
+            };
+            let apart = solid.is_some_and(|solid| solid[texel] != FREE);
+            let [own, others] = if apart { [[true, false], [false, true]] } else { [[lower, higher]; 2] };
+            add(out, own);
+            other.into_iter().for_each(|out| add(out, others));
         });
     }
 }

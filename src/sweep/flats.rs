@@ -135,7 +135,7 @@ pub(super) struct Flats {
     /// By flat number; where both sides of level sets end on flats what the lower one shows, then what the higher one
     /// does: light does not pass from side to side within a texel.
     pub textures: Vec<Option<Texture>>,
-    /// Flats.
+    /// How many flats there are.
     pub count: usize,
     /// Of each flat as [`solid`] has it, if the sides are kept apart.
     pub solid: Vec<Option<Vec<u32>>>,

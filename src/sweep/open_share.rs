@@ -24,15 +24,13 @@ pub(super) struct OpenShare {
 impl OpenShare {
     /// `points`: those that light, of all replicates; `set`: where others come from.
     pub(super) fn new(field: &Field, light: &Polygon, points: &[DVec3], set: &Sobol) -> Self {
-        let read = |mut h: Vec<f32>| {
+        let sorted = |points: &mut dyn Iterator<Item = DVec3>| {
+            let mut h: Vec<f32> = heights(field, points).collect();
             h.sort_unstable_by(f32::total_cmp);
             h
         };
-        let many = (0..POINTS).map(|i| light.sample(set.point2(i, 0)));
-        Self {
-            many: (POINTS as usize, read(heights(field, many).collect())),
-            few: (points.len(), read(heights(field, points.iter().copied()).collect())),
-        }
+        let mut many = (0..POINTS).map(|i| light.sample(set.point2(i, 0)));
+        Self { many: (POINTS as usize, sorted(&mut many)), few: (points.len(), sorted(&mut points.iter().copied())) }
     }
 
     /// What light at isovalue `c` is multiplied by; 1 where no point is open.
