@@ -18,7 +18,7 @@ use crate::checkpoint::{self, Checkpoint};
 use crate::embree::Device;
 use crate::error::{Error, Result};
 use crate::field::Field;
-use crate::flat::FlatTexture;
+use crate::flat::FlatLight;
 use crate::flattened::Side;
 use crate::illumination_grid::{GridSize, IlluminationGrid};
 use crate::isa::Isa;
@@ -122,8 +122,9 @@ pub struct Bake {
     pub lattice: Lattice,
     /// One grid per stored side, the outside first.
     pub sides: Vec<(Side, IlluminationGrid)>,
-    /// Radiance of polygons and caps over (u, v, isovalue), by flat number.
-    pub flats: Vec<Option<FlatTexture>>,
+    /// Radiance of polygons and caps over (u, v, isovalue), by flat number; seen from within solids where that is
+    /// stored and differs.
+    pub flats: Vec<Option<FlatLight>>,
     /// Display exposure: rgb = radiance × exposure, then clamped and sRGB-encoded.
     pub exposure: f64,
     /// Counts and seconds. `load`, `export` and `total` are for the caller to fill.
@@ -135,7 +136,7 @@ pub struct Bake {
 struct Lit {
     /// The stored sides of each field.
     fields: Vec<Vec<(Side, IlluminationGrid)>>,
-    flats: Vec<Option<FlatTexture>>,
+    flats: Vec<Option<FlatLight>>,
     seconds: Seconds,
     processor_seconds: Seconds,
     bands: usize,

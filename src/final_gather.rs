@@ -10,7 +10,7 @@ use crate::direct::{Receiver, direct_irradiance};
 use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
 use crate::flat;
-use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target, split_face};
+use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, SurfacePoint, Target, split_face};
 use crate::gather::{KnownLight, gathered_irradiance};
 use crate::landing::{Landing, landing};
 use crate::rng::Stage;
@@ -187,17 +187,21 @@ pub fn seen(baked: &BakedVolume, ray: &FlattenedRay, hit: FlattenedHit) -> Optio
             if !scene.sees_front(ray, id) {
                 return Some(DVec3::ZERO);
             }
-            let light = wall(baked, id as usize, p, ray.isovalue).unwrap_or_default();
-            Some(polygon.emission + light.max(DVec3::ZERO))
+            match wall(baked, (id, scene.solid_holds(ray, hit.t)), p, ray.isovalue) {
+                Some(light) => Some(polygon.emission + light.max(DVec3::ZERO)),
+                None => Some(polygon.emission).filter(|emission| *emission != DVec3::ZERO),
+            }
         }
     }
 }
 
-/// What the texture of polygon `id` holds at local position `p`, if it has one.
-fn wall(baked: &BakedVolume, id: usize, p: DVec3, isovalue: f32) -> Option<DVec3> {
-    let texture = baked.flats.get(id)?.as_ref()?;
-    let [u, v] = baked.scene.polygons()[id].texture(baked.lattice().to_world(p));
-    Some(texture.lookup([u, v, f64::from(isovalue)]))
+/// What polygon `id` reflects at local position `p` to what is within solids, or not; `None` if that is not stored.
+fn wall(baked: &BakedVolume, (id, within): (u32, bool), p: DVec3, isovalue: f32) -> Option<DVec3> {
+    // Those without a texture reflect nothing.
+    let Some(light) = &baked.flats[id as usize] else { return Some(DVec3::ZERO) };
+    let stored = !within || light.within.is_some() || baked.scene.gathers_within();
+    let [u, v] = baked.scene.polygons()[id as usize].texture(baked.lattice().to_world(p));
+    stored.then(|| light.seen(within).lookup([u, v, f64::from(isovalue)]))
 }
 
 /// What the texture of the cap on a face of Ω holds at local position `p`, if it has one: each bake holds its own.
@@ -205,13 +209,13 @@ fn cap(baked: &BakedVolume, face: u8, p: DVec3, isovalue: f32) -> Option<DVec3> 
     let scene = &baked.scene;
     let (companion, own) = split_face(face);
     let holder = companion.map_or(baked, |n| &baked.companions[usize::from(n)]);
-    let texture = holder.flats.get(scene.polygons().len() + usize::from(own))?.as_ref()?;
+    let light = holder.flats.get(scene.polygons().len() + usize::from(own))?.as_ref()?;
     let [u, v] = flat::face_texture(scene, face, p);
-    Some(texture.lookup([u, v, f64::from(isovalue)]))
+    Some(light.outside.lookup([u, v, f64::from(isovalue)]))
 }
 
-/// A bake where gather rays land. Rays go on where it holds nothing: from sides and cells that are not stored, and from
-/// walls and caps within solids, whose light there is not.
+/// A bake where gather rays land. Rays go on where it holds nothing: from sides and cells that are not stored, from
+/// caps within solids, and from walls there unless these hold light of their own.
 struct Landings<'a> {
     baked: &'a BakedVolume,
     least_distance: f32,
@@ -222,22 +226,17 @@ impl KnownLight for Landings<'_> {
         self.least_distance
     }
 
-    fn radiance(
-        &self,
-        _: &Scene,
-        (target, within): (Target, bool),
-        position: DVec3,
-        isovalue: f32,
-        _: &mut u64,
-    ) -> Option<DVec3> {
+    fn radiance(&self, _: &Scene, landed: SurfacePoint, _: &mut u64) -> Option<DVec3> {
+        let SurfacePoint { target, within, position, isovalue } = landed;
         match target {
             Target::Surface(side) => stored(self.baked, None, side, position),
             Target::Companion(n, side) => stored(self.baked, Some(n), side, position),
             Target::Cap(_, Side::Higher) => None,
             Target::Cap(face, Side::Lower) => Some(cap(self.baked, face, position, isovalue).unwrap_or_default()),
-            Target::Polygon(_) if within => None,
-            // Those without a texture reflect nothing.
-            Target::Polygon(id) => Some(wall(self.baked, id as usize, position, isovalue).unwrap_or_default()),
+            Target::Polygon(id) => {
+                let one_for_all = self.baked.flats[id as usize].as_ref().is_some_and(|light| light.within.is_none());
+                if within && one_for_all { None } else { wall(self.baked, (id, within), position, isovalue) }
+            }
         }
     }
 }
@@ -250,12 +249,15 @@ mod tests {
     use crate::direct::open_irradiance;
     use crate::embree::{Device, GraphTracer};
     use crate::field::{Field, Sweep};
+    use crate::flat::{FlatLight, FlatTexture};
     use crate::polygon::Polygon;
     use crate::progress::Progress;
-    use crate::scene::{Boundary, Surface};
+    use crate::rng::Rng;
+    use crate::scene::{Boundary, Surface, cornell_box};
     use crate::split::Split;
     use crate::stats::Moments;
     use crate::volume::{Lattice, Samples, Volume};
+    use glam::Vec3;
     use std::f64::consts::TAU;
 
     const ALBEDO: f64 = 0.5;
@@ -280,6 +282,7 @@ mod tests {
             photons: Some(100),
             shadow_rays: Some(1),
             gather_rays: Some(1),
+            wall_resolution: Some(4),
             ..BakeOptions::default()
         };
         let settings = BakeSettings::new(&options, &scene).unwrap();
@@ -348,6 +351,57 @@ mod tests {
         assert!(off.mean().abs() < 1e-3 && off.variance() < 1e-4, "{} {}", off.mean(), off.variance());
         let lit = found(&split, [64, 0], (0.7, 300), |_, _| 0.25);
         assert!(lit.mean() > 0.01, "{}", lit.mean());
+    }
+
+    /// A room half full of a solid, seen from far in front of it: its walls show each side's own light, whatever f32
+    /// makes of where a ray lands; within the solid none, or that of all, if no other is stored.
+    #[test]
+    fn walls_show_the_side_that_is_seen() {
+        let lattice = Lattice::aligned([17; 3], DVec3::splat(0.3), DVec3::splat(1.0 / 16.0)).unwrap();
+        let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[2] as f32).collect();
+        let volume = Volume::new("planes", lattice.clone(), Samples::F32(samples)).unwrap();
+        let room = |both_sides: bool, outside: Side| {
+            let field = Field::new(&volume, Sweep::new(0.0, 16.0).unwrap()).unwrap();
+            let walls = cornell_box(&lattice, 0.0).unwrap();
+            Scene::new(field, Surface { both_sides, outside, ..Surface::default() }, Boundary::Open, walls).unwrap()
+        };
+        let device = Device::new(1).unwrap();
+        let cases = [(false, false), (true, false), (false, true), (true, true)];
+        for ((both, own), outside) in cases.into_iter().flat_map(|case| [(case, Side::Lower), (case, Side::Higher)]) {
+            let mut baked = baked(room(both, outside), 0.0, None);
+            let shows = |light: f32| {
+                let black = FlatTexture::black([4, 4, 4]);
+                FlatTexture { texels: vec![[light; 3]; black.texels.len()], ..black }
+            };
+            let light = FlatLight { outside: shows(1.0), within: own.then(|| shows(2.0)) };
+            baked.flats.iter_mut().flatten().for_each(|flat| *flat = light.clone());
+            let scene = &baked.scene;
+            let tracer = GraphTracer::new(&device, scene).unwrap();
+            let (eye, mut walls) = (DVec3::new(0.61, -9.7, 0.77), [0; 2]);
+            for i in 0..4000 {
+                let mut rng = Rng::stream(1, Stage::Test, i);
+                let target = lattice.to_world(lattice.far() * DVec3::new(rng.unit(), 1.0, rng.unit()));
+                let (at, c) = (lattice.to_index(eye).as_vec3(), 0.25 + 0.5 * rng.unit() as f32);
+                let ray = scene.ray(at, target - eye, c, Departure::Free);
+                let Some(hit) = tracer.intersect(&ray) else { continue };
+                let Target::Polygon(id) = hit.target else { continue };
+                let height = ray.at(hit.t).z / 16.0 - f64::from(c);
+                if height.abs() < 1e-4 || baked.flats[id as usize].is_none() {
+                    continue;
+                }
+                let within = (height > 0.0) == (outside == Side::Lower);
+                let expected = match (within, own, both) {
+                    (true, true, _) => Some(Vec3::splat(2.0)),
+                    (true, false, false) => None,
+                    _ => Some(Vec3::ONE),
+                };
+                walls[usize::from(within)] += 1;
+                let emission = scene.polygons()[id as usize].emission;
+                let shown = seen(&baked, &ray, hit).map(|light| (light - emission).as_vec3());
+                assert_eq!(shown, expected, "{both} {own} {outside:?} {height}");
+            }
+            assert!(walls[0] > 500 && walls[1] > 500, "{walls:?}");
+        }
     }
 
     #[test]

@@ -310,6 +310,29 @@ impl FlatTexture {
     }
 }
 
+/// What a flat reflects, to whom it shows.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FlatLight {
+    /// To all that is not within solids.
+    pub outside: FlatTexture,
+    /// To what is within the solids that stand on it, if that is known: their own light in all texels that they cover,
+    /// whatever else lies in these.
+    pub within: Option<FlatTexture>,
+}
+
+impl FlatLight {
+    /// The texture that is seen from within solids, or not; the one for all if there is no other.
+    #[inline]
+    pub fn seen(&self, within: bool) -> &FlatTexture {
+        self.within.as_ref().filter(|_| within).unwrap_or(&self.outside)
+    }
+
+    /// Its one or two textures, the outside's first.
+    pub fn textures(&self) -> impl Iterator<Item = &FlatTexture> {
+        std::iter::once(&self.outside).chain(&self.within)
+    }
+}
+
 /// Texels of the textures of all flats of a scene, at most: as [`Flat::resolution`] sizes them.
 pub fn texels(scene: &Scene, across: usize, isovalues: usize) -> usize {
     let flats = (0..count(scene)).filter_map(|n| flat(scene, n));

@@ -162,6 +162,19 @@ pub struct FlattenedHit {
     pub target: Target,
 }
 
+/// A place on what stands in a hyperplane, and whence it is seen.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SurfacePoint {
+    /// What stands there.
+    pub target: Target,
+    /// Whether it is seen from within a solid, where flats have light of their own.
+    pub within: bool,
+    /// Local frame.
+    pub position: DVec3,
+    /// The hyperplane, in units of the sweep.
+    pub isovalue: f32,
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

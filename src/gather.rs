@@ -2,7 +2,7 @@
 //! several fields cross, within capped solids, and where none is known. \[Jensen01; Christensen99\]
 
 use crate::direct::{Estimate, LEAST_UNANIMOUS, Receiver, direct_once, luminance};
-use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target};
+use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, SurfacePoint, Target};
 use crate::landing::{Landing, MOST_LANDINGS, landing};
 use crate::radiance_cache::RadianceCache;
 use crate::rng::{Rng, Sobol, Stage};
@@ -22,30 +22,15 @@ pub trait KnownLight: Sync {
         0.0
     }
 
-    /// Outgoing radiance where a ray of hyperplane `isovalue` landed, local frame, without what luminaires emit; `None`
-    /// if that is not known. `within`: whether the ray comes from within a solid, where flats have light of their own.
-    /// Counts up `misses` where there should be some but is not.
-    fn radiance(
-        &self,
-        scene: &Scene,
-        landed: (Target, bool),
-        position: DVec3,
-        isovalue: f32,
-        misses: &mut u64,
-    ) -> Option<DVec3>;
+    /// Outgoing radiance where a ray landed, without what luminaires emit; `None` if that is not known. Counts up
+    /// `misses` where there should be some but is not.
+    fn radiance(&self, scene: &Scene, landed: SurfacePoint, misses: &mut u64) -> Option<DVec3>;
 }
 
 impl KnownLight for RadianceCache {
     #[inline]
-    fn radiance(
-        &self,
-        scene: &Scene,
-        landed: (Target, bool),
-        position: DVec3,
-        isovalue: f32,
-        misses: &mut u64,
-    ) -> Option<DVec3> {
-        Some(self.lookup(scene, landed, position, isovalue, misses))
+    fn radiance(&self, scene: &Scene, landed: SurfacePoint, misses: &mut u64) -> Option<DVec3> {
+        Some(self.lookup(scene, landed, misses))
     }
 }
 
@@ -192,8 +177,9 @@ fn found(
     {
         return Some(DVec3::ZERO);
     }
-    let target = (hit.target, scene.leaves_within(ray.departure));
-    light.radiance(scene, target, ray.at(hit.t), ray.isovalue, misses)
+    let within = scene.leaves_within(ray.departure);
+    let landed = SurfacePoint { target: hit.target, within, position: ray.at(hit.t), isovalue: ray.isovalue };
+    light.radiance(scene, landed, misses)
 }
 
 /// What gathers in corners know.
@@ -354,7 +340,8 @@ mod tests {
         fn least_distance(&self) -> f32 {
             self.0
         }
-        fn radiance(&self, _: &Scene, _: (Target, bool), p: DVec3, _: f32, _: &mut u64) -> Option<DVec3> {
+        fn radiance(&self, _: &Scene, landed: SurfacePoint, _: &mut u64) -> Option<DVec3> {
+            let p = landed.position;
             Some(if (p.x - 4.0).abs() < 0.5 && (p.y - 4.0).abs() < 0.5 { DVec3::ONE } else { DVec3::ZERO })
         }
     }

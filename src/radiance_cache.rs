@@ -10,8 +10,8 @@ use crate::brdf::reflected;
 use crate::checkpoint;
 use crate::direct::{Receiver, direct_irradiance};
 use crate::field::Field;
-use crate::flat::{self, FlatTexture};
-use crate::flattened::{Departure, Side, Target};
+use crate::flat::{self, FlatLight};
+use crate::flattened::{Departure, Side, SurfacePoint, Target};
 use crate::isovalue_axis::IsovalueAxis;
 use crate::mask::{Mask, masks, stand_ins};
 use crate::nearest::Neighbours;
@@ -128,11 +128,9 @@ pub struct RadianceCache {
     /// nor its surroundings hold a surface. The albedo is that of the hit: isovalues may differ much from node to node.
     nodes: Vec<Option<FieldNodes>>,
     /// What gather rays find: photons under the narrowest kernel, since many rays average their noise.
-    flats: Vec<Option<FlatTexture>>,
-    /// What those from within solids find, if not the same.
-    within: Vec<Option<FlatTexture>>,
+    flats: Vec<Option<FlatLight>>,
     /// What pictures show, if not the same: photons smoothed until their noise is not seen.
-    shown: Option<Vec<Option<FlatTexture>>>,
+    shown: Option<Vec<Option<FlatLight>>>,
     /// Rays traced to fill it.
     pub rays: u64,
 }
@@ -158,11 +156,11 @@ impl RadianceCache {
         let filled = (0..flat::count(scene)).into_par_iter().map(|n| {
             let photons = pools.of(n).flat_map(|m| photons_of.flat(m));
             let filled = fill_flat(scene, tracer, n, photons, pools.area(scene, n), settings, &rays);
-            (filled.gathered, (filled.within, filled.shown))
+            (filled.gathered, filled.shown)
         });
-        let (flats, (within, shown)) = filled.unzip();
+        let (flats, shown) = filled.unzip();
         let nodes = (0..scene.fields()).map(|_| None).collect();
-        let mut cache = Self { nodes, flats, within, shown: Some(shown), rays: rays.into_inner() };
+        let mut cache = Self { nodes, flats, shown: Some(shown), rays: rays.into_inner() };
         if with_nodes {
             cache.fill(scene, tracer, photons, estimate, settings, saved, tick);
         }
@@ -239,25 +237,17 @@ impl RadianceCache {
 
     /// A cache of light known already: per side (lower, higher) irradiance / π at those nodes of the scene's lattice,
     /// of `dims` nodes along x, y and z, that are `stored` (or it panics), NaN where unknown, and the flats' radiance.
-    pub fn from_parts(nodes: Nodes, stored: NodeSet, dims: [usize; 3], flats: Vec<Option<FlatTexture>>) -> Self {
+    pub fn from_parts(nodes: Nodes, stored: NodeSet, dims: [usize; 3], flats: Vec<Option<FlatLight>>) -> Self {
         let known = nodes.iter().any(Option::is_some);
         let sides = nodes.map(|side| Some(sharpen(&stored, &side?, &stored, dims, SHARPENING)));
         let nodes = known.then(|| FieldNodes { stored, filled: Nodes::default(), sides });
-        let within = vec![None; flats.len()];
-        Self { nodes: vec![nodes], flats, within, shown: None, rays: 0 }
+        Self { nodes: vec![nodes], flats, shown: None, rays: 0 }
     }
 
-    /// Outgoing radiance where a ray of hyperplane `isovalue` landed, without what luminaires emit. `within`: whether
-    /// it comes from within a solid, where flats have light of their own. Counts up `misses` if no node of the cell is
+    /// Outgoing radiance where a ray landed, without what luminaires emit. Counts up `misses` if no node of the cell is
     /// filled.
-    pub fn lookup(
-        &self,
-        scene: &Scene,
-        (target, within): (Target, bool),
-        position: DVec3,
-        isovalue: f32,
-        misses: &mut u64,
-    ) -> DVec3 {
+    pub fn lookup(&self, scene: &Scene, landed: SurfacePoint, misses: &mut u64) -> DVec3 {
+        let SurfacePoint { target, within, position, isovalue } = landed;
         match target {
             Target::Surface(side) => {
                 let surface = &scene.surface;
@@ -286,8 +276,8 @@ impl RadianceCache {
     }
 
     fn flat(&self, number: usize, within: bool, [u, v]: [f64; 2], isovalue: f32) -> DVec3 {
-        let within = if within { self.within[number].as_ref() } else { None };
-        within.or(self.flats[number].as_ref()).map_or(DVec3::ZERO, |t| t.lookup([u, v, f64::from(isovalue)]))
+        let light = self.flats[number].as_ref();
+        light.map_or(DVec3::ZERO, |light| light.seen(within).lookup([u, v, f64::from(isovalue)]))
     }
 
     /// What a white surface of field `number` would reflect where its level set `isovalue` is at a position: the mean
@@ -355,13 +345,8 @@ impl RadianceCache {
         DVec3::ZERO
     }
 
-    /// The flats' radiance textures; `None` for flats that reflect nothing.
-    pub fn flats(&self) -> &[Option<FlatTexture>] {
-        &self.flats
-    }
-
-    /// The flats' textures for pictures, without the rest.
-    pub fn into_shown_flats(self) -> Vec<Option<FlatTexture>> {
+    /// The flats' light for pictures, without the rest; `None` for flats that reflect nothing.
+    pub fn into_shown_flats(self) -> Vec<Option<FlatLight>> {
         self.shown.unwrap_or(self.flats)
     }
 }
@@ -501,19 +486,23 @@ mod tests {
         Scene::new(field, Surface { albedo: DVec3::ONE.into(), ..Surface::default() }, Boundary::Open, vec![]).unwrap()
     }
 
+    fn on_surface(position: DVec3, isovalue: f32) -> SurfacePoint {
+        SurfacePoint { target: Target::Surface(Side::Lower), within: false, position, isovalue }
+    }
+
     /// Σ|found − there| and Σ|trilinear − there| over places whose light is a function of the isovalue.
     fn off(light: impl Fn(f64) -> f64) -> [f64; 2] {
         let scene = planes();
         let nodes: Vec<_> = scene.field.samples().iter().map(|h| [light(f64::from(*h)) as f32; 3]).collect();
         let stored = NodeSet::all(nodes.len());
         let field = FieldNodes { stored, filled: Nodes::default(), sides: [Some(nodes.clone()), None] };
-        let cache = RadianceCache { nodes: vec![Some(field)], flats: vec![], within: vec![], shown: None, rays: 0 };
+        let cache = RadianceCache { nodes: vec![Some(field)], flats: vec![], shown: None, rays: 0 };
         let mut rng = crate::rng::Rng::stream(5, Stage::Test, 0);
         let (mut sums, mut misses) = ([0.0; 2], 0);
         for _ in 0..20_000 {
             let x = 8.0 * DVec3::new(rng.unit(), rng.unit(), rng.unit());
             let h = scene.field.value(x);
-            let found = cache.lookup(&scene, (Target::Surface(Side::Lower), false), x, h as f32, &mut misses).x;
+            let found = cache.lookup(&scene, on_surface(x, h as f32), &mut misses).x;
             let ([i, j, k], u) = scene.field.locate(x);
             let trilinear: f64 = (0..8)
                 .map(|n| {
@@ -557,7 +546,7 @@ mod tests {
         let look = |x: f64| {
             let mut misses = 0;
             let at = DVec3::new(x, 0.5, 0.5);
-            let found = cache.lookup(&scene, (Target::Surface(Side::Lower), false), at, 0.5, &mut misses).x;
+            let found = cache.lookup(&scene, on_surface(at, 0.5), &mut misses).x;
             (found, misses)
         };
         // In the cell; one step off; both nodes in reach; out of reach.

@@ -236,6 +236,23 @@ impl Scene {
         }
     }
 
+    /// Whether `ray` is at `t` in a solid, of any field, or where one touches the wall that it meets there.
+    pub fn solid_holds(&self, ray: &FlattenedRay, t: f32) -> bool {
+        let (p, c) = (ray.at(t), f64::from(ray.isovalue));
+        let rounding = 16.0 * f64::from(f32::EPSILON) * p.abs().max(ray.origin.as_dvec3().abs()).max_element().max(1.0);
+        let holds = |field: &Field, p: DVec3, slack: f64, outside: Side| {
+            // NaN beside samples that are not finite: nothing is there.
+            let h = field.lattice().nearest(p, slack).map_or(f64::NAN, |p| field.value(p));
+            if outside == Side::Lower { h > c } else { h < c }
+        };
+        holds(&self.field, p, rounding, self.surface.outside)
+            || self.companions.iter().any(|companion| {
+                let q = companion.to_index(p);
+                let slack = (companion.to_index(p + rounding) - q).abs().max_element();
+                holds(&companion.member.field, q, slack, companion.member.surface.outside)
+            })
+    }
+
     /// Whether `ray` comes towards the front of polygon `id`. The back of a luminaire is black.
     #[inline]
     pub fn sees_front(&self, ray: &FlattenedRay, id: u32) -> bool {

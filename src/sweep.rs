@@ -50,7 +50,7 @@ mod totals;
 
 use crate::checkpoint::Stage;
 use crate::error::{Error, Result};
-use crate::flat::FlatTexture;
+use crate::flat::FlatLight;
 use crate::flattened::Side;
 use crate::isa::Isa;
 use crate::scene::{Boundary, Scene};
@@ -131,7 +131,7 @@ pub struct SweepResult {
     /// than a quarter of the sweep outside it, unless h ends in a plateau there.
     pub lit: Vec<bool>,
     /// Reflected radiance of walls, luminaires and caps, by flat number; `None` where nothing is reflected.
-    pub flats: Vec<Option<FlatTexture>>,
+    pub flats: Vec<Option<FlatLight>>,
     /// Indirect bounces of the replicate that took the most.
     pub bounces: usize,
     /// The share of all indirect light, up to 1, that later bounces would bring or take, as far as their decay is
@@ -301,7 +301,7 @@ pub fn sweep_resumable(
     }
     let State { done, total, flats: mut sums, bounces, residual, counts } = state;
     sums.iter_mut().flatten().flatten().for_each(|x| *x /= done.max(1) as f32);
-    let flats = flats.export(&sums);
+    let flats = flats.export(&sums, scene.surface.outside);
     let mut sides = total.finish(&rows, &Focus { dims, lit: |at| lit[at] }, done, settings.direct);
     let world = |o: usize| scene.lattice().to_world(DVec3::from_array(scene.lattice().ijk(o).map(|i| i as f64)));
     let dark = slits.hidden.iter().map(|hidden| hidden.0).filter(|&o| scene.covers(world(o)));

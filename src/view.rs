@@ -6,7 +6,7 @@ pub mod codec;
 use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
-use crate::flat::{self, FlatTexture};
+use crate::flat::{self, FlatLight, FlatTexture};
 use crate::flattened::Side;
 use crate::mask::Mask;
 use crate::polygon::Polygon;
@@ -75,7 +75,9 @@ impl Payload {
         // Colours are stored up to `scale` times the display's white, so that lower exposures have something to show.
         let brightest = |colours: &[[f32; 3]]| colours.as_flattened().par_iter().copied().reduce(|| 0.0, f32::max);
         let most = baked.sides.iter().map(|(_, g)| brightest(&g.radiance));
-        let most = most.chain(baked.flats.iter().flatten().map(|t| brightest(&t.texels))).fold(0.0, f32::max);
+        let most = most
+            .chain(baked.flats.iter().flatten().flat_map(FlatLight::textures).map(|t| brightest(&t.texels)))
+            .fold(0.0, f32::max);
         let scale = (f64::from(most) * baked.exposure).clamp(1.0, 4.0);
         let factor = (baked.exposure / scale) as f32;
 
@@ -182,11 +184,14 @@ fn describe_flat(baked: &BakedVolume, frame: &Frame, n: usize, factor: f32, byte
         let across = a - b * (a.dot(b) / b.dot(b));
         (across / across.dot(across) * frame.size).to_array()
     };
-    let texture = baked.flats[n].as_ref().map(|t: &FlatTexture| {
+    let mut texture = |t: &FlatTexture| {
         let offset = bytes.len();
         codec::append_colours(bytes, &t.texels, factor);
         json!({ "offset": offset, "dims": t.dims, "axis": t.axis })
-    });
+    };
+    let light = baked.flats[n].as_ref();
+    let outside = light.map(|light| texture(&light.outside));
+    let within = light.and_then(|light| light.within.as_ref()).map(texture);
     let emission = polygon.map_or(DVec3::ZERO, |p| p.emission * baked.exposure);
     Some(json!({
         "name": polygon.map_or("cap", |p| p.name.as_str()),
@@ -199,7 +204,8 @@ fn describe_flat(baked: &BakedVolume, frame: &Frame, n: usize, factor: f32, byte
         "corner": frame.point(corner),
         "du": dual(e, g),
         "dv": dual(g, e),
-        "texture": texture,
+        "texture": outside,
+        "within": within,
     }))
 }
 

@@ -185,7 +185,14 @@ impl Lattice {
     /// Whether index coordinates lie in Ω, or as near as rounding puts what stands on its faces (10⁻⁶ of a step).
     #[inline]
     pub fn holds(&self, p: DVec3) -> bool {
-        p.cmpge(DVec3::splat(-1e-6)).all() && p.cmple(self.far() + 1e-6).all()
+        self.nearest(p, 1e-6).is_some()
+    }
+
+    /// The point of Ω next to index coordinates that lie at most `slack` steps outside along any axis.
+    #[inline]
+    pub fn nearest(&self, p: DVec3, slack: f64) -> Option<DVec3> {
+        let nearest = p.clamp(DVec3::ZERO, self.far());
+        (p - nearest).abs().cmple(DVec3::splat(slack)).all().then_some(nearest)
     }
 }
 

@@ -3,6 +3,7 @@
 use isolume::bake::{Bake, BakeOptions, BakeSettings, StrategyName, bake_fields};
 use isolume::embree::Device;
 use isolume::field::{Field, Sweep};
+use isolume::flat::FlatLight;
 use isolume::illumination_grid::GridSize;
 use isolume::progress::Progress;
 use isolume::scene::{Boundary, Member, Policy, Scene, Surface, cornell_box};
@@ -55,7 +56,14 @@ fn light(bakes: &[Bake]) -> (Vec<u64>, usize) {
             bits.extend(grid.std_error.iter().map(|x| u64::from(x.to_bits())));
             bits.extend(grid.mask.iter().map(|&m| m as u64));
         }
-        bits.extend(bake.flats.iter().flatten().flat_map(|f| f.texels.as_flattened()).map(|x| u64::from(x.to_bits())));
+        bits.extend(
+            bake.flats
+                .iter()
+                .flatten()
+                .flat_map(FlatLight::textures)
+                .flat_map(|f| f.texels.as_flattened())
+                .map(|x| u64::from(x.to_bits())),
+        );
         let r = &bake.report;
         bits.extend([r.rays, r.samples, r.misses, r.filled, r.masked, r.samples_without_gradient, r.photons.stored]);
     }

@@ -4,6 +4,7 @@
 use glam::{DMat3, DVec3};
 use isolume::embree::{Device, GraphTracer};
 use isolume::field::{Field, Sweep};
+use isolume::flat::FlatLight;
 use isolume::flattened::{Departure, Side, Target};
 use isolume::luminaire::unoccluded;
 use isolume::polygon::Polygon;
@@ -117,7 +118,7 @@ fn what_level_sets_send_is_what_walls_and_level_sets_gather() {
             let own: f64 = cell * valid.iter().map(|&o| PI * radiosity(&got, o) * gradient(o)).sum::<f64>();
             let mut walls = 0.0;
             for (t, p) in got.flats.iter().zip(scene.polygons()) {
-                let texels = &t.as_ref().unwrap().texels;
+                let texels = &t.as_ref().unwrap().outside.texels;
                 // B = ρE/π.
                 walls +=
                     texels.iter().map(|t| f64::from(t[1]) * PI / 0.5).sum::<f64>() / texels.len() as f64 * p.area();
@@ -214,7 +215,7 @@ fn a_floor_sees_a_long_wall_as_it_should() {
         // Few lines meet each texel: what counts is the mean.
         let settings = SweepSettings { directions: 1024, replicates: 8, flat_resolution: (150, 8), ..ONE_BOUNCE };
         let got = run(&scene, settings);
-        let texture = got.flats[0].as_ref().unwrap();
+        let texture = &got.flats[0].as_ref().unwrap().outside;
         let errors: Vec<f64> = (0..50)
             .map(|y| {
                 let at = DVec3::new(50.0 - height / k, 200.0 + 4.0 * f64::from(y), 0.0);
@@ -311,13 +312,21 @@ fn caps_close_level_sets() {
     println!("capped: level sets {mean:.5}, RMS {rms:.5}");
     assert!(mean.abs() < 0.005 && rms < 0.01);
     // The cap on x = 1 (face 3) is covered at every isovalue.
-    let cap = got.flats[scene.polygons().len() + 3].as_ref().unwrap();
+    let cap = &got.flats[scene.polygons().len() + 3].as_ref().unwrap().outside;
     let errors: Vec<f64> = cap.texels.iter().map(|t| f64::from(t[1]) - rho).collect();
     let (mean, rms) = mean_rms(&errors);
     println!("capped: caps {mean:.5}, RMS {rms:.5}");
     assert!(mean.abs() < 0.005 && rms < 0.01);
     // Uncapped, the inside of the solid is open, but the outer side sees the same.
-    assert!(got.flats.iter().flatten().flat_map(|t| &t.texels).flatten().all(|x| x.is_finite()));
+    assert!(
+        got.flats
+            .iter()
+            .flatten()
+            .flat_map(FlatLight::textures)
+            .flat_map(|t| &t.texels)
+            .flatten()
+            .all(|x| x.is_finite())
+    );
 }
 
 /// Light from outside stays outside: the inside of capped solids is black, beside the luminaire too, and the outside as
@@ -369,7 +378,15 @@ fn holes_in_the_data_hold_no_surface_and_hide_nothing() {
     };
     let ((whole, one), (holed, two)) = (light_it(f(false)), light_it(f(true)));
     assert!(two.sides[0].irradiance.iter().flatten().all(|x| x.is_finite()));
-    assert!(two.flats.iter().flatten().flat_map(|t| &t.texels).flatten().all(|x| x.is_finite()));
+    assert!(
+        two.flats
+            .iter()
+            .flatten()
+            .flat_map(FlatLight::textures)
+            .flat_map(|t| &t.texels)
+            .flatten()
+            .all(|x| x.is_finite())
+    );
     let holes = (0..holed.lattice().len()).filter(|&o| holed.field.samples()[o].is_nan()).count();
     assert!(holes > 50);
     let errors: Vec<f64> = nodes(&whole, 0).iter().map(|&o| radiosity(&two, o) - radiosity(&one, o)).collect();
@@ -388,7 +405,7 @@ fn walls_see_nothing_in_a_gap() {
     let scene = Scene::new(f, black, Boundary::Open, walls).unwrap();
     let got = run(&scene, SweepSettings { flat_resolution: (8, 20), ..ONE_BOUNCE });
     for (face, wall) in got.flats.iter().take(6).enumerate() {
-        let wall = wall.as_ref().unwrap();
+        let wall = &wall.as_ref().unwrap().outside;
         let [nu, nv, nc] = wall.dims;
         let mean = |t: usize| {
             let texels = &wall.texels[t * nu * nv..(t + 1) * nu * nv];
@@ -422,6 +439,7 @@ fn walls_do_not_see_through_capped_solids_with_a_hole() {
     let [whole, holed] = [false, true].map(lit);
     let (mut most, mut light) = (0f32, 0f32);
     for (one, other) in whole.iter().flatten().zip(holed.iter().flatten()) {
+        let [one, other] = [one, other].map(|light| &light.outside);
         for (a, b) in one.texels.iter().flatten().zip(other.texels.iter().flatten()) {
             (most, light) = (most.max((a - b).abs()), light.max(*a));
         }
@@ -474,7 +492,7 @@ fn texels_that_solids_cover_in_part_are_as_bright_as_the_rest() {
     let settings = SweepSettings { light_points: 256, max_bounces: 0, flat_resolution: (8, 64), ..ONE_BOUNCE };
     let got = run(&scene, settings);
     let lamp = scene.luminaires()[0] as usize;
-    let texture = got.flats[1 - lamp].as_ref().unwrap();
+    let texture = &got.flats[1 - lamp].as_ref().unwrap().outside;
     let [nu, nv, nc] = texture.dims;
     let (mut straddled, mut worst) = (0, 0f64);
     for (t, j, i) in (0..nc).flat_map(|t| (0..nv).flat_map(move |j| (0..nu).map(move |i| (t, j, i)))) {

@@ -330,6 +330,30 @@ fn axes_caps_and_sides_are_where_render_has_them() {
     compare(dir, &program, &views, "");
 }
 
+/// Solids that stand on the walls all around: within them walls show light of their own, or none.
+#[test]
+fn walls_within_solids_are_as_render_has_them() {
+    let Some(program) = chromium() else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let lattice = Lattice::aligned([25; 3], DVec3::ZERO, DVec3::splat(1.0 / 24.0)).unwrap();
+    let samples = (0..lattice.len()).map(|o| {
+        let x = lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)));
+        ((9.0 * x.x + 1.5 * x.y).sin() * (6.0 * x.y - 2.5 * x.z).cos() + (5.5 * x.z).sin()) as f32
+    });
+    Volume::new("waves", lattice.clone(), Samples::F32(samples.collect())).unwrap().write(dir.join("b.nrrd")).unwrap();
+    let bake = ["bake", "b.nrrd", "--isovalues", "-2", "2", "-o", "out.vti", "--outside", "higher"];
+    for (sides, engine) in [("both", "sweep"), ("both", "photon"), ("outside", "sweep")] {
+        isolume(dir, &[&bake[..], &QUICK, &["--engine", engine, "--sides", sides]].concat());
+        let stored = BakedVolume::read(&dir.join("out.vti")).unwrap().flats;
+        let own = stored.iter().flatten().filter(|light| light.within.is_some()).count();
+        assert_eq!(own > 3, sides == "both", "{engine}, {sides}: {own}");
+        let name = if sides == "both" { "waves-both" } else { "waves-outside" };
+        let views = [View { name, page: "{ iso: 0.45 }".to_owned(), render: words("--isovalue -0.2") }];
+        compare(dir, &program, &views, "");
+    }
+}
+
 /// Direct light that the page computes itself: on a skew volume with a finer grid, whose normals are those of the
 /// volume, by a square above and a triangle in front.
 #[test]
@@ -392,7 +416,7 @@ fn walls_of_crowded_isovalues_are_as_bright_as_render_has_them() {
         &[&["bake", "b.nrrd", "--isovalues", "0.001", "1", "-o", "out.vti", "--margin", "0.1"][..], &QUICK].concat(),
     );
     let texels = BakedVolume::read(&dir.join("out.vti")).unwrap().flats.into_iter().flatten();
-    assert!(texels.map(|t| t.axis).all(|axis| !axis.is_even() && axis.place(0.01) > 0.2));
+    assert!(texels.map(|t| t.outside.axis).all(|axis| !axis.is_even() && axis.place(0.01) > 0.2));
     let views = [0.0015, 0.01].map(|isovalue: f64| View {
         name: if isovalue < 0.005 { "faint" } else { "dense" },
         page: format!("{{ iso: {} }}", (isovalue - 0.001) / 0.999),

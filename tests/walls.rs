@@ -10,6 +10,7 @@ use isolume::flattened::{Departure, Side};
 use isolume::mask::Mask;
 use isolume::progress::Progress;
 use isolume::reference::{PathTracer, receiver};
+use isolume::rng::{Rng, Stage};
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
 use isolume::volume::{Lattice, Samples, Volume};
 use rayon::prelude::*;
@@ -56,7 +57,19 @@ fn baked(scene: &Scene, engine: Engine) -> Bake {
 
 /// Errors of a bake of `scene` at every `stride`th point that `chosen` picks.
 fn errors(scene: &Scene, engine: Engine, stride: usize, paths: u32, chosen: impl Fn(DVec3) -> bool) -> Errors {
-    let baked = baked(scene, engine);
+    errors_of(scene, &baked(scene, engine), Side::Lower, stride, paths, chosen)
+}
+
+/// The same of one side of a bake.
+fn errors_of(
+    scene: &Scene,
+    baked: &Bake,
+    side: Side,
+    stride: usize,
+    paths: u32,
+    chosen: impl Fn(DVec3) -> bool,
+) -> Errors {
+    let grid = &baked.sides.iter().find(|(stored, _)| *stored == side).unwrap().1;
     let device = Device::new(0).unwrap();
     let tracer = GraphTracer::new(&device, scene).unwrap();
     let place = |o: usize| DVec3::from_array(scene.lattice().ijk(o).map(|x| x as f64));
@@ -67,9 +80,9 @@ fn errors(scene: &Scene, engine: Engine, stride: usize, paths: u32, chosen: impl
     let light: Vec<[f64; 2]> = points
         .par_iter()
         .map(|&o| {
-            let receiver = receiver(scene, place(o), scene.field.samples()[o], Side::Lower).unwrap();
+            let receiver = receiver(scene, place(o), scene.field.samples()[o], side).unwrap();
             let exact = PathTracer::new(scene, &tracer).outgoing(&receiver, paths, (5, o as u64));
-            [f64::from(baked.sides[0].1.radiance[o][1]), exact.y]
+            [f64::from(grid.radiance[o][1]), exact.y]
         })
         .collect();
     let n = light.len() as f64;
@@ -134,7 +147,7 @@ fn the_ceiling_is_bright_up_to_the_luminaire() {
     let share = ceiling.albedo.y / scene.surface.albedo.at(isovalue).y;
     for engine in [Engine::Sweep, Engine::Photon] {
         let baked = baked(&scene, engine);
-        let texture = baked.flats[wall as usize].as_ref().unwrap();
+        let texture = &baked.flats[wall as usize].as_ref().unwrap().outside;
         let got: f64 = places.iter().map(|&[u, v]| texture.lookup([u, v, isovalue]).y).sum();
         let error = got / (share * exact.iter().sum::<f64>()) - 1.0;
         println!("{engine:?}: {} places, {error:+.4}", places.len());
@@ -299,10 +312,24 @@ fn no_light_seeps_along_walls() {
     // The luminaire's lowest corner is above all of these.
     let most = scene.polygons()[scene.luminaires()[0] as usize].vertices().iter().map(|&x| height(x));
     let most = (most.fold(f64::INFINITY, f64::min) - 0.2 - sweep.lo()) / (sweep.hi() - sweep.lo());
-    let bake = baked(&scene, Engine::Sweep);
+    for engine in [Engine::Sweep, Engine::Photon] {
+        let bake = baked(&scene, engine);
+        let light = brightest_by_side(&scene, &bake, most);
+        let touches = |p: DVec3| p.cmpeq(DVec3::ZERO).any() || p.cmpeq(lattice.far()).any();
+        let walls = errors_of(&scene, &bake, Side::Higher, 5, 1024, |p| touches(p) && scene.field.value(p) < most);
+        let off = errors_of(&scene, &bake, Side::Higher, 20, 1024, |p| !touches(p) && scene.field.value(p) < most);
+        println!("{engine:?} {light:?} {walls:?} {off:?}");
+        assert!(light[0].iter().all(|x| *x < 1e-3), "{engine:?} {light:?}");
+        assert!(walls.mean.abs() < 0.02 && walls.rms < 0.06, "{engine:?} {walls:?}");
+        assert!(off.mean.abs() < 0.01 && off.rms < 0.04, "{engine:?} {off:?}");
+    }
+}
+
+/// Per side of level sets below `most`: the most light of points off the walls and on them, and of walls.
+fn brightest_by_side(scene: &Scene, bake: &Bake, most: f64) -> [[f32; 3]; 2] {
+    let lattice = scene.lattice();
     let far = lattice.far();
     let brighter = |most: &mut f32, rgb: [f32; 3]| *most = rgb.into_iter().fold(*most, f32::max);
-    // Per side: points off the walls and on them, walls.
     let mut light = [[0f32; 3]; 2];
     for (side, grid) in &bake.sides {
         let of = |o: &usize| grid.mask[*o] == Mask::Valid && f64::from(scene.field.samples()[*o]) < most;
@@ -314,20 +341,14 @@ fn no_light_seeps_along_walls() {
     }
     for (number, flat) in bake.flats.iter().enumerate() {
         let Some(flat) = flat else { continue };
-        let [nu, nv, nc] = flat.dims;
-        let centres = flat.axis.centres(nc);
-        for (i, texel) in flat.texels.iter().enumerate() {
-            let uv = [(i % nu, nu), (i / nu % nv, nv)].map(|(k, n)| (k as f64 + 0.5) / n as f64);
-            let h = scene.field.value(lattice.to_index(scene.polygons()[number].at(uv)).clamp(DVec3::ZERO, far));
-            let c = centres[i / (nu * nv)];
-            // Rounding decides where a level set halves a texel.
-            if c < most && (h - c).abs() > 1e-6 {
-                brighter(&mut light[usize::from(h > c)][2], *texel);
-            }
+        for i in 0..20_000 {
+            let mut rng = Rng::stream(1, Stage::Test, i);
+            let [u, v, c] = [(); 3].map(|()| rng.unit());
+            let p = lattice.to_index(scene.polygons()[number].at([u, v])).clamp(DVec3::ZERO, far);
+            let within = scene.field.value(p) > c * most;
+            let found = flat.seen(within).lookup([u, v, c * most]).as_vec3().to_array();
+            brighter(&mut light[usize::from(within)][2], found);
         }
     }
-    println!("{light:?}");
-    // Points on walls find the light of a wedge by rays that read texels between both sides.
-    assert!(light[0][0] < 1e-3 && light[0][1] < 0.02 && light[0][2] < 1e-3, "{light:?}");
-    assert!(light[1].iter().all(|x| *x > 0.1), "{light:?}");
+    light
 }

@@ -9,7 +9,7 @@
 use super::BakeSettings;
 use super::grid_points::{Counts, STAND_INS};
 use crate::direct::{Receiver, direct_irradiance, luminance};
-use crate::flattened::{Departure, Side, Target};
+use crate::flattened::{Departure, Side, SurfacePoint, Target};
 use crate::gather::gathered_irradiance;
 use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, local_position};
@@ -208,12 +208,13 @@ impl<'a> Contacts<'a> {
         let gathered = gathered_irradiance(scene, tracer, cache, &receiver, gather_rays, (seed, index)).estimate;
         counts.rays += direct.rays + gathered.rays;
         counts.misses += gathered.misses;
-        let target = (Target::Polygon(wall), scene.leaves_within(receiver.departure));
-        let shown = cache.lookup(scene, target, x, isovalue, &mut counts.misses);
+        let within = scene.leaves_within(receiver.departure);
+        let seen = |target| SurfacePoint { target, within, position: x, isovalue };
+        let shown = cache.lookup(scene, seen(Target::Polygon(wall)), &mut counts.misses);
         let level_set = scene.surface.albedo.at(f64::from(isovalue));
         // D_w/π, without what the level set reflects onto the wall by what the cache says.
-        let touched = (Target::Surface(side), scene.leaves_within(receiver.departure));
-        let reflects = cache.lookup(scene, touched, x, isovalue, &mut counts.misses) - scene.surface.emission;
+        let touched = cache.lookup(scene, seen(Target::Surface(side)), &mut counts.misses);
+        let reflects = touched - scene.surface.emission;
         let opening = ((direct.mean + gathered.mean) / PI - share * reflects).max(DVec3::ZERO);
         // Of white surfaces that touch face to face nothing would ever be lost.
         let lost = 1.0 - (share * share * polygon.albedo * level_set).min(DVec3::splat(MOST_KEPT));

@@ -322,8 +322,8 @@ impl Parts {
         Ok(Self {
             engine: settings.engine,
             base,
-            // For gathers, of photons maybe others from within solids, and for pictures.
-            flats: texels * if settings.engine == Engine::Photon && scene.gathers_within() { 36 } else { 24 },
+            // For gathers and for pictures, from outside solids and maybe from within.
+            flats: texels * if settings.engine == Engine::Photon { 48 } else { 24 },
             photons: (landings * photon).min(MOST) as u64,
             maps: ((lower + higher) * MAP).min(MOST) as u64,
             cached: if gather { 2 } else { 0 },

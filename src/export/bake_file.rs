@@ -8,7 +8,7 @@ use crate::bake::Bake;
 use crate::digits::span;
 use crate::error::{Error, Result};
 use crate::field::{Field, FieldRows, Sweep};
-use crate::flat::{self, FlatTexture};
+use crate::flat::{self, FlatLight, FlatTexture};
 use crate::flattened::Side;
 use crate::illumination_grid::{GridSize, IlluminationGrid};
 use crate::isovalue_axis::IsovalueAxis;
@@ -66,6 +66,9 @@ struct TextureDescription {
     /// Texels of the array before it.
     #[serde(default)]
     start: usize,
+    /// Whether it is what is seen from within solids, if that differs.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    inside: bool,
 }
 
 impl TextureDescription {
@@ -209,8 +212,9 @@ pub fn field_file(path: &Path, name: &str) -> PathBuf {
 /// Writes a bake. Point data: `value` (source units, active scalars; in f64 where f32 is too coarse for the sweep, or
 /// does not hold all samples), `radiance` (linear RGB), `rgb` (exposed, clamped, sRGB-encoded), `std_error` (of
 /// luminance), `mask` ([`Mask`]), of a split bake `indirect` and `visible` ([`Split`]); with both sides also
-/// `radiance_inside` and so on. Field data: `wall_<name>` radiance over (u, v, isovalue), `context` the same of all
-/// context geometry, exposure, every number of the report, and all of it as JSON.
+/// `radiance_inside` and so on. Field data: `wall_<name>` radiance over (u, v, isovalue), with both sides also
+/// `wall_<name>_inside`, which is seen from within solids, `context` the same of all context geometry, exposure, every
+/// number of the report, and all of it as JSON.
 ///
 /// # Errors
 /// `Io` if the file cannot be written.
@@ -232,11 +236,11 @@ fn completed(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
     let mut texels: Vec<(String, Cow<'_, [f32]>)> = Vec::new();
     // Much context geometry would be as many arrays.
     let mut context = Vec::new();
-    for (n, t) in bake.flats.iter().enumerate() {
-        let Some(t) = t else { continue };
+    let flats = bake.flats.iter().enumerate().filter_map(|(n, light)| Some((n, light.as_ref()?)));
+    for (n, i, t) in flats.flat_map(|(n, light)| light.textures().enumerate().map(move |(i, t)| (n, i, t))) {
         let (array, start) = match scene.polygons().get(n) {
             Some(p) if p.other_face != 0 => (CONTEXT.to_owned(), context.len() / 3),
-            _ => (format!("wall_{}", flat_name(scene, n)), 0),
+            _ => (format!("wall_{}{}", flat_name(scene, n), suffix(i)), 0),
         };
         // Names in OBJ files may repeat.
         let array =
@@ -246,7 +250,14 @@ fn completed(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
         } else {
             texels.push((array.clone(), Cow::Borrowed(t.texels.as_flattened())));
         }
-        textures.push(TextureDescription { flat: n, array, dims: t.dims, middle: t.axis.middle(), start });
+        textures.push(TextureDescription {
+            flat: n,
+            array,
+            dims: t.dims,
+            middle: t.axis.middle(),
+            start,
+            inside: i > 0,
+        });
     }
     if !context.is_empty() {
         texels.push((CONTEXT.to_owned(), Cow::Owned(context)));
@@ -363,7 +374,7 @@ pub struct BakedVolume {
     /// One grid per stored side, the outside first.
     pub sides: Vec<(Side, IlluminationGrid)>,
     /// The flats' radiance, by flat number.
-    pub flats: Vec<Option<FlatTexture>>,
+    pub flats: Vec<Option<FlatLight>>,
     /// Display exposure.
     pub exposure: f64,
     /// The report, as written.
@@ -506,7 +517,7 @@ impl BakedVolume {
         let boundary = if d.capped { Boundary::Capped } else { Boundary::Open };
         let member = Member { name: d.volume, field: field.into(), surface, boundary };
         let scene = Scene::with_members(vec![member], Policy::Joint, polygons)?;
-        let mut flats = vec![None; flat::count(&scene)];
+        let mut flats: Vec<Option<FlatLight>> = vec![None; flat::count(&scene)];
         let mut read: Option<(String, Vec<[f32; 3]>)> = None;
         for t in d.textures {
             let number = flats.len();
@@ -515,8 +526,12 @@ impl BakedVolume {
                 Some((name, texels)) if *name == t.array => texels,
                 _ => &read.insert((t.array.clone(), triples(all(&file.field_data, &t.array)?))).1,
             };
-            if slot.replace(t.of(texels)?).is_some() {
-                return Err(t.wrong("another one is of the same flat"));
+            let texture = t.of(texels)?;
+            match slot {
+                None if !t.inside => *slot = Some(FlatLight { outside: texture, within: None }),
+                Some(light) if t.inside && light.within.is_none() => light.within = Some(texture),
+                None => return Err(t.wrong("none before it is of the flat's outside")),
+                Some(_) => return Err(t.wrong("another one is of the same flat")),
             }
         }
         let (exposure, report) = (d.exposure, d.report);

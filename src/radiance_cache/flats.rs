@@ -5,7 +5,7 @@ use super::CacheSettings;
 use super::openings::{Hidden, Open, Solid, is_open};
 use crate::brdf::reflected;
 use crate::direct::{Receiver, direct_irradiance};
-use crate::flat::{self, FlatTexture, Texel};
+use crate::flat::{self, FlatLight, FlatTexture, Texel};
 use crate::neighbourhood::neighbourhood;
 use crate::photon::FlatPhoton;
 use crate::rng::Stage;
@@ -19,12 +19,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 #[derive(Default)]
 pub(super) struct Filled {
     /// For gathers, smoothed little.
-    pub gathered: Option<FlatTexture>,
-    /// For gathers from within solids, where those stand on the flat: their own light in all texels that they cover,
-    /// whatever else lies in these; `gathered` elsewhere.
-    pub within: Option<FlatTexture>,
+    pub gathered: Option<FlatLight>,
     /// For pictures, smoothed more.
-    pub shown: Option<FlatTexture>,
+    pub shown: Option<FlatLight>,
 }
 
 /// Direct light of texels and photons of later landings, on so many times the flat's area.
@@ -101,30 +98,36 @@ pub(super) fn fill_flat<T: Tracer>(
         let texels = (0..direct.len()).map(|n| reflected(flat.albedo.at(isovalues[n / parts.len()]), reflects(n)));
         FlatTexture { dims, axis: settings.axis, texels: texels.map(|l| l.as_vec3().to_array()).collect() }
     };
-    // Outside solids and within.
-    let smoothed = |kernel: &Kernel| [Some(indirect(0, kernel)), (counts[1] > 0).then(|| indirect(1, kernel))];
-    let of = |all: &[Option<Vec<DVec3>>; 2], n: usize, within: bool| {
-        all[usize::from(within)].as_ref().map_or(DVec3::ZERO, |i| i[source(n)])
-    };
-    let wide = smoothed(&SHOWN);
-    let shown = Some(texture(&|n| (direct[source(n)] + of(&wide, n, !outer(n))).max(DVec3::ZERO)));
-    drop(wide);
-    // A texture to be averaged is not clamped at 0: that would brighten what few photons reach.
-    let narrow = smoothed(&GATHERED);
-    let light = |n: usize| direct[source(n)] + of(&narrow, n, !outer(n));
-    let gathered = Some(texture(&light));
-    let within = open.as_ref().filter(|_| number < scene.polygons().len() && scene.gathers_within()).map(|open| {
+    // Direct light within solids that stand on walls, and whether texels show it.
+    let own = open.as_ref().filter(|_| number < scene.polygons().len()).map(|open| {
         let solid = |i: usize| parts[i % parts.len()].covered > 0.0 && open.shares[i] < 1.0;
         let own = (0..lit.len()).into_par_iter().with_min_len(256).map(|i| match solid(i) {
             true if outer(i) => open.place(i, false).map(|at| irradiance(i, at)),
             true => lit[i],
             false => None,
         });
-        let own = widened(&own.collect::<Vec<_>>(), dims, &solid);
         let beside = |n: usize| neighbourhood(dims, source(n)).any(|mut run| run.any(solid));
-        texture(&|n| if beside(n) { own[source(n)] + of(&narrow, n, true) } else { light(n) })
+        let beside: Vec<bool> = (0..lit.len()).into_par_iter().with_min_len(256).map(beside).collect();
+        (widened(&own.collect::<Vec<_>>(), dims, &solid), beside)
     });
-    Filled { gathered, within, shown }
+    // Pictures show it, if there is any, though nothing else is stored there.
+    let own = own.filter(|(own, _)| {
+        scene.gathers_within() || counts[1] > 0 || own.par_iter().any(|light| *light != DVec3::ZERO)
+    });
+    let light = |kernel: &Kernel, least: DVec3| {
+        // Outside solids and within.
+        let smoothed = [Some(indirect(0, kernel)), (counts[1] > 0).then(|| indirect(1, kernel))];
+        let indirect =
+            |n: usize, within: bool| smoothed[usize::from(within)].as_ref().map_or(DVec3::ZERO, |i| i[source(n)]);
+        let outside = |n: usize| (direct[source(n)] + indirect(n, !outer(n))).max(least);
+        let within = own.as_ref().map(|(own, beside)| {
+            texture(&|n| if beside[n] { (own[source(n)] + indirect(n, true)).max(least) } else { outside(n) })
+        });
+        Some(FlatLight { outside: texture(&outside), within })
+    };
+    let shown = light(&SHOWN, DVec3::ZERO);
+    // A texture to be averaged is not clamped at 0: that would brighten what few photons reach.
+    Filled { gathered: light(&GATHERED, DVec3::NEG_INFINITY), shown }
 }
 
 /// Photons sorted by flat, in their order.
@@ -318,7 +321,7 @@ mod tests {
             FlatPhoton { flat: ceiling, uvc: [(); 3].map(|()| rng.unit() as f32), power, bounces: 1 }
         });
         let texture =
-            fill_flat(&scene, &Nothing, number, photons, 1.0, &SETTINGS, &AtomicU64::new(0)).gathered.unwrap();
+            fill_flat(&scene, &Nothing, number, photons, 1.0, &SETTINGS, &AtomicU64::new(0)).gathered.unwrap().outside;
         let (hidden, expected) = (Hidden::new(&scene, number, &flat), reflected(flat.albedo.at(0.5), DVec3::ONE).x);
         let mut shown = [crate::stats::Moments::default(); 2];
         let mut most = 0f64;
@@ -361,6 +364,7 @@ mod tests {
             fill_flat(&scene, &Nothing, floor, photons.iter().copied(), 1.0, &SETTINGS, &AtomicU64::new(0))
                 .gathered
                 .unwrap()
+                .outside
         };
         let texture = fill(&photons);
         let expected = reflected(flat.albedo.at(0.5), DVec3::splat(irradiance)).x;
@@ -437,9 +441,8 @@ mod tests {
         let fill = |scene: &Scene| {
             fill_flat(scene, &tracer, floor, photons.iter().copied(), 1.0, &SETTINGS, &AtomicU64::new(0))
         };
-        let (filled, without) = (fill(&scene), fill(&one));
-        let (within, gathered) = (filled.within.unwrap(), filled.gathered.unwrap());
-        assert!(without.within.is_none() && without.gathered.unwrap() == gathered, "nobody asks from within");
+        let filled = fill(&scene).gathered.unwrap();
+        assert_eq!(fill(&one).gathered.unwrap(), filled, "whatever else is stored");
         // Within 0.03 of the surface, and farther off: from within, and from outside.
         let mut found = [crate::stats::Moments::default(); 4];
         for i in 0..40_000 {
@@ -455,8 +458,7 @@ mod tests {
             let direct = direct_irradiance(&scene, &Nothing, &receiver, 4, (3, Stage::Test, i)).mean;
             let outside = gap > 0.0;
             let expected = if outside { DVec3::splat(dense) } else { direct + dense / 3.0 };
-            let texture = if outside { &gathered } else { &within };
-            let x = texture.lookup([u, v, c]).x / reflected(flat.albedo.at(c), expected).x;
+            let x = filled.seen(!outside).lookup([u, v, c]).x / reflected(flat.albedo.at(c), expected).x;
             found[2 * usize::from(outside) + usize::from(gap.abs() > 0.03)].push(x);
         }
         println!("{:?}", found.map(|m| (m.mean(), m.count())));
@@ -483,8 +485,8 @@ mod tests {
             let photons = (0..count).map(|i| place(1, i)).filter(|&p| depth(p) >= 0.0);
             let photons = photons.map(|p| FlatPhoton { flat: 2, uvc: p.map(|x| x as f32), power, bounces: 1 });
             let filled = fill_flat(&scene, &Nothing, number, photons, 1.0, &SETTINGS, &AtomicU64::new(0));
-            let texture = filled.gathered.unwrap();
-            assert!(filled.within.is_none(), "no light is within");
+            let FlatLight { outside: texture, within } = filled.gathered.unwrap();
+            assert!(within.is_none(), "no light is within");
             let expected = reflected(flat.albedo.at(0.5), DVec3::splat(irradiance)).x;
             let mut found = [crate::stats::Moments::default(); 2];
             for p in (0..40_000).map(|i| place(2, i)) {

@@ -5,6 +5,7 @@ use crate::bake::{Bake, BakeOptions, BakeSettings, Engine, bake};
 use crate::embree::{Device, GraphTracer};
 use crate::error::{Error, Result};
 use crate::field::{Field, Sweep};
+use crate::flat::FlatLight;
 use crate::flattened::FlattenedRay;
 use crate::mask::Mask;
 use crate::polygon::Polygon;
@@ -211,7 +212,7 @@ fn scene(input: &Input) -> Result<Scene> {
 /// Every number of a bake that a viewer would read.
 fn numbers(bake: &Bake) -> impl Iterator<Item = f32> {
     let grids = bake.sides.iter().flat_map(|(_, g)| g.radiance.as_flattened().iter().chain(&g.std_error));
-    let flats = bake.flats.iter().flatten().flat_map(|t| t.texels.as_flattened());
+    let flats = bake.flats.iter().flatten().flat_map(FlatLight::textures).flat_map(|t| t.texels.as_flattened());
     grids.chain(flats).copied()
 }
 

@@ -8,6 +8,7 @@ use crate::bake::{Bake, BakeOptions, BakeSettings, bake};
 use crate::embree::{Device, GraphTracer};
 use crate::error::Result;
 use crate::field::{Field, Sweep};
+use crate::flat::FlatLight;
 use crate::flattened::{FlattenedHit, FlattenedRay, Target};
 use crate::mask::Mask;
 use crate::progress::Progress;
@@ -344,7 +345,8 @@ fn bits(bake: &Bake) -> Vec<u32> {
         bits.extend(grid.radiance.as_flattened().iter().chain(&grid.std_error).map(|x| x.to_bits()));
         bits.extend(grid.mask.iter().map(|&m| m as u32));
     }
-    bits.extend(bake.flats.iter().flatten().flat_map(|t| t.texels.as_flattened().iter().map(|x| x.to_bits())));
+    let textures = bake.flats.iter().flatten().flat_map(FlatLight::textures);
+    bits.extend(textures.flat_map(|t| t.texels.as_flattened().iter().map(|x| x.to_bits())));
     bits
 }
 

@@ -6,7 +6,7 @@ use super::gather::local_bounds;
 use super::half::{Half4, encode};
 use super::solid::{FREE, solid};
 use super::swept_sides;
-use crate::flat::{self, Flat, FlatTexture};
+use crate::flat::{self, Flat, FlatLight, FlatTexture};
 use crate::flattened::Side;
 use crate::isa::Isa;
 use crate::isovalue_axis::IsovalueAxis;
@@ -420,18 +420,20 @@ impl Flats {
         }
     }
 
-    /// Radiances of the textures as pictures show them: of each texel and isovalue the side that its centre is on.
-    pub(super) fn export(&self, radiance: &[Option<Vec<f32>>]) -> Vec<Option<FlatTexture>> {
-        let (lower, higher) = radiance.split_at(self.count.min(radiance.len()));
-        let of = |(flat, lower): (usize, &Option<Vec<f32>>)| {
-            let (texture, lower) = (self.textures[flat].as_ref()?, lower.as_ref()?);
-            let apart = higher.get(flat).and_then(Option::as_ref).zip(self.solid.get(flat).and_then(Option::as_ref));
-            Some(texture.export(|texel, isovalue| match apart {
-                Some((higher, solid)) if isovalue < solid[texel] as usize => higher,
-                _ => lower,
-            }))
+    /// Radiances of the textures, of flats that keep sides apart of both.
+    pub(super) fn export(&self, radiance: &[Option<Vec<f32>>], outside: Side) -> Vec<Option<FlatLight>> {
+        let of = |number: usize| Some(self.textures.get(number)?.as_ref()?.export(radiance.get(number)?.as_ref()?));
+        let light = |flat: usize| {
+            let solid = self.solid.get(flat).and_then(Option::as_ref);
+            let apart = solid.is_some_and(|solid| solid.iter().any(|n| *n != FREE));
+            match (of(flat)?, of(self.count + flat).filter(|_| apart)) {
+                (lower, Some(higher)) if outside == Side::Higher => {
+                    Some(FlatLight { outside: higher, within: Some(lower) })
+                }
+                (outside, within) => Some(FlatLight { outside, within }),
+            }
         };
-        lower.iter().enumerate().map(of).collect()
+        (0..self.count).map(light).collect()
     }
 
     /// Irradiance = π Σ w L / Σ w, which is exact for equal L however unevenly lines fell on the texels.
@@ -549,13 +551,12 @@ impl Texture {
         self.radiance = new;
     }
 
-    /// Those of the values (isovalues fastest) that `pick` says, in the order of [`FlatTexture`].
-    fn export<'a>(&self, pick: impl Fn(usize, usize) -> &'a Vec<f32>) -> FlatTexture {
+    /// The values (isovalues fastest) in the order of [`FlatTexture`].
+    fn export(&self, values: &[f32]) -> FlatTexture {
         let [nu, nv, nc] = self.dims;
         let mut out = FlatTexture { axis: self.axis, ..FlatTexture::black(self.dims) };
         for texel in 0..nu * nv {
             for i in 0..nc {
-                let values = pick(texel, i);
                 out.texels[i * nu * nv + texel] = std::array::from_fn(|c| values[(3 * texel + c) * nc + i]);
             }
         }

@@ -158,8 +158,8 @@ function upload(bytes) {
     gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(f.vertices.flat()), gl.STATIC_DRAW);
     gl.enableVertexAttribArray(0);
     gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
-    const wall = f.texture ? colours(f.texture.offset, f.texture.dims, 3, gl.NEAREST) : none;
-    return { ...f, vertex_array: vertices, count: f.vertices.length, wall };
+    const [wall, wallWithin] = [f.texture, f.within].map((t) => t ? colours(t.offset, t.dims, 3, gl.NEAREST) : none);
+    return { ...f, vertex_array: vertices, count: f.vertices.length, wall, wallWithin };
   });
   if (!textures.visible.length) textures.visible.push(none);
   textures.empty = gl.createVertexArray();
@@ -218,17 +218,20 @@ function draw() {
     ...camera(width, height), u_value: 0, u_dims: scene.dims, u_inverse: scene.inverse, u_origin: scene.origin,
     u_iso: state.iso, u_clip: clipPlane(), u_clipped: state.clip ? 1 : 0, u_local: state.shading === "local" ? 1 : 0,
     u_gain: state.tint.map((t) => t * state.exposure), u_scale: scene.scale,
+    u_both: textures.lights.length > 1 ? 1 : 0, u_outside_lower: scene.outside_lower ? 1 : 0,
   };
   const bind = (unit, t) => { gl.activeTexture(gl.TEXTURE0 + unit); gl.bindTexture(gl.TEXTURE_3D, t); };
   bind(0, textures.value);
   gl.useProgram(programs.flat.p);
-  programs.flat.set({ ...common, u_wall: 1 });
+  programs.flat.set({ ...common, u_wall: 1, u_wall_within: 2 });
   for (const f of flats) {
     if (!f.cap && !state.walls) continue;
     bind(1, f.wall);
+    bind(2, f.wallWithin);
     programs.flat.set({
       u_normal: f.normal, u_albedo: albedo(f.albedo), u_emission: f.emission, u_corner: f.corner, u_du: f.du, u_dv: f.dv,
       u_cap: f.cap ? 1 : 0, u_textured: f.texture ? 1 : 0, u_opaque_back: f.opaqueBack ? 1 : 0,
+      u_within: f.within ? 1 : 0,
       u_place: f.texture ? place(f.texture.axis) : 0,
     });
     gl.bindVertexArray(f.vertex_array);
@@ -244,7 +247,6 @@ function draw() {
   programs.volume.set({
     ...common, u_light: 1, u_other: 2, u_blocks: 3, u_block_count: textures.count, u_albedo: albedo(scene.albedo),
     u_most_steps: 2 * (scene.dims[0] + scene.dims[1] + scene.dims[2]) + 64, u_capped: scene.capped ? 1 : 0,
-    u_both: textures.lights.length > 1 ? 1 : 0, u_outside_lower: scene.outside_lower ? 1 : 0,
     u_visible: 4, u_other_visible: 5, ...direct(),
   });
   gl.drawArrays(gl.TRIANGLES, 0, 3);

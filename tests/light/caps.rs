@@ -31,7 +31,7 @@ fn caps_are_lit_like_walls() {
     let bake = run(&scene, &BakeSettings { gather_rays: 0, bounces: 0, ..at_nodes(1) });
     let mut lit = 0;
     for face in 0..6u8 {
-        let texture = bake.flats[scene.polygons().len() + usize::from(face)].as_ref().unwrap();
+        let texture = &bake.flats[scene.polygons().len() + usize::from(face)].as_ref().unwrap().outside;
         let n = scene.face_normal(face);
         let flat = isolume::flat::flat(&scene, scene.polygons().len() + usize::from(face)).unwrap();
         let mut worst = 0f64;

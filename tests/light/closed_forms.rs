@@ -189,7 +189,7 @@ fn furnace_of_emitting_walls() {
             }
             sums.iter().zip(&mut on_ball).for_each(|((a, n), m)| m.push(a / n / expected));
             for (wall, m) in on_walls.iter_mut().enumerate() {
-                let texels = &bake.flats[wall].as_ref().unwrap().texels;
+                let texels = &bake.flats[wall].as_ref().unwrap().outside.texels;
                 let reflected = texels.iter().map(|t| f64::from(t[1])).sum::<f64>() / texels.len() as f64;
                 m.push((1.0 + reflected) / expected);
             }

@@ -59,7 +59,7 @@ fn a_rectangle_from_a_file_is_the_same_wall() {
             let c = rng.unit();
             let of = |bake: &isolume::bake::Bake, scene: &Scene, id: usize| {
                 let [u, v] = scene.polygons()[id].texture(x);
-                luminance(bake.flats[id].as_ref().unwrap().lookup([u, v, c]))
+                luminance(bake.flats[id].as_ref().unwrap().outside.lookup([u, v, c]))
             };
             let fronts = scene.polygons().iter().enumerate().filter(|(_, p)| p.other_face == 1 && p.contains(x));
             let (id, _) = fronts.into_iter().next().expect("the floor covers everything");
@@ -74,7 +74,7 @@ fn a_rectangle_from_a_file_is_the_same_wall() {
         println!("{faces:?}: mean {:.4}, RMS {rms:.4}, along the diagonal {:.4}", sum / sum_own, edge.mean());
         assert!((sum / sum_own - 1.0).abs() < 0.01 && rms < 0.15 && (edge.mean() - 1.0).abs() < 0.03);
         for (id, p) in scene.polygons().iter().enumerate().filter(|(_, p)| p.other_face == -1) {
-            let dark = got.flats[id].as_ref().unwrap().texels.iter().all(|t| *t == [0.0; 3]);
+            let dark = got.flats[id].as_ref().unwrap().outside.texels.iter().all(|t| *t == [0.0; 3]);
             assert!(dark && p.normal().z < 0.0, "no light gets below the floor");
         }
     }
@@ -160,7 +160,7 @@ fn light_to_and_from_context_agrees_with_paths() {
     let mut rng = Rng::stream(5, Stage::Test, 0);
     let (mut sheets, mut solid) = ([[Moments::default(); 2]; 2], [Moments::default(); 2]);
     for (id, p) in scene.polygons().iter().enumerate().filter(|(_, p)| p.other_face != 0) {
-        let texture = bake.flats[id].as_ref().unwrap();
+        let texture = &bake.flats[id].as_ref().unwrap().outside;
         let sheet = p.vertices().len() == 4;
         for i in 0..if sheet { 4000u64 } else { 600 } {
             let x = p.sample([rng.unit(), rng.unit()]);

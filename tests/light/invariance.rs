@@ -6,6 +6,7 @@ use isolume::bake::{Bake, BakeSettings, Engine};
 use isolume::direct::{Receiver, direct_irradiance};
 use isolume::embree::{Device, GraphTracer};
 use isolume::field::{Field, Sweep};
+use isolume::flat::FlatLight;
 use isolume::flattened::{Departure, FlattenedRay, Side};
 use isolume::photon::PhotonSettings;
 use isolume::rng::{Rng, Stage};
@@ -114,7 +115,13 @@ fn bits(bake: &Bake) -> Vec<u32> {
         bits.extend(grid.std_error.iter().map(|x| x.to_bits()));
         bits.extend(grid.mask.iter().map(|&m| m as u32));
     }
-    bits.extend(bake.flats.iter().flatten().flat_map(|t| t.texels.iter().flatten().map(|x| x.to_bits())));
+    bits.extend(
+        bake.flats
+            .iter()
+            .flatten()
+            .flat_map(FlatLight::textures)
+            .flat_map(|t| t.texels.iter().flatten().map(|x| x.to_bits())),
+    );
     bits.extend([bake.report.rays as u32, bake.report.samples as u32, bake.report.photons.stored as u32]);
     bits
 }

@@ -4,7 +4,7 @@ use crate::support::*;
 use glam::DVec3;
 use isolume::bake::{BakeSettings, Engine};
 use isolume::embree::{Device, GraphTracer};
-use isolume::flattened::{Side, Target};
+use isolume::flattened::{Side, SurfacePoint};
 use isolume::gather::{KnownLight, gathered_irradiance};
 use isolume::landing::MOST_LANDINGS;
 use isolume::mask::Mask;
@@ -82,7 +82,7 @@ fn nothing_passes_through_a_luminaire_that_reflects() {
 struct Unknown;
 
 impl KnownLight for Unknown {
-    fn radiance(&self, _: &Scene, _: (Target, bool), _: DVec3, _: f32, _: &mut u64) -> Option<DVec3> {
+    fn radiance(&self, _: &Scene, _: SurfacePoint, _: &mut u64) -> Option<DVec3> {
         None
     }
 }

@@ -4,6 +4,7 @@ use glam::{DMat3, DVec3};
 use isolume::checkpoint::Checkpoint;
 use isolume::embree::{Device, GraphTracer};
 use isolume::field::{Field, Sweep};
+use isolume::flat::FlatLight;
 use isolume::flattened::{Departure, Side, Target};
 use isolume::polygon::Polygon;
 use isolume::rng::{Rng, Sobol, Stage};
@@ -289,7 +290,7 @@ fn furnaces() {
         println!("nodes {skin} from the faces: mean {mean:.5} RMS {:.5}", rms(errors.iter().copied()));
         assert!(mean.abs() < 0.01);
     }
-    for t in got.flats.iter().flatten() {
+    for t in got.flats.iter().flatten().flat_map(FlatLight::textures) {
         let mean = t.texels.iter().map(|t| f64::from(t[0])).sum::<f64>() / t.texels.len() as f64;
         println!("wall {mean:.4}, {a} expected; RMS {:.4}", rms(t.texels.iter().map(|t| f64::from(t[0]) - a)));
         assert!((mean - a).abs() < 0.01);
@@ -377,7 +378,14 @@ fn light_does_not_depend_on_the_unit_of_length() {
         run(&Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap(), settings)
     };
     let bits = |result: SweepResult| -> Vec<u32> {
-        let walls = result.flats.iter().flatten().flat_map(|f| f.texels.iter().flatten()).copied().collect::<Vec<_>>();
+        let walls = result
+            .flats
+            .iter()
+            .flatten()
+            .flat_map(FlatLight::textures)
+            .flat_map(|f| f.texels.iter().flatten())
+            .copied()
+            .collect::<Vec<_>>();
         let nodes = result.sides.into_iter().flat_map(|s| s.irradiance).flatten();
         nodes.chain(walls).map(f32::to_bits).collect()
     };
@@ -458,7 +466,12 @@ fn an_interrupted_sweep_goes_on_with_the_same_bits() {
             let nodes = result.sides.iter().flat_map(|s| {
                 s.irradiance.iter().flatten().chain(&s.std_error).map(|x| x.to_bits()).collect::<Vec<_>>()
             });
-            let walls = result.flats.iter().flatten().flat_map(|f| f.texels.iter().flatten().map(|x| x.to_bits()));
+            let walls = result
+                .flats
+                .iter()
+                .flatten()
+                .flat_map(FlatLight::textures)
+                .flat_map(|f| f.texels.iter().flatten().map(|x| x.to_bits()));
             nodes.chain(walls).collect()
         };
         let ticks = AtomicU64::new(0);

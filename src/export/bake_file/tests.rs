@@ -31,7 +31,7 @@ fn read(changed: impl FnOnce(&mut Value)) -> Result<BakedVolume> {
 #[test]
 fn descriptions_that_do_not_hold_are_refused() {
     let read_back = read(|_| ()).unwrap();
-    assert_eq!(read_back.flats[0].as_ref().unwrap().lookup([0.5; 3]), DVec3::splat(0.125));
+    assert_eq!(read_back.flats[0].as_ref().unwrap().outside.lookup([0.5; 3]), DVec3::splat(0.125));
     let huge = 1u64 << 32;
     for (key, value, what) in [
         ("dims", json!([0, 8, 8]), "dims"),
@@ -61,6 +61,18 @@ fn descriptions_that_do_not_hold_are_refused() {
         panic!("two textures of one flat are accepted")
     };
     assert!(error.to_string().contains("flat 0"), "{error}");
+    // What is seen from within solids follows what is seen from outside.
+    let inside = |first: bool| {
+        read(|d| {
+            let mut again = d["textures"][0].clone();
+            again["inside"] = json!(true);
+            let textures = d["textures"].as_array_mut().unwrap();
+            textures.insert(usize::from(!first), again);
+        })
+    };
+    let light = inside(false).unwrap().flats.swap_remove(0).unwrap();
+    assert!(light.within.as_ref() == Some(&light.outside) && read_back.flats[0].as_ref().unwrap().within.is_none());
+    assert!(inside(true).err().unwrap().to_string().contains("flat 0"));
     // Caps, which open volumes do not have, count among the flats.
     for flat in 1..7 {
         let found = read(|d| d["textures"][0]["flat"] = json!(flat));
