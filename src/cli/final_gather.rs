@@ -13,7 +13,7 @@ use rayon::prelude::*;
 #[derive(clap::Args, Clone, Copy, Debug)]
 pub(super) struct FinalGatherOptions {
     /// Direct light not from the bake, but by N shadow rays to each luminaire from every point that is looked at
-    /// (default: as many as gather rays; without these the bake must have been made with --split)
+    /// (default: four times as many as gather rays; without these the bake must have been made with --split)
     #[arg(long, value_name = "N")]
     shadow_rays: Option<u32>,
     /// Indirect light of every point that is looked at by N rays into the bake: as a rule 64 are within 2 % or so of
@@ -28,14 +28,18 @@ impl FinalGatherOptions {
     /// # Errors
     /// `Invalid` for numbers out of range.
     pub(super) fn settings(self) -> Result<Option<FinalGatherSettings>> {
-        if [self.shadow_rays, self.gather_rays].into_iter().flatten().any(|n| !(1..=1 << 20).contains(&n)) {
-            return Err(Error::Invalid("--shadow-rays, --gather-rays: 1 to 1048576".into()));
+        if [self.shadow_rays, self.gather_rays].into_iter().flatten().any(|n| !(1..=MOST).contains(&n)) {
+            return Err(Error::Invalid(format!("--shadow-rays, --gather-rays: 1 to {MOST}")));
         }
         let gather_rays = self.gather_rays.unwrap_or(0);
-        let shadow_rays = self.shadow_rays.or(self.gather_rays);
+        // They cost less than gather rays and have as much of the noise.
+        let shadow_rays = self.shadow_rays.or(self.gather_rays.map(|n| (4 * n).min(MOST)));
         Ok(shadow_rays.map(|shadow_rays| FinalGatherSettings { shadow_rays, gather_rays }))
     }
 }
+
+/// Rays of either kind from one place, at most.
+const MOST: u32 = 1 << 20;
 
 /// Light of a mesh's vertices and the rays that it cost.
 pub(super) struct Gathered {
