@@ -9,7 +9,7 @@ use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{BufReader, BufWriter, ErrorKind, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
-pub(super) const MAGIC: &[u8] = b"isolume checkpoint 17\n";
+pub(super) const MAGIC: &[u8] = b"isolume checkpoint 18\n";
 /// What the magic of any version starts with.
 pub(super) const ANY_MAGIC: &[u8] = b"isolume checkpoint ";
 

@@ -4,7 +4,7 @@
 use super::CacheSettings;
 use super::openings::{Hidden, Open, Solid, is_open};
 use crate::brdf::reflected;
-use crate::direct::{Receiver, direct_irradiance};
+use crate::direct::{Estimate, Receiver, direct_irradiance};
 use crate::flat::{self, FlatLight, FlatTexture, Texel};
 use crate::neighbourhood::neighbourhood;
 use crate::photon::FlatPhoton;
@@ -14,6 +14,12 @@ use crate::tracer::Tracer;
 use glam::DVec3;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
+
+/// So many times as many shadow rays go from texels beside which a luminaire is seen in part as from others: pictures
+/// show their noise, which gathers average.
+const PENUMBRA: u32 = 4;
+/// Of fewer than these it is so many times these.
+const LEAST_FEW: u32 = 32;
 
 /// A flat's textures; `None` of what reflects nothing.
 #[derive(Default)]
@@ -50,7 +56,7 @@ pub(super) fn fill_flat<T: Tracer>(
     let photons = photons.filter(|p| !hidden.holds([p.uvc[0], p.uvc[1]].map(f64::from)));
     let Landings { powers, counts } = Landings::new(&black, &parts, photons, solid.as_ref());
     let outer = |i: usize| open.as_ref().is_none_or(|o| o.outer[i]);
-    let irradiance = |i: usize, at: [f64; 2]| {
+    let estimate = |i: usize, at: [f64; 2], shadow_rays: u32| {
         let c = isovalues[i / parts.len()];
         #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
         let receiver = Receiver {
@@ -60,23 +66,20 @@ pub(super) fn fill_flat<T: Tracer>(
             departure: flat.departure,
         };
         let key = (settings.seed, Stage::Cache, !(((number as u64) << 40) | i as u64));
-        let direct = direct_irradiance(scene, tracer, &receiver, settings.flat_shadow_rays, key);
+        let direct = direct_irradiance(scene, tracer, &receiver, shadow_rays, key);
         rays.fetch_add(direct.rays, Ordering::Relaxed);
-        direct.mean
+        direct
     };
-    let lit: Vec<Option<DVec3>> = (0..black.texels.len())
-        .into_par_iter()
-        .with_min_len(256)
-        .map(|i| {
-            let part = parts[i % parts.len()];
-            let place = match &open {
-                _ if part.covered == 0.0 => None,
-                Some(open) if open.outer[i] => open.place(i, true),
-                _ => Some(part.at),
-            };
-            Some(irradiance(i, place?))
-        })
-        .collect();
+    let [few, many] = [settings.flat_shadow_rays, PENUMBRA * settings.flat_shadow_rays.max(LEAST_FEW)];
+    let place = |i: usize| {
+        let part = parts[i % parts.len()];
+        match &open {
+            _ if part.covered == 0.0 => None,
+            Some(open) if open.outer[i] => open.place(i, true),
+            _ => Some(part.at),
+        }
+    };
+    let lit = direct_light(dims, |i, rays| Some(estimate(i, place(i)?, rays)), [few, many]);
     let direct = widened(&lit, dims, &outer);
     let texel = areas * flat.area() / (dims[0] * dims[1]) as f64;
     let sizes: Vec<f64> = settings.axis.edges(dims[2]).windows(2).map(|c| texel * (c[1] - c[0])).collect();
@@ -102,7 +105,7 @@ pub(super) fn fill_flat<T: Tracer>(
     let own = open.as_ref().filter(|_| number < scene.polygons().len()).map(|open| {
         let solid = |i: usize| parts[i % parts.len()].covered > 0.0 && open.shares[i] < 1.0;
         let own = (0..lit.len()).into_par_iter().with_min_len(256).map(|i| match solid(i) {
-            true if outer(i) => open.place(i, false).map(|at| irradiance(i, at)),
+            true if outer(i) => open.place(i, false).map(|at| estimate(i, at, many).mean),
             true => lit[i],
             false => None,
         });
@@ -128,6 +131,30 @@ pub(super) fn fill_flat<T: Tracer>(
     let shown = light(&SHOWN, DVec3::ZERO);
     // A texture to be averaged is not clamped at 0: that would brighten what few photons reach.
     Filled { gathered: light(&GATHERED, DVec3::NEG_INFINITY), shown }
+}
+
+/// Direct irradiance of the texels that `estimate` knows, by `few` shadow rays, and by `many` beside those that see a
+/// luminaire in part.
+fn direct_light(
+    [nu, nv, nc]: [usize; 3],
+    estimate: impl Fn(usize, u32) -> Option<Estimate> + Sync,
+    [few, many]: [u32; 2],
+) -> Vec<Option<DVec3>> {
+    let texels = nu * nv;
+    let isovalue = |first: usize| {
+        let each = (0..texels).into_par_iter().with_min_len(256);
+        let roughly: Vec<Option<Estimate>> = each.clone().map(|n| estimate(first + n, few)).collect();
+        let light = |n: usize| {
+            let own = roughly[n]?;
+            let differs =
+                |other: Estimate| other.variance > 0.0 || (other.mean == DVec3::ZERO) != (own.mean == DVec3::ZERO);
+            let mut around = neighbourhood([nu, nv, 1], n);
+            let penumbra = around.any(|mut run| run.any(|m| roughly[m].is_some_and(differs)));
+            if penumbra { estimate(first + n, many) } else { Some(own) }
+        };
+        each.map(|n| Some(light(n)?.mean)).collect::<Vec<_>>()
+    };
+    (0..nc).into_par_iter().flat_map(|c| isovalue(c * texels)).collect()
 }
 
 /// Photons sorted by flat, in their order.
@@ -334,6 +361,38 @@ mod tests {
         }
         println!("{:.4}, behind the luminaire {:.4}, most {most:.3}", shown[0].mean(), shown[1].mean());
         assert!((shown[0].mean() - 1.0).abs() < 0.01 && shown[1].count() > 500 && most < 2.0);
+    }
+
+    /// A half-plane shadows half of the floor: where that ends, eight shadow rays a texel are not the noise they were
+    /// (5 % of all).
+    #[test]
+    fn borders_of_shadows_are_not_noise() {
+        struct Edge;
+
+        impl Tracer for Edge {
+            fn intersect(&self, _: &FlattenedRay) -> Option<FlattenedHit> {
+                None
+            }
+            fn occluded(&self, ray: &FlattenedRay) -> bool {
+                let t = (4.0 - ray.origin.z) / ray.direction.z;
+                ray.origin.x + t * ray.direction.x < 4.0
+            }
+        }
+
+        let field = wavy();
+        let walls = cornell_box(field.lattice(), 0.0).unwrap();
+        let floor = walls.iter().position(|p| p.name == "z_min").unwrap();
+        let scene = Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap();
+        let [few, many] = [8, 4096].map(|flat_shadow_rays| {
+            let settings = CacheSettings { flat_shadow_rays, ..SETTINGS };
+            let nothing = std::iter::empty();
+            let filled = fill_flat(&scene, &Edge, floor, nothing, 1.0, &settings, &AtomicU64::new(0));
+            filled.shown.unwrap().outside.texels
+        });
+        let sum = |square: &dyn Fn(usize) -> f32| (0..many.len()).map(square).sum::<f32>();
+        let off = (sum(&|i| (few[i][0] - many[i][0]).powi(2)) / sum(&|i| many[i][0].powi(2))).sqrt();
+        println!("{off}");
+        assert!(off > 0.0 && off < 0.02, "{off}");
     }
 
     /// Photons as dense everywhere on that part of the floor where h < c: it shows the same irradiance up to the line
