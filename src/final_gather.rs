@@ -6,7 +6,7 @@
 //! averages over it. What lands within a few voxels sees that blur as well as the eye does: such rays go on as paths.
 
 use crate::brdf::reflected;
-use crate::direct::{Receiver, direct_irradiance};
+use crate::direct::{Estimate, Receiver, direct_irradiance, luminance};
 use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
 use crate::flat;
@@ -17,6 +17,7 @@ use crate::rng::Stage;
 use crate::scene::{Policy, Scene};
 use crate::tracer::Tracer;
 use glam::DVec3;
+use std::f64::consts::PI;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Rays from every place that is looked at.
@@ -99,38 +100,46 @@ impl<'a, T: Tracer> FinalGather<'a, T> {
             Target::Polygon(_) => return shown(),
             _ => DVec3::ZERO,
         };
-        Some(self.leaving(&receiver, albedo, emission, index)? + luminaire)
+        Some(self.leaving(&receiver, albedo, emission, index)?.mean + luminaire)
     }
 
     /// Radiance that leaves `receiver`, which is no luminaire.
-    fn leaving(&self, receiver: &Receiver, albedo: DVec3, emission: DVec3, index: u64) -> Option<DVec3> {
+    fn leaving(&self, receiver: &Receiver, albedo: DVec3, emission: DVec3, index: u64) -> Option<Estimate> {
         let Self { baked, tracer, settings, .. } = *self;
         let scene = &baked.scene;
         let p = receiver.position.as_dvec3();
         if scene.covers(scene.lattice().to_world(p)) {
-            return Some(emission);
+            return Some(Estimate { mean: emission, ..Estimate::default() });
         }
-        let rest = match settings.gather_rays {
-            0 => indirect(baked, receiver.departure, p)?,
+        let (rest, gathered) = match settings.gather_rays {
+            0 => (indirect(baked, receiver.departure, p)?, Estimate::default()),
             gather_rays => {
                 let known = Landings { baked, least_distance: settings.least_distance() };
                 let light = gathered_irradiance(scene, tracer, &known, receiver, gather_rays, (SEED, index)).estimate;
-                self.rays.fetch_add(light.rays, Ordering::Relaxed);
-                reflected(albedo, light.mean) + emission
+                (reflected(albedo, light.mean) + emission, light)
             }
         };
         let direct = direct_irradiance(scene, tracer, receiver, settings.shadow_rays, (SEED, Stage::Direct, index));
-        self.rays.fetch_add(direct.rays, Ordering::Relaxed);
-        Some((reflected(albedo, direct.mean) + rest).max(DVec3::ZERO))
+        let rays = direct.rays + gathered.rays;
+        self.rays.fetch_add(rays, Ordering::Relaxed);
+        let scale = luminance(albedo) / PI;
+        Some(Estimate {
+            mean: (reflected(albedo, direct.mean) + rest).max(DVec3::ZERO),
+            variance: (direct.variance + gathered.variance) * scale * scale,
+            rays,
+            misses: gathered.misses,
+        })
     }
 
-    /// Radiance that leaves the outside of level set `isovalue` (units of the sweep) at local position `p`. `None` as
-    /// [`FinalGather::seen`].
-    pub fn outside(&self, p: DVec3, isovalue: f32, index: u64) -> Option<DVec3> {
+    /// Radiance that leaves the outside of level set `isovalue` (units of the sweep) at local position `p`, and the
+    /// variance that rays leave in it: not what the bake itself is off by. `None` as [`FinalGather::seen`].
+    pub fn outside(&self, p: DVec3, isovalue: f32, index: u64) -> Option<Estimate> {
         let scene = &self.baked.scene;
         let side = scene.surface.outside;
         let position = p.as_vec3();
-        let Some(normal) = scene.normal(position.as_dvec3(), side) else { return self.baked.radiance(side, p) };
+        let Some(normal) = scene.normal(position.as_dvec3(), side) else {
+            return Some(Estimate { mean: self.baked.radiance(side, p)?, ..Estimate::default() });
+        };
         let receiver = Receiver { position, normal, isovalue, departure: Departure::Surface(side) };
         self.leaving(&receiver, scene.surface.albedo.at(f64::from(isovalue)), scene.surface.emission, index)
     }
@@ -295,17 +304,17 @@ mod tests {
         baked
     }
 
-    /// What leaves places all over a sphere, less what is expected there.
+    /// What leaves places all over a sphere, less what is expected there, and the mean of the variances that are said.
     fn found(
         baked: &BakedVolume,
         [shadow_rays, gather_rays]: [u32; 2],
         (radius, places): (f64, u32),
         expected: impl Fn(DVec3, DVec3) -> f64,
-    ) -> Moments {
+    ) -> (Moments, f64) {
         let device = Device::new(0).unwrap();
         let tracer = GraphTracer::new(&device, &baked.scene).unwrap();
         let gather = FinalGather::new(baked, &tracer, FinalGatherSettings { shadow_rays, gather_rays }).unwrap();
-        let mut off = Moments::default();
+        let (mut off, mut said) = (Moments::default(), 0.0);
         for i in 0..places {
             let z = 1.0 - 2.0 * (f64::from(i) + 0.5) / f64::from(places);
             let turn = TAU * f64::from(i) * 0.618_034;
@@ -313,10 +322,11 @@ mod tests {
             let p = baked.lattice().to_index(radius * n);
             let c = baked.scene.field.value(p) as f32;
             let light = gather.outside(p, c, u64::from(i)).unwrap();
-            off.push(light.x - expected(p, baked.scene.normal(p, baked.scene.surface.outside).unwrap()));
+            said += light.variance / f64::from(places);
+            off.push(light.mean.x - expected(p, baked.scene.normal(p, baked.scene.surface.outside).unwrap()));
         }
         assert!(gather.rays() >= u64::from(places * gather_rays));
-        off
+        (off, said)
     }
 
     /// Within a sphere that glows e and reflects ρ there is e / (1 − ρ) everywhere. Of a bake that is off by d a few
@@ -329,10 +339,16 @@ mod tests {
             let wrong = baked(spheres(Side::Lower, Vec::new()), (within + off) as f32, None);
             // √n / 4 is 1 cell, and the sphere 28 wide; 32 cells; 1 and 12.
             for (rays, radius, seen, most) in [(16, 0.7, off, 0.02), (16384, 0.7, 0.0, 0.004), (16, 0.3, 0.0, 0.04)] {
-                let off_by = found(&wrong, [1, rays], (radius, 400 / rays.ilog2()), |_, _| within + ALBEDO * seen);
+                let places = 400 / u32::ilog2(rays);
+                let (off_by, said) = found(&wrong, [1, rays], (radius, places), |_, _| within + ALBEDO * seen);
                 let allowed = 0.02 * seen + 4.5 * off_by.std_error();
                 let right = allowed < most && off_by.mean().abs() < allowed;
                 assert!(right, "{rays} rays, off by {off}: {} ± {allowed}", off_by.mean());
+                // Not more than that of independent rays, which is known to √(2/n).
+                let share = off_by.variance() / said;
+                println!("{rays} rays, off by {off}: {share} of the variance that is said");
+                let limit = 1.0 + 4.5 * (2.0 / f64::from(places)).sqrt();
+                assert!(share > 0.05 && share < limit, "{rays} rays, off by {off}: {share} of {said}");
             }
         }
     }
@@ -347,9 +363,9 @@ mod tests {
         let own = scene.clone();
         let split = baked(scene, 9.0, Some([0.25, 0.1]));
         let direct = |p, n| reflected(DVec3::splat(ALBEDO), open_irradiance(&own, p, n)).x;
-        let off = found(&split, [64, 0], (0.7, 300), |p, n| 0.25 + direct(p, n));
+        let (off, _) = found(&split, [64, 0], (0.7, 300), |p, n| 0.25 + direct(p, n));
         assert!(off.mean().abs() < 1e-3 && off.variance() < 1e-4, "{} {}", off.mean(), off.variance());
-        let lit = found(&split, [64, 0], (0.7, 300), |_, _| 0.25);
+        let (lit, _) = found(&split, [64, 0], (0.7, 300), |_, _| 0.25);
         assert!(lit.mean() > 0.01, "{}", lit.mean());
     }
 

@@ -157,7 +157,9 @@ impl Compare {
         #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
         let shown = |p: DVec3, index| {
             let isovalue = || baked.scene.field.value(p) as f32;
-            let light = gather.as_ref().map_or_else(|| baked.radiance(side, p), |g| g.outside(p, isovalue(), index));
+            let light = gather
+                .as_ref()
+                .map_or_else(|| baked.radiance(side, p), |g| Some(g.outside(p, isovalue(), index)?.mean));
             light.expect("the outside is stored")
         };
         let stage = progress.stage("paths", 2 * self.points as u64);

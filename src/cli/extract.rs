@@ -18,7 +18,8 @@ use std::time::Instant;
 #[command(after_help = "\
 From a bake, vertices also hold its light, as colours for the eye (exposed; sRGB-encoded but in .glb, whose colours are linear)
 and, in .ply as `radiance_r`, `radiance_g`, `radiance_b` and in .vtp as `radiance`, linear and not exposed. It is the light of the
-outside; that of the inside, of a bake with --sides both, is in the bake's array `radiance_inside` (isolume export).
+outside; that of the inside, of a bake with --sides both, is in the bake's array `radiance_inside` (isolume export). By rays
+(--gather-rays), `std_error` says what noise they leave in its luminance, at most.
 
 Examples:
   isolume extract head.nii.gz --isovalue 80 -o head.ply
@@ -78,10 +79,12 @@ impl Extract {
         let radiance = found.as_ref().map(|f| &f.radiance);
         let channels: Option<[Vec<f32>; 3]> = radiance.map(|r| [0, 1, 2].map(|c| channel(r, c)));
         let colours = radiance.zip(baked.as_ref()).map(|(r, b)| display_colours(r, b.exposure));
-        let properties: Vec<(&str, &[f32])> = match &channels {
+        let mut properties: Vec<(&str, &[f32])> = match &channels {
             Some([r, g, b]) => vec![("radiance_r", r), ("radiance_g", g), ("radiance_b", b)],
             None => Vec::new(),
         };
+        let std_error = found.as_ref().and_then(|f| f.std_error.as_ref());
+        properties.extend(std_error.map(|std_error| ("std_error", &std_error[..])));
         unless_interrupted()?;
         let lit = Mesh { colours: colours.as_deref(), ..mesh.export(&properties) };
         // Where it can be said, for compare.

@@ -1,6 +1,7 @@
 //! Rays from what is looked at, for the verbs that look at a bake.
 
 use super::device;
+use crate::direct::Estimate;
 use crate::embree::GraphTracer;
 use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
@@ -44,6 +45,8 @@ const MOST: u32 = 1 << 20;
 /// Light of a mesh's vertices and the rays that it cost.
 pub(super) struct Gathered {
     pub(super) radiance: Vec<DVec3>,
+    /// Of its luminance, if rays found it.
+    pub(super) std_error: Option<Vec<f32>>,
     pub(super) rays: u64,
 }
 
@@ -58,7 +61,9 @@ pub(super) fn light(
     positions: &[DVec3],
     progress: Progress,
 ) -> Result<Gathered> {
-    let Some(settings) = settings else { return Ok(Gathered { radiance: texture(baked, positions)?, rays: 0 }) };
+    let Some(settings) = settings else {
+        return Ok(Gathered { radiance: texture(baked, positions)?, std_error: None, rays: 0 });
+    };
     settings.check(baked)?;
     let tracer = GraphTracer::new(&device()?, &baked.scene)?;
     let gather = FinalGather::new(baked, &tracer, settings)?;
@@ -66,10 +71,11 @@ pub(super) fn light(
     let at = |(index, &x): (usize, &DVec3)| {
         let p = baked.lattice().to_index(x);
         let isovalue = baked.scene.field.value(p) as f32;
-        if stage.tick(1) { gather.outside(p, isovalue, index as u64) } else { Some(DVec3::ZERO) }
+        if stage.tick(1) { gather.outside(p, isovalue, index as u64) } else { Some(Estimate::default()) }
     };
-    let radiance: Option<Vec<DVec3>> = positions.par_iter().enumerate().with_min_len(16).map(at).collect();
+    let light: Option<Vec<Estimate>> = positions.par_iter().enumerate().with_min_len(16).map(at).collect();
     stage.end()?;
-    let radiance = radiance.ok_or_else(|| Error::Invalid("the bake does not hold the surface's outside".into()))?;
-    Ok(Gathered { radiance, rays: gather.rays() })
+    let light = light.ok_or_else(|| Error::Invalid("the bake does not hold the surface's outside".into()))?;
+    let (radiance, std_error) = light.into_iter().map(|l| (l.mean, l.variance.sqrt() as f32)).unzip();
+    Ok(Gathered { radiance, std_error: Some(std_error), rays: gather.rays() })
 }

@@ -3,6 +3,7 @@
 use super::{ok, refused, text};
 use exr::prelude::read_all_flat_layers_from_file;
 use glam::DVec3;
+use isolume::export::ply;
 use isolume::volume::{Lattice, Samples, Volume};
 use std::path::Path;
 
@@ -100,14 +101,26 @@ fn meshes_by_rays_are_nearer_to_paths() {
         println!("{file}: texture {texture}, split {split}, shadow rays {shadows}, 32 rays {few}, 512 {many}");
         assert!(few < shadows && many < 0.6 * few && many < 0.15 * texture && radiance == texture);
     }
-    let made = |more: &[&str]| {
-        let given = ["extract", "whole.vti", "--isovalue", "30", "-o", "m.ply", "--json", "-q", "--gather-rays", "16"];
-        let said: serde_json::Value = serde_json::from_slice(&ok(dir, &[&given[..], more].concat()).stdout).unwrap();
+    let made = |n: u64, more: &[&str]| {
+        let (given, number) =
+            (["extract", "whole.vti", "--isovalue", "30", "-o", "m.ply", "--json", "-q"], n.to_string());
+        let more = [&["--gather-rays", &number], more].concat();
+        let said: serde_json::Value =
+            serde_json::from_slice(&ok(dir, &[&given[..], &more[..]].concat()).stdout).unwrap();
         let (rays, vertices) = (said["rays"].as_u64().unwrap(), said["vertices"].as_u64().unwrap());
-        assert!(rays >= 16 * vertices && rays < 200 * vertices, "{said}");
+        assert!(rays >= n * vertices && rays < 12 * n * vertices, "{said}");
         (rays, std::fs::read(dir.join("m.ply")).unwrap())
     };
-    assert!(made(&[]) == made(&["--threads", "1"]) && made(&[]) != made(&["--shadow-rays", "8"]));
+    assert!(made(16, &[]) == made(16, &["--threads", "1"]) && made(16, &[]) != made(16, &["--shadow-rays", "8"]));
+    let noise = |n: u64| {
+        made(n, &[]);
+        let mesh = ply::read(dir.join("m.ply")).unwrap();
+        let sum = |name: &str| mesh.property(name).unwrap().iter().sum::<f64>();
+        sum("std_error") / sum("radiance_g")
+    };
+    let [few, more] = [16, 256].map(noise);
+    println!("standard error of 16 rays {few}, of 256 {more}");
+    assert!(few > 3.0 * more && few < 0.3 && more > 0.002, "{few} {more}");
     // The same points of a mesh, against references.
     let paths = ["reference", "whole.vti", "--isovalue", "30", "--samples", "256", "--vertices", "800", "-q"];
     for (seed, file) in [("1", "r1.ply"), ("2", "r2.ply")] {
