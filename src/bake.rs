@@ -336,11 +336,6 @@ pub fn left_out(scene: &Scene, grid: &GridSize) -> Result<Option<f64>> {
     Ok((most > UNKNOWN).then_some(most))
 }
 
-/// Whether sweeps would leave walls dark that the luminaires light, of any field: within solids that are not stored.
-pub fn leaves_walls_dark(scene: &Scene) -> bool {
-    (0..scene.fields()).any(|n| sweep::leaves_walls_dark(&scene.lit(n)))
-}
-
 /// Bakes with their reports from what an engine gave.
 fn finish(
     jobs: &[Job],

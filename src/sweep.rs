@@ -315,7 +315,8 @@ pub fn sweep_resumable(
     Ok(SweepResult { sides, lit, flats, bounces, residual, stopped, counts })
 }
 
-/// The sides that are swept: the stored ones, and the other one if light passes to it.
+/// The sides that are swept: the stored ones, and the other one if light passes to it, or the luminaires mostly light
+/// it: walls are seen there.
 pub(crate) fn swept_sides(scene: &Scene) -> Vec<Side> {
     // Only around the open rims of level sets: outside Ω, or beside samples that are not finite.
     let margin = {
@@ -324,18 +325,17 @@ pub(crate) fn swept_sides(scene: &Scene) -> Vec<Side> {
     };
     let rims = (margin || scene.field.has_gaps()) && scene.boundary == Boundary::Open;
     let coupled = rims && !scene.polygons().is_empty();
+    let walls = scene.boundary == Boundary::Open && scene.polygons().iter().any(|p| p.albedo != DVec3::ZERO);
     let mut sides = scene.surface.stored_sides();
-    if coupled && sides.len() == 1 {
+    if sides.len() == 1 && (coupled || walls && lit_mostly_within(scene)) {
         sides.push(sides[0].opposite());
     }
     sides
 }
 
-/// Whether the luminaires light mostly the side of level sets that is not swept: walls on that side stay dark, which
-/// rays would show lit.
-pub fn leaves_walls_dark(scene: &Scene) -> bool {
-    let shown = scene.boundary == Boundary::Open && scene.polygons().iter().any(|p| p.albedo != DVec3::ZERO);
-    matches!(swept_sides(scene)[..], [side] if shown && open_over_sweep(scene, side) < 0.5)
+/// Whether the luminaires stand mostly within solids, over the whole sweep.
+pub fn lit_mostly_within(scene: &Scene) -> bool {
+    open_over_sweep(scene, scene.surface.outside) < 0.5
 }
 
 /// What the replicates of one sweep share.

@@ -312,8 +312,13 @@ fn no_light_seeps_along_walls() {
     // The luminaire's lowest corner is above all of these.
     let most = scene.polygons()[scene.luminaires()[0] as usize].vertices().iter().map(|&x| height(x));
     let most = (most.fold(f64::INFINITY, f64::min) - 0.2 - sweep.lo()) / (sweep.hi() - sweep.lo());
+    // Stored are the lower sides; walls are lit as if both were.
+    let (field, walls) = (Field::new(&volume, sweep).unwrap(), scene.polygons().to_vec());
+    let dark = Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap();
     for engine in [Engine::Sweep, Engine::Photon] {
         let bake = baked(&scene, engine);
+        let walls = baked(&dark, engine).flats;
+        assert!(walls == bake.flats && walls.iter().flatten().all(|light| light.within.is_some()), "{engine:?}");
         let light = brightest_by_side(&scene, &bake, most);
         let touches = |p: DVec3| p.cmpeq(DVec3::ZERO).any() || p.cmpeq(lattice.far()).any();
         let walls = errors_of(&scene, &bake, Side::Higher, 5, 1024, |p| touches(p) && scene.field.value(p) < most);

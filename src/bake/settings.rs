@@ -1,6 +1,6 @@
 //! What a user may set about a bake, and the presets.
 
-use super::{can_sweep, leaves_walls_dark, left_out};
+use super::{can_sweep, left_out};
 use crate::error::{Error, Result};
 use crate::illumination_grid::GridSize;
 use crate::isovalue_axis::IsovalueAxis;
@@ -287,7 +287,7 @@ impl BakeOptions {
 
     /// The engine for a scene: the one that is asked for; else sweeps, which are faster for the same error, unless
     /// options that only photons know are set, the scene cannot be swept, or sweeps would leave out what its surfaces
-    /// reflect or walls that its luminaires light.
+    /// reflect.
     fn engine(&self, scene: &Scene) -> Result<Engine> {
         let [photons, sweeps] = self.asks_for();
         match (self.engine, photons, sweeps) {
@@ -298,9 +298,7 @@ impl BakeOptions {
             (None, Some(_), None) => Ok(Engine::Photon),
             (None, None, Some(_)) => Ok(Engine::Sweep),
             (None, None, None) => {
-                let swept = can_sweep(scene).is_ok()
-                    && !leaves_walls_dark(scene)
-                    && left_out(scene, &self.grid.unwrap_or(GridSize::OWN))?.is_none();
+                let swept = can_sweep(scene).is_ok() && left_out(scene, &self.grid.unwrap_or(GridSize::OWN))?.is_none();
                 Ok(if swept { Engine::Sweep } else { Engine::Photon })
             }
         }

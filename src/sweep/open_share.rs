@@ -1,6 +1,7 @@
 //! The share of a luminaire outside the matter. A luminaire may stand in the volume; then part of it lies within the
 //! solid of an isovalue, and how much its points say of that is the same error at all receivers.
 
+use super::ends;
 use crate::direct::luminance;
 use crate::field::Field;
 use crate::flattened::Side;
@@ -59,16 +60,19 @@ fn heights(field: &Field, points: impl Iterator<Item = DVec3>) -> impl Iterator<
 
 /// The share of what a scene's luminaires emit over the whole sweep that is open on one side; 1 if there are none.
 pub(super) fn open_over_sweep(scene: &Scene, side: Side) -> f64 {
-    let set = Sobol::set(0, Stage::Sweep, 0);
+    let (set, inside) = (Sobol::set(0, Stage::Sweep, 0), ends::inside(scene));
     let (mut all, mut closed) = (0.0, 0.0);
     for &number in scene.luminaires() {
         let light = &scene.polygons()[number as usize];
         let flux = light.area() * luminance(light.emission);
+        all += flux;
+        if !inside[number as usize] {
+            continue;
+        }
         // At h a point is closed below c = h on the lower side, above it on the higher one.
         let share = |h: f32| f64::from(if side == Side::Lower { h.clamp(0.0, 1.0) } else { 1.0 - h.clamp(0.0, 1.0) });
         let points = (0..ROUGHLY).map(|i| light.sample(set.point2(i, 0)));
         closed += flux * heights(&scene.field, points).map(share).sum::<f64>() / f64::from(ROUGHLY);
-        all += flux;
     }
     if all > 0.0 { 1.0 - closed / all } else { 1.0 }
 }

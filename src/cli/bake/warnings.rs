@@ -1,11 +1,11 @@
 //! What a bake warns of before it begins.
 
-use crate::bake::{BakeOptions, BakeSettings, Engine, common_size, leaves_walls_dark, left_out};
+use crate::bake::{BakeOptions, BakeSettings, Engine, common_size, left_out};
 use crate::error::Result;
 use crate::flattened::Side;
 use crate::illumination_grid::GridSize;
 use crate::scene::{Boundary, Scene};
-use crate::sweep::lit_within_solids;
+use crate::sweep::{lit_mostly_within, lit_within_solids};
 use crate::volume::Volume;
 use glam::DVec3;
 
@@ -42,6 +42,13 @@ pub(super) fn warnings(
                 .into(),
         );
     }
+    let mostly_within = |scene: &Scene| !scene.surface.both_sides && lit_mostly_within(scene);
+    if (0..scene.fields()).any(|n| mostly_within(&scene.lit(n))) {
+        lines.push(
+            "the luminaires stand mostly within the solids, whose outside is stored; use --sides both, or the other outside"
+                .into(),
+        );
+    }
     if let Some([a, b]) = scene.coplanar_caps() {
         lines.push(format!(
             "boundary = \"capped\": '{a}' and '{b}' end in the same faces; where both are solid there, neither cap lies \
@@ -49,21 +56,15 @@ pub(super) fn warnings(
         ));
     }
     // Sweeps that nobody asked for were chosen because they leave out nothing to speak of.
-    if settings.engine == Engine::Sweep && !options.leaves_engine() {
-        if leaves_walls_dark(scene) {
-            lines.push(
-                "the luminaires stand mostly within the solids, where sweeps leave walls dark; use --engine photon, or the \
-                 other outside"
-                    .into(),
-            );
-        }
-        if let Some(share) = left_out(scene, &settings.grid)? {
-            lines.push(format!(
-                "samples jump over the whole sweep at {:.0} % of the points that surfaces need, where sweeps leave out \
-                 what surfaces reflect; use --engine photon, a finer --grid or smoother samples",
-                100.0 * share
-            ));
-        }
+    if settings.engine == Engine::Sweep
+        && !options.leaves_engine()
+        && let Some(share) = left_out(scene, &settings.grid)?
+    {
+        lines.push(format!(
+            "samples jump over the whole sweep at {:.0} % of the points that surfaces need, where sweeps leave out what \
+             surfaces reflect; use --engine photon, a finer --grid or smoother samples",
+            100.0 * share
+        ));
     }
     if options.grid.is_none() {
         lines.extend(long_voxels(scene));
