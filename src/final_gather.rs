@@ -6,7 +6,7 @@
 //! averages over it. What lands within a few voxels sees that blur as well as the eye does: such rays go on as paths.
 
 use crate::brdf::reflected;
-use crate::direct::{Estimate, Receiver, direct_irradiance, luminance};
+use crate::direct::{Estimate, Receiver, direct_irradiance};
 use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
 use crate::flat;
@@ -122,7 +122,8 @@ impl<'a, T: Tracer> FinalGather<'a, T> {
         let direct = direct_irradiance(scene, tracer, receiver, settings.shadow_rays, (SEED, Stage::Direct, index));
         let rays = direct.rays + gathered.rays;
         self.rays.fetch_add(rays, Ordering::Relaxed);
-        let scale = luminance(albedo) / PI;
+        // No less than what colours make of it.
+        let scale = albedo.max_element() / PI;
         Some(Estimate {
             mean: (reflected(albedo, direct.mean) + rest).max(DVec3::ZERO),
             variance: (direct.variance + gathered.variance) * scale * scale,
@@ -208,9 +209,8 @@ pub fn seen(baked: &BakedVolume, ray: &FlattenedRay, hit: FlattenedHit) -> Optio
 fn wall(baked: &BakedVolume, (id, within): (u32, bool), p: DVec3, isovalue: f32) -> Option<DVec3> {
     // Those without a texture reflect nothing.
     let Some(light) = &baked.flats[id as usize] else { return Some(DVec3::ZERO) };
-    let stored = !within || light.within.is_some() || baked.scene.gathers_within();
     let [u, v] = baked.scene.polygons()[id as usize].texture(baked.lattice().to_world(p));
-    stored.then(|| light.seen(within).lookup([u, v, f64::from(isovalue)]))
+    Some(light.seen(within)?.lookup([u, v, f64::from(isovalue)]))
 }
 
 /// What the texture of the cap on a face of Ω holds at local position `p`, if it has one: each bake holds its own.
@@ -243,7 +243,7 @@ impl KnownLight for Landings<'_> {
             Target::Cap(_, Side::Higher) => None,
             Target::Cap(face, Side::Lower) => Some(cap(self.baked, face, position, isovalue).unwrap_or_default()),
             Target::Polygon(id) => {
-                let one_for_all = self.baked.flats[id as usize].as_ref().is_some_and(|light| light.within.is_none());
+                let one_for_all = self.baked.flats[id as usize].as_ref().is_some_and(|light| light.own().is_none());
                 if within && one_for_all { None } else { wall(self.baked, (id, within), position, isovalue) }
             }
         }
@@ -258,7 +258,7 @@ mod tests {
     use crate::direct::open_irradiance;
     use crate::embree::{Device, GraphTracer};
     use crate::field::{Field, Sweep};
-    use crate::flat::{FlatLight, FlatTexture};
+    use crate::flat::{FlatLight, FlatTexture, Within};
     use crate::polygon::Polygon;
     use crate::progress::Progress;
     use crate::rng::Rng;
@@ -370,26 +370,26 @@ mod tests {
     }
 
     /// A room half full of a solid, seen from far in front of it: its walls show each side's own light, whatever f32
-    /// makes of where a ray lands; within the solid none, or that of all, if no other is stored.
+    /// makes of where a ray lands; within the solid none, or that of all, if no other is known. So do gather rays.
     #[test]
     fn walls_show_the_side_that_is_seen() {
         let lattice = Lattice::aligned([17; 3], DVec3::splat(0.3), DVec3::splat(1.0 / 16.0)).unwrap();
         let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[2] as f32).collect();
         let volume = Volume::new("planes", lattice.clone(), Samples::F32(samples)).unwrap();
-        let room = |both_sides: bool, outside: Side| {
+        let room = |outside: Side| {
             let field = Field::new(&volume, Sweep::new(0.0, 16.0).unwrap()).unwrap();
             let walls = cornell_box(&lattice, 0.0).unwrap();
-            Scene::new(field, Surface { both_sides, outside, ..Surface::default() }, Boundary::Open, walls).unwrap()
+            Scene::new(field, Surface { outside, ..Surface::default() }, Boundary::Open, walls).unwrap()
         };
         let device = Device::new(1).unwrap();
-        let cases = [(false, false), (true, false), (false, true), (true, true)];
-        for ((both, own), outside) in cases.into_iter().flat_map(|case| [(case, Side::Lower), (case, Side::Higher)]) {
-            let mut baked = baked(room(both, outside), 0.0, None);
-            let shows = |light: f32| {
-                let black = FlatTexture::black([4, 4, 4]);
-                FlatTexture { texels: vec![[light; 3]; black.texels.len()], ..black }
-            };
-            let light = FlatLight { outside: shows(1.0), within: own.then(|| shows(2.0)) };
+        let shows = |light: f32| {
+            let black = FlatTexture::black([4, 4, 4]);
+            FlatTexture { texels: vec![[light; 3]; black.texels.len()], ..black }
+        };
+        let cases = [(Within::Same, Some(1.0)), (Within::Own(shows(2.0)), Some(2.0)), (Within::Unknown, None)];
+        for ((known, shown), outside) in cases.iter().flat_map(|case| [(case, Side::Lower), (case, Side::Higher)]) {
+            let mut baked = baked(room(outside), 0.0, None);
+            let light = FlatLight { outside: shows(1.0), within: known.clone() };
             baked.flats.iter_mut().flatten().for_each(|flat| *flat = light.clone());
             let scene = &baked.scene;
             let tracer = GraphTracer::new(&device, scene).unwrap();
@@ -406,17 +406,31 @@ mod tests {
                     continue;
                 }
                 let within = (height > 0.0) == (outside == Side::Lower);
-                let expected = match (within, own, both) {
-                    (true, true, _) => Some(Vec3::splat(2.0)),
-                    (true, false, false) => None,
-                    _ => Some(Vec3::ONE),
-                };
+                let expected = if within { shown.map(Vec3::splat) } else { Some(Vec3::ONE) };
                 walls[usize::from(within)] += 1;
                 let emission = scene.polygons()[id as usize].emission;
-                let shown = seen(&baked, &ray, hit).map(|light| (light - emission).as_vec3());
-                assert_eq!(shown, expected, "{both} {own} {outside:?} {height}");
+                let found = seen(&baked, &ray, hit).map(|light| (light - emission).as_vec3());
+                assert_eq!(found, expected, "{known:?} {outside:?} {height}");
             }
             assert!(walls[0] > 500 && walls[1] > 500, "{walls:?}");
+            // From the middle of a wall, above and below the level set.
+            let x = scene.polygons().iter().position(|p| p.name == "x_min").unwrap() as u32;
+            let [above, below] = [0.25, 0.75].map(|isovalue| {
+                let (position, departure) = (Vec3::new(0.0, 8.0, 8.0), Departure::Polygon(x));
+                let receiver = Receiver { position, normal: DVec3::X, isovalue, departure };
+                gathered_irradiance(scene, &tracer, &Inside, &receiver, 256, (1, 1)).estimate.mean.x
+            });
+            let [within, without] = if outside == Side::Lower { [above, below] } else { [below, above] };
+            assert!(within > 1.5 && without == 0.0, "{outside:?}: {within} {without}");
+        }
+    }
+
+    /// Light on walls within solids only.
+    struct Inside;
+
+    impl KnownLight for Inside {
+        fn radiance(&self, _: &Scene, landed: SurfacePoint, _: &mut u64) -> Option<DVec3> {
+            Some(DVec3::splat(f64::from(u8::from(landed.within))))
         }
     }
 

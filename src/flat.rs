@@ -315,21 +315,48 @@ impl FlatTexture {
 pub struct FlatLight {
     /// To all that is not within solids.
     pub outside: FlatTexture,
-    /// To what is within the solids that stand on it, if that is known: their own light in all texels that they cover,
-    /// whatever else lies in these.
-    pub within: Option<FlatTexture>,
+    /// To what is within the solids that stand on it.
+    pub within: Within,
+}
+
+/// What a flat shows within the solids that stand on it.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Within {
+    /// What it shows outside, since nothing tells the two apart.
+    Same,
+    /// Their own light in all texels that they cover, whatever else lies in these.
+    Own(FlatTexture),
+    /// Nobody looked for light there.
+    Unknown,
 }
 
 impl FlatLight {
-    /// The texture that is seen from within solids, or not; the one for all if there is no other.
+    /// One texture for all.
+    pub fn for_all(texture: FlatTexture) -> Self {
+        Self { outside: texture, within: Within::Same }
+    }
+
+    /// What is seen from within solids, or not; `None` if that is not known.
     #[inline]
-    pub fn seen(&self, within: bool) -> &FlatTexture {
-        self.within.as_ref().filter(|_| within).unwrap_or(&self.outside)
+    pub fn seen(&self, within: bool) -> Option<&FlatTexture> {
+        match &self.within {
+            Within::Own(texture) if within => Some(texture),
+            Within::Unknown if within => None,
+            _ => Some(&self.outside),
+        }
+    }
+
+    /// The texture that is seen from within solids only.
+    pub fn own(&self) -> Option<&FlatTexture> {
+        match &self.within {
+            Within::Own(texture) => Some(texture),
+            Within::Same | Within::Unknown => None,
+        }
     }
 
     /// Its one or two textures, the outside's first.
     pub fn textures(&self) -> impl Iterator<Item = &FlatTexture> {
-        std::iter::once(&self.outside).chain(&self.within)
+        std::iter::once(&self.outside).chain(self.own())
     }
 }
 

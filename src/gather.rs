@@ -177,7 +177,11 @@ fn found(
     {
         return Some(DVec3::ZERO);
     }
-    let within = scene.leaves_within(ray.departure);
+    let within = match (ray.departure, hit.target) {
+        // Walls may stand in and out of solids.
+        (Departure::Polygon(_) | Departure::Cap(..), Target::Polygon(_)) => scene.solid_holds(ray, hit.t),
+        _ => scene.leaves_within(ray.departure),
+    };
     let landed = SurfacePoint { target: hit.target, within, position: ray.at(hit.t), isovalue: ray.isovalue };
     light.radiance(scene, landed, misses)
 }

@@ -34,7 +34,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 pub struct CacheSettings {
     /// Shadow rays per node and luminaire; with two, what is reflected among many surfaces is 3 % too dark.
     pub node_shadow_rays: u32,
-    /// Shadow rays per texel of a flat and luminaire.
+    /// Shadow rays per texel of a flat and luminaire; four times as many, of at least 32, beside texels that see one in
+    /// part.
     pub flat_shadow_rays: u32,
     /// Texels along the longer edge of a flat.
     pub flat_resolution: usize,
@@ -276,8 +277,9 @@ impl RadianceCache {
     }
 
     fn flat(&self, number: usize, within: bool, [u, v]: [f64; 2], isovalue: f32) -> DVec3 {
-        let light = self.flats[number].as_ref();
-        light.map_or(DVec3::ZERO, |light| light.seen(within).lookup([u, v, f64::from(isovalue)]))
+        // Where nobody looked for light nothing receives any.
+        let texture = self.flats[number].as_ref().map(|light| light.seen(within).unwrap_or(&light.outside));
+        texture.map_or(DVec3::ZERO, |texture| texture.lookup([u, v, f64::from(isovalue)]))
     }
 
     /// What a white surface of field `number` would reflect where its level set `isovalue` is at a position: the mean

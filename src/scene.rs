@@ -236,17 +236,21 @@ impl Scene {
         }
     }
 
-    /// Whether `ray` is at `t` in a solid, of any field, or where one touches the wall that it meets there.
+    /// Whether `ray` is at `t` in a solid, of any field that is lit with this one, or where one touches the wall that
+    /// it meets there. On a level set it is.
+    #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
     pub fn solid_holds(&self, ray: &FlattenedRay, t: f32) -> bool {
-        let (p, c) = (ray.at(t), f64::from(ray.isovalue));
+        let (p, c) = (ray.at(t), ray.isovalue);
         let rounding = 16.0 * f64::from(f32::EPSILON) * p.abs().max(ray.origin.as_dvec3().abs()).max_element().max(1.0);
         let holds = |field: &Field, p: DVec3, slack: f64, outside: Side| {
             // NaN beside samples that are not finite: nothing is there.
-            let h = field.lattice().nearest(p, slack).map_or(f64::NAN, |p| field.value(p));
-            if outside == Side::Lower { h > c } else { h < c }
+            let h = field.lattice().nearest(p, slack).map_or(f32::NAN, |p| field.value(p) as f32);
+            if outside == Side::Lower { h >= c } else { h < c }
         };
+        // Those that are not lit together do not see each other.
+        let companions = if self.policy == Policy::Joint { &self.companions[..] } else { &[] };
         holds(&self.field, p, rounding, self.surface.outside)
-            || self.companions.iter().any(|companion| {
+            || companions.iter().any(|companion| {
                 let q = companion.to_index(p);
                 let slack = (companion.to_index(p + rounding) - q).abs().max_element();
                 holds(&companion.member.field, q, slack, companion.member.surface.outside)
@@ -257,11 +261,6 @@ impl Scene {
     #[inline]
     pub fn sees_front(&self, ray: &FlattenedRay, id: u32) -> bool {
         (self.lattice().axes() * ray.direction.as_dvec3()).dot(self.polygons[id as usize].normal()) < 0.0
-    }
-
-    /// Whether light within solids is stored, of any field.
-    pub fn gathers_within(&self) -> bool {
-        self.surface.both_sides || self.companions.iter().any(|c| c.member.surface.both_sides)
     }
 
     /// E₀: the unoccluded irradiance of a patch at the centre of the (first) volume that faces the strongest luminaire;

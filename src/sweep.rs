@@ -301,7 +301,7 @@ pub fn sweep_resumable(
     }
     let State { done, total, flats: mut sums, bounces, residual, counts } = state;
     sums.iter_mut().flatten().flatten().for_each(|x| *x /= done.max(1) as f32);
-    let flats = flats.export(&sums, scene.surface.outside);
+    let flats = flats.export(&sums, &sides, scene.surface.outside);
     let mut sides = total.finish(&rows, &Focus { dims, lit: |at| lit[at] }, done, settings.direct);
     let world = |o: usize| scene.lattice().to_world(DVec3::from_array(scene.lattice().ijk(o).map(|i| i as f64)));
     let dark = slits.hidden.iter().map(|hidden| hidden.0).filter(|&o| scene.covers(world(o)));

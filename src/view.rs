@@ -6,7 +6,7 @@ pub mod codec;
 use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
-use crate::flat::{self, FlatLight, FlatTexture};
+use crate::flat::{self, FlatLight, FlatTexture, Within};
 use crate::flattened::Side;
 use crate::mask::Mask;
 use crate::polygon::Polygon;
@@ -191,7 +191,7 @@ fn describe_flat(baked: &BakedVolume, frame: &Frame, n: usize, factor: f32, byte
     };
     let light = baked.flats[n].as_ref();
     let outside = light.map(|light| texture(&light.outside));
-    let within = light.and_then(|light| light.within.as_ref()).map(texture);
+    let within = light.and_then(FlatLight::own).map(texture);
     let emission = polygon.map_or(DVec3::ZERO, |p| p.emission * baked.exposure);
     Some(json!({
         "name": polygon.map_or("cap", |p| p.name.as_str()),
@@ -206,6 +206,7 @@ fn describe_flat(baked: &BakedVolume, frame: &Frame, n: usize, factor: f32, byte
         "dv": dual(g, e),
         "texture": outside,
         "within": within,
+        "outsideOnly": light.is_some_and(|light| light.within == Within::Unknown),
     }))
 }
 

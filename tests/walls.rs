@@ -318,7 +318,7 @@ fn no_light_seeps_along_walls() {
     for engine in [Engine::Sweep, Engine::Photon] {
         let bake = baked(&scene, engine);
         let walls = baked(&dark, engine).flats;
-        assert!(walls == bake.flats && walls.iter().flatten().all(|light| light.within.is_some()), "{engine:?}");
+        assert!(walls == bake.flats && walls.iter().flatten().all(|light| light.own().is_some()), "{engine:?}");
         let light = brightest_by_side(&scene, &bake, most);
         let touches = |p: DVec3| p.cmpeq(DVec3::ZERO).any() || p.cmpeq(lattice.far()).any();
         let walls = errors_of(&scene, &bake, Side::Higher, 5, 1024, |p| touches(p) && scene.field.value(p) < most);
@@ -351,7 +351,7 @@ fn brightest_by_side(scene: &Scene, bake: &Bake, most: f64) -> [[f32; 3]; 2] {
             let [u, v, c] = [(); 3].map(|()| rng.unit());
             let p = lattice.to_index(scene.polygons()[number].at([u, v])).clamp(DVec3::ZERO, far);
             let within = scene.field.value(p) > c * most;
-            let found = flat.seen(within).lookup([u, v, c * most]).as_vec3().to_array();
+            let found = flat.seen(within).unwrap().lookup([u, v, c * most]).as_vec3().to_array();
             brighter(&mut light[usize::from(within)][2], found);
         }
     }

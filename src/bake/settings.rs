@@ -351,7 +351,7 @@ pub struct BakeSettings {
     pub wall_resolution: usize,
     /// Texels along the isovalue.
     pub wall_isovalues: usize,
-    /// Shadow rays per texel and luminaire.
+    /// Shadow rays per texel and luminaire; four times as many, of at least 32, beside texels that see one in part.
     pub wall_shadow_rays: u32,
     /// How photon power becomes irradiance.
     #[serde(skip)]

@@ -226,11 +226,6 @@ impl Bake {
                 );
             }
         }
-        for warning in warnings(&loaded.scene, &volumes, &options, &settings)? {
-            if said.insert(warning.clone()) {
-                say!("warning: {warning}");
-            }
-        }
         let device = device()?;
         let memory = match self.max_memory {
             Some(most) => {
@@ -251,7 +246,14 @@ impl Bake {
             }
             None => MemoryEstimate::new(&loaded.scene, &volumes, &settings, &device)?,
         };
+        // A trial run may be for another machine.
         let fits = memory.check_machine(settings.engine);
+        let unfit = if self.dry_run { fits.err() } else { fits.map(|()| None)? };
+        for warning in warnings(&loaded.scene, &volumes, &options, &settings)? {
+            if said.insert(warning.clone()) {
+                say!("warning: {warning}");
+            }
+        }
         if progress == Progress::Shown || self.dry_run {
             let engine = match settings.engine {
                 Engine::Sweep => "sweep: every isovalue at once",
@@ -264,8 +266,7 @@ impl Bake {
             }
         }
         if self.dry_run {
-            // It may be for another machine.
-            if let Err(e) = fits {
+            if let Some(e) = unfit {
                 say!("warning: {e}");
             }
             let time = TimeEstimate::new(&loaded.scene, &settings, &device)?;
@@ -279,7 +280,6 @@ impl Bake {
             });
             return Ok((sweep, json));
         }
-        fits?;
         let job = job(&loaded.scene, &settings, &device.version());
         // Of a series, what is there.
         let whole = (self.resume && self.scene.time.is_some()).then(|| self.whole()).flatten();

@@ -19,7 +19,7 @@ use std::time::Instant;
 From a bake, vertices also hold its light, as colours for the eye (exposed; sRGB-encoded but in .glb, whose colours are linear)
 and, in .ply as `radiance_r`, `radiance_g`, `radiance_b` and in .vtp as `radiance`, linear and not exposed. It is the light of the
 outside; that of the inside, of a bake with --sides both, is in the bake's array `radiance_inside` (isolume export). By rays
-(--gather-rays), `std_error` says what noise they leave in its luminance, at most.
+(--gather-rays), `std_error` says what noise they leave in its luminance, as if they were independent.
 
 Examples:
   isolume extract head.nii.gz --isovalue 80 -o head.ply

@@ -8,7 +8,7 @@ use crate::bake::Bake;
 use crate::digits::span;
 use crate::error::{Error, Result};
 use crate::field::{Field, FieldRows, Sweep};
-use crate::flat::{self, FlatLight, FlatTexture};
+use crate::flat::{self, FlatLight, FlatTexture, Within};
 use crate::flattened::Side;
 use crate::illumination_grid::{GridSize, IlluminationGrid};
 use crate::isovalue_axis::IsovalueAxis;
@@ -66,9 +66,12 @@ struct TextureDescription {
     /// Texels of the array before it.
     #[serde(default)]
     start: usize,
-    /// Whether it is what is seen from within solids, if that differs.
+    /// Whether it is what is seen from within solids, if that differs; it follows what is seen from outside.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     inside: bool,
+    /// Whether nothing is known of what is seen from within solids.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    outside_only: bool,
 }
 
 impl TextureDescription {
@@ -212,9 +215,9 @@ pub fn field_file(path: &Path, name: &str) -> PathBuf {
 /// Writes a bake. Point data: `value` (source units, active scalars; in f64 where f32 is too coarse for the sweep, or
 /// does not hold all samples), `radiance` (linear RGB), `rgb` (exposed, clamped, sRGB-encoded), `std_error` (of
 /// luminance), `mask` ([`Mask`]), of a split bake `indirect` and `visible` ([`Split`]); with both sides also
-/// `radiance_inside` and so on. Field data: `wall_<name>` radiance over (u, v, isovalue), with both sides also
-/// `wall_<name>_inside`, which is seen from within solids, `context` the same of all context geometry, exposure, every
-/// number of the report, and all of it as JSON.
+/// `radiance_inside` and so on. Field data: `wall_<name>` radiance over (u, v, isovalue), `wall_<name>_inside` where
+/// something else is known to be seen from within solids, `context` the same of all context geometry (each wall's one
+/// or two after each other), exposure, every number of the report, and all of it as JSON.
 ///
 /// # Errors
 /// `Io` if the file cannot be written.
@@ -237,7 +240,8 @@ fn completed(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
     // Much context geometry would be as many arrays.
     let mut context = Vec::new();
     let flats = bake.flats.iter().enumerate().filter_map(|(n, light)| Some((n, light.as_ref()?)));
-    for (n, i, t) in flats.flat_map(|(n, light)| light.textures().enumerate().map(move |(i, t)| (n, i, t))) {
+    let flats = flats.flat_map(|(n, light)| light.textures().enumerate().map(move |(i, t)| (n, light, i, t)));
+    for (n, light, i, t) in flats {
         let (array, start) = match scene.polygons().get(n) {
             Some(p) if p.other_face != 0 => (CONTEXT.to_owned(), context.len() / 3),
             _ => (format!("wall_{}{}", flat_name(scene, n), suffix(i)), 0),
@@ -257,6 +261,7 @@ fn completed(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
             middle: t.axis.middle(),
             start,
             inside: i > 0,
+            outside_only: light.within == Within::Unknown,
         });
     }
     if !context.is_empty() {
@@ -528,8 +533,11 @@ impl BakedVolume {
             };
             let texture = t.of(texels)?;
             match slot {
-                None if !t.inside => *slot = Some(FlatLight { outside: texture, within: None }),
-                Some(light) if t.inside && light.within.is_none() => light.within = Some(texture),
+                None if !t.inside => {
+                    let within = if t.outside_only { Within::Unknown } else { Within::Same };
+                    *slot = Some(FlatLight { outside: texture, within });
+                }
+                Some(light) if t.inside && light.own().is_none() => light.within = Within::Own(texture),
                 None => return Err(t.wrong("none before it is of the flat's outside")),
                 Some(_) => return Err(t.wrong("another one is of the same flat")),
             }

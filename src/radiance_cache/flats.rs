@@ -5,7 +5,7 @@ use super::CacheSettings;
 use super::openings::{Hidden, Open, Solid, is_open};
 use crate::brdf::reflected;
 use crate::direct::{Estimate, Receiver, direct_irradiance};
-use crate::flat::{self, FlatLight, FlatTexture, Texel};
+use crate::flat::{self, FlatLight, FlatTexture, Texel, Within};
 use crate::neighbourhood::neighbourhood;
 use crate::photon::FlatPhoton;
 use crate::rng::Stage;
@@ -105,7 +105,10 @@ pub(super) fn fill_flat<T: Tracer>(
     let own = open.as_ref().filter(|_| number < scene.polygons().len()).map(|open| {
         let solid = |i: usize| parts[i % parts.len()].covered > 0.0 && open.shares[i] < 1.0;
         let own = (0..lit.len()).into_par_iter().with_min_len(256).map(|i| match solid(i) {
-            true if outer(i) => open.place(i, false).map(|at| estimate(i, at, many).mean),
+            true if outer(i) => open.place(i, false).map(|at| {
+                let roughly = estimate(i, at, few);
+                if roughly.variance > 0.0 { estimate(i, at, many) } else { roughly }.mean
+            }),
             true => lit[i],
             false => None,
         });
@@ -113,18 +116,15 @@ pub(super) fn fill_flat<T: Tracer>(
         let beside: Vec<bool> = (0..lit.len()).into_par_iter().with_min_len(256).map(beside).collect();
         (widened(&own.collect::<Vec<_>>(), dims, &solid), beside)
     });
-    // Pictures show it, if there is any, though nothing else is stored there.
-    let own = own.filter(|(own, _)| {
-        scene.gathers_within() || counts[1] > 0 || own.par_iter().any(|light| *light != DVec3::ZERO)
-    });
     let light = |kernel: &Kernel, least: DVec3| {
         // Outside solids and within.
         let smoothed = [Some(indirect(0, kernel)), (counts[1] > 0).then(|| indirect(1, kernel))];
         let indirect =
             |n: usize, within: bool| smoothed[usize::from(within)].as_ref().map_or(DVec3::ZERO, |i| i[source(n)]);
         let outside = |n: usize| (direct[source(n)] + indirect(n, !outer(n))).max(least);
-        let within = own.as_ref().map(|(own, beside)| {
-            texture(&|n| if beside[n] { (own[source(n)] + indirect(n, true)).max(least) } else { outside(n) })
+        let within = own.as_ref().map_or(Within::Same, |(own, beside)| {
+            let light = |n: usize| (own[source(n)] + indirect(n, true)).max(least);
+            Within::Own(texture(&|n| if beside[n] { light(n) } else { outside(n) }))
         });
         Some(FlatLight { outside: texture(&outside), within })
     };
@@ -517,7 +517,7 @@ mod tests {
             let direct = direct_irradiance(&scene, &Nothing, &receiver, 4, (3, Stage::Test, i)).mean;
             let outside = gap > 0.0;
             let expected = if outside { DVec3::splat(dense) } else { direct + dense / 3.0 };
-            let x = filled.seen(!outside).lookup([u, v, c]).x / reflected(flat.albedo.at(c), expected).x;
+            let x = filled.seen(!outside).unwrap().lookup([u, v, c]).x / reflected(flat.albedo.at(c), expected).x;
             found[2 * usize::from(outside) + usize::from(gap.abs() > 0.03)].push(x);
         }
         println!("{:?}", found.map(|m| (m.mean(), m.count())));
@@ -545,7 +545,7 @@ mod tests {
             let photons = photons.map(|p| FlatPhoton { flat: 2, uvc: p.map(|x| x as f32), power, bounces: 1 });
             let filled = fill_flat(&scene, &Nothing, number, photons, 1.0, &SETTINGS, &AtomicU64::new(0));
             let FlatLight { outside: texture, within } = filled.gathered.unwrap();
-            assert!(within.is_none(), "no light is within");
+            assert_eq!(within, Within::Same, "no light is within");
             let expected = reflected(flat.albedo.at(0.5), DVec3::splat(irradiance)).x;
             let mut found = [crate::stats::Moments::default(); 2];
             for p in (0..40_000).map(|i| place(2, i)) {

@@ -6,7 +6,7 @@ use super::gather::local_bounds;
 use super::half::{Half4, encode};
 use super::solid::{FREE, solid};
 use super::swept_sides;
-use crate::flat::{self, Flat, FlatLight, FlatTexture};
+use crate::flat::{self, Flat, FlatLight, FlatTexture, Within};
 use crate::flattened::Side;
 use crate::isa::Isa;
 use crate::isovalue_axis::IsovalueAxis;
@@ -420,17 +420,24 @@ impl Flats {
         }
     }
 
-    /// Radiances of the textures, of flats that keep sides apart of both.
-    pub(super) fn export(&self, radiance: &[Option<Vec<f32>>], outside: Side) -> Vec<Option<FlatLight>> {
+    /// Radiances of the textures, of flats that keep sides apart of both; `sides`: those that were swept.
+    pub(super) fn export(
+        &self,
+        radiance: &[Option<Vec<f32>>],
+        sides: &[Side],
+        outside: Side,
+    ) -> Vec<Option<FlatLight>> {
+        let one_for_all = if sides.len() == 2 { Within::Same } else { Within::Unknown };
         let of = |number: usize| Some(self.textures.get(number)?.as_ref()?.export(radiance.get(number)?.as_ref()?));
         let light = |flat: usize| {
             let solid = self.solid.get(flat).and_then(Option::as_ref);
             let apart = solid.is_some_and(|solid| solid.iter().any(|n| *n != FREE));
             match (of(flat)?, of(self.count + flat).filter(|_| apart)) {
                 (lower, Some(higher)) if outside == Side::Higher => {
-                    Some(FlatLight { outside: higher, within: Some(lower) })
+                    Some(FlatLight { outside: higher, within: Within::Own(lower) })
                 }
-                (outside, within) => Some(FlatLight { outside, within }),
+                (lower, Some(higher)) => Some(FlatLight { outside: lower, within: Within::Own(higher) }),
+                (outside, None) => Some(FlatLight { outside, within: one_for_all.clone() }),
             }
         };
         (0..self.count).map(light).collect()

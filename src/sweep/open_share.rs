@@ -1,7 +1,6 @@
 //! The share of a luminaire outside the matter. A luminaire may stand in the volume; then part of it lies within the
 //! solid of an isovalue, and how much its points say of that is the same error at all receivers.
 
-use super::ends;
 use crate::direct::luminance;
 use crate::field::Field;
 use crate::flattened::Side;
@@ -60,13 +59,15 @@ fn heights(field: &Field, points: impl Iterator<Item = DVec3>) -> impl Iterator<
 
 /// The share of what a scene's luminaires emit over the whole sweep that is open on one side; 1 if there are none.
 pub(super) fn open_over_sweep(scene: &Scene, side: Side) -> f64 {
-    let (set, inside) = (Sobol::set(0, Stage::Sweep, 0), ends::inside(scene));
+    let (set, far) = (Sobol::set(0, Stage::Sweep, 0), scene.lattice().far());
     let (mut all, mut closed) = (0.0, 0.0);
     for &number in scene.luminaires() {
         let light = &scene.polygons()[number as usize];
         let flux = light.area() * luminance(light.emission);
         all += flux;
-        if !inside[number as usize] {
+        let corners = || light.vertices().iter().map(|&x| scene.lattice().to_index(x));
+        let (lo, hi) = (corners().fold(DVec3::INFINITY, DVec3::min), corners().fold(DVec3::NEG_INFINITY, DVec3::max));
+        if lo.cmpgt(far).any() || hi.cmplt(DVec3::ZERO).any() {
             continue;
         }
         // At h a point is closed below c = h on the lower side, above it on the higher one.

@@ -8,7 +8,7 @@ uniform mat3 u_inverse;
 uniform vec4 u_clip;
 uniform vec2 u_depth;
 uniform float u_iso, u_scale;
-uniform bool u_local, u_clipped, u_both, u_outside_lower;
+uniform bool u_local, u_clipped, u_outside_lower;
 float value(vec3 p) { return texture(u_value, (p + 0.5) / u_dims).r; }
 
 // A cell that touches a sample that is not finite holds no surface.
@@ -44,7 +44,7 @@ out vec4 colour;
 uniform sampler3D u_light, u_other, u_blocks, u_visible, u_other_visible;
 uniform ivec3 u_block_count;
 uniform int u_most_steps, u_luminaires;
-uniform bool u_capped;
+uniform bool u_capped, u_both;
 uniform mat3 u_axes;
 uniform vec3 u_steps, u_corners[64], u_facing[8], u_power[8];
 uniform vec2 u_ranges[8];
@@ -181,7 +181,7 @@ out vec4 colour;
 uniform sampler3D u_wall, u_wall_within;
 uniform vec3 u_normal, u_corner, u_du, u_dv, u_emission;
 uniform float u_place;
-uniform bool u_cap, u_textured, u_opaque_back, u_within;
+uniform bool u_cap, u_textured, u_opaque_back, u_within, u_outside_only;
 
 // Texel-centred trilinear lookup, continued linearly over the outer half texels.
 vec3 wall(sampler3D light, vec3 uvc) {
@@ -200,7 +200,7 @@ vec3 wall(sampler3D light, vec3 uvc) {
 // Whether a solid of the isosurface holds p.
 bool solid(vec3 p) {
   vec3 far = u_dims - 1.0, within = clamp(p, vec3(0.0), far);
-  return all(lessThan(abs(p - within), vec3(1e-3))) && !hole(within) && (value(within) > u_iso) == u_outside_lower;
+  return all(lessThan(abs(p - within), vec3(1e-3))) && !hole(within) && (value(within) >= u_iso) == u_outside_lower;
 }
 
 void main() {
@@ -222,7 +222,7 @@ void main() {
   }
   vec3 x = v_position - u_corner, light = u_emission, uvc = vec3(dot(u_du, x), dot(u_dv, x), u_place);
   bool within = !u_cap && solid(u_inverse * (v_position - u_origin));
-  if (within && !u_within && !u_both) light += u_clipped ? 0.3 * u_albedo * headlight(facing) : vec3(0.0);
+  if (within && u_outside_only) light += u_clipped ? 0.3 * u_albedo * headlight(facing) : vec3(0.0);
   else if (u_textured) light += within && u_within ? wall(u_wall_within, uvc) : wall(u_wall, uvc);
   colour = display(light);
 }`;

@@ -218,7 +218,7 @@ function draw() {
     ...camera(width, height), u_value: 0, u_dims: scene.dims, u_inverse: scene.inverse, u_origin: scene.origin,
     u_iso: state.iso, u_clip: clipPlane(), u_clipped: state.clip ? 1 : 0, u_local: state.shading === "local" ? 1 : 0,
     u_gain: state.tint.map((t) => t * state.exposure), u_scale: scene.scale,
-    u_both: textures.lights.length > 1 ? 1 : 0, u_outside_lower: scene.outside_lower ? 1 : 0,
+    u_outside_lower: scene.outside_lower ? 1 : 0,
   };
   const bind = (unit, t) => { gl.activeTexture(gl.TEXTURE0 + unit); gl.bindTexture(gl.TEXTURE_3D, t); };
   bind(0, textures.value);
@@ -231,7 +231,7 @@ function draw() {
     programs.flat.set({
       u_normal: f.normal, u_albedo: albedo(f.albedo), u_emission: f.emission, u_corner: f.corner, u_du: f.du, u_dv: f.dv,
       u_cap: f.cap ? 1 : 0, u_textured: f.texture ? 1 : 0, u_opaque_back: f.opaqueBack ? 1 : 0,
-      u_within: f.within ? 1 : 0,
+      u_within: f.within ? 1 : 0, u_outside_only: f.outsideOnly ? 1 : 0,
       u_place: f.texture ? place(f.texture.axis) : 0,
     });
     gl.bindVertexArray(f.vertex_array);
@@ -247,7 +247,7 @@ function draw() {
   programs.volume.set({
     ...common, u_light: 1, u_other: 2, u_blocks: 3, u_block_count: textures.count, u_albedo: albedo(scene.albedo),
     u_most_steps: 2 * (scene.dims[0] + scene.dims[1] + scene.dims[2]) + 64, u_capped: scene.capped ? 1 : 0,
-    u_visible: 4, u_other_visible: 5, ...direct(),
+    u_both: textures.lights.length > 1 ? 1 : 0, u_visible: 4, u_other_visible: 5, ...direct(),
   });
   gl.drawArrays(gl.TRIANGLES, 0, 3);
 }

@@ -42,7 +42,10 @@ pub(super) fn warnings(
                 .into(),
         );
     }
-    let mostly_within = |scene: &Scene| !scene.surface.both_sides && lit_mostly_within(scene);
+    let mostly_within = |scene: &Scene| {
+        let stored = scene.surface.both_sides || scene.surface.emission != DVec3::ZERO;
+        !stored && scene.boundary == Boundary::Open && lit_mostly_within(scene)
+    };
     if (0..scene.fields()).any(|n| mostly_within(&scene.lit(n))) {
         lines.push(
             "the luminaires stand mostly within the solids, whose outside is stored; use --sides both, or the other outside"

@@ -71,7 +71,11 @@ fn descriptions_that_do_not_hold_are_refused() {
         })
     };
     let light = inside(false).unwrap().flats.swap_remove(0).unwrap();
-    assert!(light.within.as_ref() == Some(&light.outside) && read_back.flats[0].as_ref().unwrap().within.is_none());
+    assert_eq!(light.own(), Some(&light.outside));
+    // Of files from before, one for all.
+    assert_eq!(read_back.flats[0].as_ref().unwrap().within, Within::Same);
+    let outside_only = read(|d| d["textures"][0]["outside_only"] = json!(true)).unwrap();
+    assert_eq!(outside_only.flats[0].as_ref().unwrap().within, Within::Unknown);
     assert!(inside(true).err().unwrap().to_string().contains("flat 0"));
     // Caps, which open volumes do not have, count among the flats.
     for flat in 1..7 {
