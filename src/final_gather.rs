@@ -376,8 +376,8 @@ mod tests {
         let lattice = Lattice::aligned([17; 3], DVec3::splat(0.3), DVec3::splat(1.0 / 16.0)).unwrap();
         let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[2] as f32).collect();
         let volume = Volume::new("planes", lattice.clone(), Samples::F32(samples)).unwrap();
-        let room = |outside: Side| {
-            let field = Field::new(&volume, Sweep::new(0.0, 16.0).unwrap()).unwrap();
+        let room = |volume: &Volume, outside: Side| {
+            let field = Field::new(volume, Sweep::new(0.0, 16.0).unwrap()).unwrap();
             let walls = cornell_box(&lattice, 0.0).unwrap();
             Scene::new(field, Surface { outside, ..Surface::default() }, Boundary::Open, walls).unwrap()
         };
@@ -388,7 +388,7 @@ mod tests {
         };
         let cases = [(Within::Same, Some(1.0)), (Within::Own(shows(2.0)), Some(2.0)), (Within::Unknown, None)];
         for ((known, shown), outside) in cases.iter().flat_map(|case| [(case, Side::Lower), (case, Side::Higher)]) {
-            let mut baked = baked(room(outside), 0.0, None);
+            let mut baked = baked(room(&volume, outside), 0.0, None);
             let light = FlatLight { outside: shows(1.0), within: known.clone() };
             baked.flats.iter_mut().flatten().for_each(|flat| *flat = light.clone());
             let scene = &baked.scene;
@@ -422,6 +422,16 @@ mod tests {
             });
             let [within, without] = if outside == Side::Lower { [above, below] } else { [below, above] };
             assert!(within > 1.5 && without == 0.0, "{outside:?}: {within} {without}");
+            // All of a background is at its isovalue, whatever rounding makes of that between samples.
+            let background = Samples::F32(vec![0.3; lattice.len() - 1].into_iter().chain([16.0]).collect());
+            let background = Volume::new("background", lattice.clone(), background).unwrap();
+            let scene = room(&background, outside);
+            let rays = (0..1000).map(|i| {
+                let mut rng = Rng::stream(1, Stage::Test, i);
+                let target = lattice.to_world(lattice.far() * DVec3::new(0.9 * rng.unit(), 1.0, 0.9 * rng.unit()));
+                scene.ray(lattice.to_index(eye).as_vec3(), target - eye, scene.field.samples()[0], Departure::Free)
+            });
+            assert!(rays.into_iter().all(|ray| !scene.solid_holds(&ray, 1.0)), "{outside:?}");
         }
     }
 

@@ -331,11 +331,6 @@ pub enum Within {
 }
 
 impl FlatLight {
-    /// One texture for all.
-    pub fn for_all(texture: FlatTexture) -> Self {
-        Self { outside: texture, within: Within::Same }
-    }
-
     /// What is seen from within solids, or not; `None` if that is not known.
     #[inline]
     pub fn seen(&self, within: bool) -> Option<&FlatTexture> {

@@ -237,7 +237,7 @@ impl Scene {
     }
 
     /// Whether `ray` is at `t` in a solid, of any field that is lit with this one, or where one touches the wall that
-    /// it meets there. On a level set it is.
+    /// it meets there. On the level set itself it is not: of a background at its isovalue walls are seen.
     #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
     pub fn solid_holds(&self, ray: &FlattenedRay, t: f32) -> bool {
         let (p, c) = (ray.at(t), ray.isovalue);
@@ -245,7 +245,7 @@ impl Scene {
         let holds = |field: &Field, p: DVec3, slack: f64, outside: Side| {
             // NaN beside samples that are not finite: nothing is there.
             let h = field.lattice().nearest(p, slack).map_or(f32::NAN, |p| field.value(p) as f32);
-            if outside == Side::Lower { h >= c } else { h < c }
+            if outside == Side::Lower { h > c } else { h < c }
         };
         // Those that are not lit together do not see each other.
         let companions = if self.policy == Policy::Joint { &self.companions[..] } else { &[] };

@@ -200,7 +200,8 @@ vec3 wall(sampler3D light, vec3 uvc) {
 // Whether a solid of the isosurface holds p.
 bool solid(vec3 p) {
   vec3 far = u_dims - 1.0, within = clamp(p, vec3(0.0), far);
-  return all(lessThan(abs(p - within), vec3(1e-3))) && !hole(within) && (value(within) >= u_iso) == u_outside_lower;
+  float above = (value(within) - u_iso) * (u_outside_lower ? 1.0 : -1.0);
+  return all(lessThan(abs(p - within), vec3(1e-3))) && !hole(within) && above > 0.0;
 }
 
 void main() {
