@@ -27,6 +27,7 @@ mod gaps;
 mod gather;
 mod grid;
 mod half;
+mod incoming;
 mod lit_rows;
 mod near;
 mod normals;

@@ -93,6 +93,11 @@ fn mean_rms(x: &[f64]) -> (f64, f64) {
     (x.iter().sum::<f64>() / n, (x.iter().map(|e| e * e).sum::<f64>() / n).sqrt())
 }
 
+fn walls_are_finite(got: &SweepResult) -> bool {
+    let textures = got.flats.iter().flatten().flat_map(FlatLight::textures);
+    textures.flat_map(|t| t.texels.as_flattened()).all(|x| x.is_finite())
+}
+
 /// E/π of the first stored side, green.
 fn radiosity(got: &SweepResult, o: usize) -> f64 {
     f64::from(got.sides[0].irradiance[o][1]) / PI
@@ -318,15 +323,7 @@ fn caps_close_level_sets() {
     println!("capped: caps {mean:.5}, RMS {rms:.5}");
     assert!(mean.abs() < 0.005 && rms < 0.01);
     // Uncapped, the inside of the solid is open, but the outer side sees the same.
-    assert!(
-        got.flats
-            .iter()
-            .flatten()
-            .flat_map(FlatLight::textures)
-            .flat_map(|t| &t.texels)
-            .flatten()
-            .all(|x| x.is_finite())
-    );
+    assert!(walls_are_finite(&got));
 }
 
 /// Light from outside stays outside: the inside of capped solids is black, beside the luminaire too, and the outside as
@@ -378,15 +375,7 @@ fn holes_in_the_data_hold_no_surface_and_hide_nothing() {
     };
     let ((whole, one), (holed, two)) = (light_it(f(false)), light_it(f(true)));
     assert!(two.sides[0].irradiance.iter().flatten().all(|x| x.is_finite()));
-    assert!(
-        two.flats
-            .iter()
-            .flatten()
-            .flat_map(FlatLight::textures)
-            .flat_map(|t| &t.texels)
-            .flatten()
-            .all(|x| x.is_finite())
-    );
+    assert!(walls_are_finite(&two));
     let holes = (0..holed.lattice().len()).filter(|&o| holed.field.samples()[o].is_nan()).count();
     assert!(holes > 50);
     let errors: Vec<f64> = nodes(&whole, 0).iter().map(|&o| radiosity(&two, o) - radiosity(&one, o)).collect();

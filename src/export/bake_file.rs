@@ -1,6 +1,8 @@
 //! The bake as one `.vti`: the volume, its illumination, the box's light and every setting, for viewers and for
 //! `render`, `compare` and `view`. Of several volumes, a `.vti` each and a `.vtm` that names them.
 
+mod description;
+
 use super::multi_block;
 use super::picture::srgb_encode;
 use crate::atomic::AtomicFile;
@@ -8,121 +10,24 @@ use crate::bake::Bake;
 use crate::digits::span;
 use crate::error::{Error, Result};
 use crate::field::{Field, FieldRows, Sweep};
-use crate::flat::{self, FlatLight, FlatTexture, Within};
+use crate::flat::{self, FlatLight, Within};
 use crate::flattened::Side;
 use crate::illumination_grid::{GridSize, IlluminationGrid};
-use crate::isovalue_axis::IsovalueAxis;
 use crate::mask::Mask;
 use crate::polygon::Polygon;
-use crate::reflectance::Reflectance;
 use crate::scene::{Boundary, Member, Policy, Scene, Surface};
 use crate::split::Split;
 use crate::volume::vti::{self, VtiArray, VtiFile, VtiWriter};
 use crate::volume::{Lattice, Samples, Volume};
+use description::{DESCRIPTION, Description, PolygonDescription, TextureDescription};
 use glam::DVec3;
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
-/// Name of the field string that holds scene and report as JSON.
-const DESCRIPTION: &str = "isolume";
-
 /// Name of the array that holds the radiance of all context geometry.
 const CONTEXT: &str = "context";
-
-/// A scene without its samples: enough to draw the box and to trace the stored volume again.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-struct Description {
-    isovalues: [f64; 2],
-    exposure: f64,
-    /// Stops, if any, in units of the sweep.
-    albedo: Reflectance,
-    emission: DVec3,
-    outside: Side,
-    both_sides: bool,
-    capped: bool,
-    polygons: Vec<PolygonDescription>,
-    textures: Vec<TextureDescription>,
-    report: serde_json::Value,
-    /// The volume's name, if there are others.
-    #[serde(default)]
-    volume: String,
-    /// Whether the others gave it no light.
-    #[serde(default)]
-    independent: bool,
-}
-
-/// Where the texture of a flat is stored.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-struct TextureDescription {
-    flat: usize,
-    array: String,
-    /// Texels along u, v and the isovalue.
-    dims: [usize; 3],
-    /// Where the isovalue's texels crowd, if not ½ ([`IsovalueAxis::around`]).
-    #[serde(default = "half", skip_serializing_if = "is_half")]
-    middle: f32,
-    /// Texels of the array before it.
-    #[serde(default)]
-    start: usize,
-    /// Whether it is what is seen from within solids, if that differs; it follows what is seen from outside.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    inside: bool,
-    /// Whether nothing is known of what is seen from within solids.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    outside_only: bool,
-}
-
-impl TextureDescription {
-    /// The texture, of the colours of its array.
-    fn of(&self, array: &[[f32; 3]]) -> Result<FlatTexture> {
-        let [nu, nv, nc] = self.dims;
-        let count = nu.checked_mul(nv).and_then(|n| n.checked_mul(nc)).filter(|&n| n > 0);
-        let count = count.ok_or_else(|| self.wrong(format!("dims {:?} are those of no texture", self.dims)))?;
-        let end =
-            self.start.checked_add(count).filter(|&end| end <= array.len()).ok_or_else(|| {
-                self.wrong(format!("holds {} colours, not {count} from {} on", array.len(), self.start))
-            })?;
-        let texels = array[self.start..end].to_vec();
-        Ok(FlatTexture { dims: self.dims, axis: IsovalueAxis::around(self.middle), texels })
-    }
-
-    fn wrong(&self, what: impl std::fmt::Display) -> Error {
-        Error::Invalid(format!("the array '{}', texture of flat {}: {what}; bake anew", self.array, self.flat))
-    }
-}
-
-/// [`IsovalueAxis::middle`] of even texels.
-fn half() -> f32 {
-    0.5
-}
-
-fn is_half(middle: &f32) -> bool {
-    *middle == 0.5
-}
-
-#[derive(Clone, Debug, Serialize, Deserialize)]
-struct PolygonDescription {
-    name: String,
-    vertices: Vec<DVec3>,
-    albedo: DVec3,
-    emission: DVec3,
-    /// As [`Polygon::other_face`].
-    #[serde(default)]
-    other_face: i32,
-}
-
-impl Description {
-    /// What a file holds, if it is a bake.
-    fn of(file: &VtiFile) -> Result<Option<Self>> {
-        // Other files may use the name for something else, as generated volumes did.
-        let own = |(name, text): &&(String, String)| name == DESCRIPTION && text.starts_with('{');
-        let Some((_, text)) = file.field_strings.iter().find(own) else { return Ok(None) };
-        let parsed = serde_json::from_str(text);
-        parsed.map(Some).map_err(|e| Error::Invalid(format!("field data '{DESCRIPTION}': {e}")))
-    }
-}
 
 /// What a bake is, without its light.
 #[derive(Clone, Debug, PartialEq, Serialize)]

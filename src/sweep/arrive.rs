@@ -3,10 +3,11 @@
 
 use super::directions::Layout;
 use super::ends::Ends;
-use super::flats::{Arrivals, Flats, Stop, below, fill_column, shapes, sinks};
+use super::flats::{Flats, Stop, below, fill_column, shapes, sinks};
 use super::gaps::Crossing;
 use super::gather::{Pass, local_bounds};
 use super::half::{Half4, colour, decode};
+use super::incoming::Arrivals;
 use super::pack::{LANES, OUTSIDE, Pack, Plan};
 use crate::flattened::Side;
 use crate::rng::{Rng, Stage};

@@ -11,7 +11,8 @@ use glam::DVec3;
 
 /// Points that tell the share itself: their error is small beside that of any luminaire points.
 const POINTS: u32 = 1 << 14;
-/// Points that tell where a luminaire stands.
+/// Points that tell where a luminaire stands, at most; of many luminaires as many together as of sixteen, and eight at
+/// least.
 const ROUGHLY: u32 = 1 << 10;
 
 /// Of a luminaire: its open share over what its points say it is.
@@ -60,6 +61,8 @@ fn heights(field: &Field, points: impl Iterator<Item = DVec3>) -> impl Iterator<
 /// The share of what a scene's luminaires emit over the whole sweep that is open on one side; 1 if there are none.
 pub(super) fn open_over_sweep(scene: &Scene, side: Side) -> f64 {
     let (set, far) = (Sobol::set(0, Stage::Sweep, 0), scene.lattice().far());
+    let count = u32::try_from(scene.luminaires().len()).unwrap_or(u32::MAX);
+    let each = (16 * ROUGHLY / count.max(1)).clamp(8, ROUGHLY);
     let (mut all, mut closed) = (0.0, 0.0);
     for &number in scene.luminaires() {
         let light = &scene.polygons()[number as usize];
@@ -72,8 +75,8 @@ pub(super) fn open_over_sweep(scene: &Scene, side: Side) -> f64 {
         }
         // At h a point is closed below c = h on the lower side, above it on the higher one.
         let share = |h: f32| f64::from(if side == Side::Lower { h.clamp(0.0, 1.0) } else { 1.0 - h.clamp(0.0, 1.0) });
-        let points = (0..ROUGHLY).map(|i| light.sample(set.point2(i, 0)));
-        closed += flux * heights(&scene.field, points).map(share).sum::<f64>() / f64::from(ROUGHLY);
+        let points = (0..each).map(|i| light.sample(set.point2(i, 0)));
+        closed += flux * heights(&scene.field, points).map(share).sum::<f64>() / f64::from(each);
     }
     if all > 0.0 { 1.0 - closed / all } else { 1.0 }
 }
