@@ -16,6 +16,7 @@ use isolume::photon_map::{EstimateSettings, Estimator, PhotonMap};
 use isolume::progress::processor_seconds;
 use isolume::radiance_cache::{CacheSettings, RadianceCache};
 use isolume::reference::{Integrator, ReferenceSettings, reference};
+use isolume::rng::Stage;
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
 use isolume::surface_mesh::{SurfaceMesh, unit_isovalue};
 use isolume::volume::generate::Generator;
@@ -102,7 +103,7 @@ fn main() {
         let saved = [checkpoint::Stage::UNSAVED; 2];
         let cache = RadianceCache::new(&scene, &tracer, &other, fine, &cache_settings, true, saved, &|_| true);
         let gather = |(i, r): (usize, &Receiver)| {
-            gathered_irradiance(&scene, &tracer, &cache, r, 512, (3, i as u64)).estimate.mean
+            gathered_irradiance(&scene, &tracer, &cache, r, 512, Stage::Gather.key(3, i as u64)).estimate.mean
         };
         receivers.par_iter().step_by(16).enumerate().map(gather).collect()
     };

@@ -141,9 +141,9 @@ fn main() {
         }
         if all > 0.0 { open * seen / all } else { 0.0 }
     };
-    let ours = |r: &Receiver, seed, i| direct_irradiance(&scene, &tracer, r, rays, (seed, Stage::Direct, i)).mean.x;
+    let ours = |r: &Receiver, seed, i| direct_irradiance(&scene, &tracer, r, rays, Stage::Direct.key(seed, i)).mean.x;
     let ours64 =
-        |r: &Receiver, seed, i| direct_irradiance(&scene, &tracer, r, 2 * rays, (seed, Stage::Direct, i)).mean.x;
+        |r: &Receiver, seed, i| direct_irradiance(&scene, &tracer, r, 2 * rays, Stage::Direct.key(seed, i)).mean.x;
     report(
         "direct light, 32 rays",
         &receivers,
@@ -157,7 +157,7 @@ fn main() {
         ],
     );
     for most in [32, 64, 128] {
-        let rays = |(i, r)| direct_irradiance(&scene, &tracer, r, most, (0, Stage::Direct, i as u64)).rays;
+        let rays = |(i, r)| direct_irradiance(&scene, &tracer, r, most, Stage::Direct.key(0, i as u64)).rays;
         let sum: u64 = receivers.par_iter().enumerate().map(rays).sum();
         println!("  isolume traces {:.1} of {most} rays on average", sum as f64 / RECEIVERS as f64);
     }

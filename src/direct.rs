@@ -2,7 +2,7 @@
 
 use crate::flattened::{Departure, FlattenedRay};
 use crate::luminaire::{Aim, unoccluded};
-use crate::rng::{Rng, Sobol, Stage};
+use crate::rng::{Key, Rng};
 use crate::scene::Scene;
 use crate::tracer::Tracer;
 use glam::{DVec3, Vec3};
@@ -84,13 +84,13 @@ fn budget(scene: &Scene, open: f64, shadow_rays: u32) -> u32 {
 /// in penumbras. Receivers that could get less than half of E₀ ([`Scene::reference_irradiance`]) get fewer rays, in
 /// proportion down to an eighth. The ratio's bias falls with 1/shadow_rays; of more than 64 rays, light or shadow below
 /// a 64th of what is open may be missed.
-/// The point set is keyed by (seed, stage, index).
+/// Polygon l of L luminaires takes the points of `key` with L · index + l for its index.
 pub fn direct_irradiance<T: Tracer>(
     scene: &Scene,
     tracer: &T,
     receiver: &Receiver,
     shadow_rays: u32,
-    (seed, stage, index): (u64, Stage, u64),
+    key: Key,
 ) -> Estimate {
     let lattice = scene.lattice();
     let x = lattice.to_world(receiver.position.as_dvec3());
@@ -107,8 +107,8 @@ pub fn direct_irradiance<T: Tracer>(
         let Some(aim) = Aim::best(light, x, receiver.normal, open) else { continue };
         let budget = budget(scene, luminance(light.emission) * open, shadow_rays);
         let pilot = (budget / 4).max(LEAST_UNANIMOUS);
-        let set =
-            Sobol::set(seed, stage, index.wrapping_mul(scene.luminaires().len() as u64).wrapping_add(u64::from(l)));
+        let index = key.index.wrapping_mul(scene.luminaires().len() as u64).wrapping_add(u64::from(l));
+        let set = Key { index, ..key }.set();
         let (mut sum, mut seen, mut squares, mut seen_squares) = (0.0, 0.0, 0.0, 0.0);
         for i in 0..budget {
             if i == pilot && (seen == 0.0 || seen == sum) {
@@ -161,6 +161,7 @@ mod tests {
     use crate::field::{Field, Sweep};
     use crate::flattened::FlattenedHit;
     use crate::polygon::Polygon;
+    use crate::rng::Stage;
     use crate::scene::{Boundary, Surface, cornell_box};
     use crate::stats::Moments;
     use crate::volume::{Lattice, Samples, Volume};
@@ -210,7 +211,7 @@ mod tests {
                 let slit = Slit { scene: &scene, light, open };
                 let mut found = Moments::default();
                 for index in 0..4000 {
-                    let key = (1, Stage::Test, index);
+                    let key = Stage::Test.key(1, index);
                     found.push(
                         direct_irradiance(&scene, &slit, &receiver, rays, key).mean.x / (light.emission.x * whole),
                     );

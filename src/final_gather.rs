@@ -115,11 +115,13 @@ impl<'a, T: Tracer> FinalGather<'a, T> {
             0 => (indirect(baked, receiver.departure, p)?, Estimate::default()),
             gather_rays => {
                 let known = Landings { baked, least_distance: settings.least_distance() };
-                let light = gathered_irradiance(scene, tracer, &known, receiver, gather_rays, (SEED, index)).estimate;
+                let light =
+                    gathered_irradiance(scene, tracer, &known, receiver, gather_rays, Stage::Gather.key(SEED, index))
+                        .estimate;
                 (reflected(albedo, light.mean) + emission, light)
             }
         };
-        let direct = direct_irradiance(scene, tracer, receiver, settings.shadow_rays, (SEED, Stage::Direct, index));
+        let direct = direct_irradiance(scene, tracer, receiver, settings.shadow_rays, Stage::Direct.key(SEED, index));
         let rays = direct.rays + gathered.rays;
         self.rays.fetch_add(rays, Ordering::Relaxed);
         // No less than what colours make of it.
@@ -418,7 +420,7 @@ mod tests {
             let [above, below] = [0.25, 0.75].map(|isovalue| {
                 let (position, departure) = (Vec3::new(0.0, 8.0, 8.0), Departure::Polygon(x));
                 let receiver = Receiver { position, normal: DVec3::X, isovalue, departure };
-                gathered_irradiance(scene, &tracer, &Inside, &receiver, 256, (1, 1)).estimate.mean.x
+                gathered_irradiance(scene, &tracer, &Inside, &receiver, 256, Stage::Gather.key(1, 1)).estimate.mean.x
             });
             let [within, without] = if outside == Side::Lower { [above, below] } else { [below, above] };
             assert!(within > 1.5 && without == 0.0, "{outside:?}: {within} {without}");

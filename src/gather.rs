@@ -5,7 +5,7 @@ use crate::direct::{Estimate, LEAST_UNANIMOUS, Receiver, direct_once, luminance}
 use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, SurfacePoint, Target};
 use crate::landing::{Landing, MOST_LANDINGS, landing};
 use crate::radiance_cache::RadianceCache;
-use crate::rng::{Rng, Sobol, Stage};
+use crate::rng::{Key, Rng};
 use crate::scene::Scene;
 use crate::stats::Moments;
 use crate::tracer::Tracer;
@@ -70,17 +70,17 @@ pub fn gathered_irradiance<T: Tracer, L: KnownLight>(
     light: &L,
     receiver: &Receiver,
     rays: u32,
-    (seed, index): (u64, u64),
+    key: Key,
 ) -> Gathered {
     let frame = Frame::new(receiver.normal);
-    let set = Sobol::set(seed, Stage::Gather, index);
+    let set = key.set();
     let mut sums = [DVec3::ZERO; 2];
     let first = rays / 2;
     let mut moments = Moments::default();
     let (mut misses, mut traced) = (0, 0);
     // Rays that landed, and of them those that found any light.
     let (mut landed, mut lit) = (0, 0);
-    let turn = Rng::stream(seed, Stage::Gather, index << 20 ^ 0xF_FFFF).bits();
+    let turn = key.nth(0xF_FFFF).bits();
     let ray = |i: u32| {
         let direction = frame.to_world(cosine_hemisphere(set.point2(i, 0)));
         scene.ray(receiver.position, direction, receiver.isovalue, receiver.departure)
@@ -109,7 +109,7 @@ pub fn gathered_irradiance<T: Tracer, L: KnownLight>(
         let hit = if trusted || i >= PILOT { tracer.intersect(&ray) } else { pilot[i as usize] };
         let radiance = hit.map_or(DVec3::ZERO, |hit| {
             landed += 1;
-            let mut rng = || Rng::stream(seed, Stage::Gather, index << 20 ^ u64::from(i));
+            let mut rng = || key.nth(i);
             corners.radiance(ray, hit, &mut rng, &mut misses, &mut traced)
         });
         lit += u32::from(radiance != DVec3::ZERO);
@@ -277,6 +277,7 @@ mod tests {
     use crate::photon::{FlatPhoton, Photons};
     use crate::photon_map::EstimateSettings;
     use crate::radiance_cache::CacheSettings;
+    use crate::rng::Stage;
     use crate::scene::{Boundary, Surface, cornell_box};
     use crate::volume::{Lattice, Samples, Volume};
 
@@ -331,7 +332,7 @@ mod tests {
             let normal = scene.normal(position, side).unwrap();
             let departure = Departure::Surface(side);
             let receiver = Receiver { position: position.as_vec3(), normal, isovalue: 0.47, departure };
-            gathered_irradiance(&scene, &tracer, &cache, &receiver, 1024, (1, 1)).estimate.mean.x
+            gathered_irradiance(&scene, &tracer, &cache, &receiver, 1024, Stage::Gather.key(1, 1)).estimate.mean.x
         });
         println!("{light:?}");
         assert!((light[0] / light[1] / 4.0 - 1.0).abs() < 0.05, "{light:?}");
@@ -364,7 +365,10 @@ mod tests {
         let receiver = Receiver { position, normal: -DVec3::Z, isovalue: 0.5, departure: Departure::Free };
         for trust in [1e-6, 0.0] {
             let found = |rays: u32, index: u64| {
-                gathered_irradiance(&scene, &Floor(0), &Patch(trust), &receiver, rays, (1, index)).estimate.mean.x
+                gathered_irradiance(&scene, &Floor(0), &Patch(trust), &receiver, rays, Stage::Gather.key(1, index))
+                    .estimate
+                    .mean
+                    .x
             };
             let expected = found(1 << 18, 0);
             assert!((0.01..0.03).contains(&(expected / PI)), "{expected}");

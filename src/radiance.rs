@@ -131,7 +131,7 @@ impl<T: Tracer> Sampler<'_, T> {
             return Some(RadianceSample { position, radiance, ..RadianceSample::default() });
         }
         let index = key * 2 + side.index() as u64;
-        let direct = direct_irradiance(scene, tracer, &receiver, self.shadow_rays, (self.seed, Stage::Direct, index));
+        let direct = direct_irradiance(scene, tracer, &receiver, self.shadow_rays, Stage::Direct.key(self.seed, index));
         counts[0] += direct.rays;
         let (mean, variance, halves) = match self.indirect {
             Indirect::Map(map) => {
@@ -139,7 +139,8 @@ impl<T: Tracer> Sampler<'_, T> {
                 (e.mean, e.variance, [e.mean; 2])
             }
             Indirect::Gather(cache, rays) => {
-                let g = gathered_irradiance(scene, tracer, *cache, &receiver, *rays, (self.seed, index));
+                let g =
+                    gathered_irradiance(scene, tracer, *cache, &receiver, *rays, Stage::Gather.key(self.seed, index));
                 let e = g.estimate;
                 counts[0] += e.rays;
                 counts[1] += e.misses;

@@ -455,7 +455,7 @@ impl<T: Tracer> Fill<'_, T> {
             let isovalue = scene.field.value(position.as_dvec3()) as f32;
             let receiver = Receiver { position, normal, isovalue, departure: Departure::Surface(side) };
             let index = (node as u64 * 2 + stand_in as u64) * 2 + side.index() as u64;
-            let key = (settings.seed, Stage::Cache, index);
+            let key = Stage::Cache.key(settings.seed, index);
             let direct = direct_irradiance(scene, self.tracer, &receiver, settings.node_shadow_rays, key);
             *traced += direct.rays;
             let indirect = map.irradiance(&receiver, scratch).mean;

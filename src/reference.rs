@@ -190,7 +190,7 @@ pub fn reference<T: Tracer>(
                 if !tick(0) {
                     return DVec3::ZERO;
                 }
-                let key = (settings.seed, vertex as u64 * u64::from(batches) + batch);
+                let key = Stage::Path.key(settings.seed, vertex as u64 * u64::from(batches) + batch);
                 let mut paths = PathTracer::new(scene, tracer);
                 let radiance = match &map {
                     None => paths.outgoing(receiver, samples, key),

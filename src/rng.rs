@@ -30,6 +30,53 @@ pub enum Stage {
     Test = 11,
 }
 
+impl Stage {
+    /// The key of index `index` under `seed`.
+    #[inline]
+    pub const fn key(self, seed: u64, index: u64) -> Key {
+        Key { seed, stage: self, index }
+    }
+}
+
+/// What random numbers belong to: equal keys give equal numbers, all others independent ones.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Key {
+    /// Chosen by the user.
+    pub seed: u64,
+    /// What the numbers are for.
+    pub stage: Stage,
+    /// Which photon, receiver, pixel … they are for.
+    pub index: u64,
+}
+
+impl Key {
+    /// The stream of independent numbers of this key.
+    #[inline]
+    pub fn stream(self) -> Rng {
+        Rng { state: self.hash() }
+    }
+
+    /// The stream of ray or path `n` < 2²⁰ of this key; indices below 2⁴⁴ keep theirs apart.
+    #[inline]
+    pub fn nth(self, n: u32) -> Rng {
+        Self { index: self.index << 20 ^ u64::from(n), ..self }.stream()
+    }
+
+    /// The point set of this key.
+    #[inline]
+    pub fn set(self) -> Sobol {
+        let k = self.hash();
+        #[allow(clippy::cast_possible_truncation, reason = "folds 64 bits to 32")]
+        Sobol { seed: (k ^ (k >> 32)) as u32 }
+    }
+
+    #[inline]
+    fn hash(self) -> u64 {
+        let seed = mix(self.seed.wrapping_add(GOLDEN));
+        mix(mix(seed ^ (self.stage as u64).wrapping_mul(GOLDEN)).wrapping_add(self.index))
+    }
+}
+
 /// The finaliser of SplitMix64: a bijection in which every input bit moves every output bit. \[Steele14\]
 #[inline]
 fn mix(mut z: u64) -> u64 {
@@ -50,7 +97,7 @@ impl Rng {
     /// The stream of one index of one stage. Equal arguments give equal streams.
     #[inline]
     pub fn stream(seed: u64, stage: Stage, index: u64) -> Self {
-        Self { state: key(seed, stage, index) }
+        stage.key(seed, index).stream()
     }
 
     /// 64 random bits.
@@ -77,11 +124,6 @@ impl Rng {
         let [u, v] = self.unit2();
         (-2.0 * (1.0 - u).ln()).sqrt() * (std::f64::consts::TAU * v).cos()
     }
-}
-
-#[inline]
-fn key(seed: u64, stage: Stage, index: u64) -> u64 {
-    mix(mix(mix(seed.wrapping_add(GOLDEN)) ^ (stage as u64).wrapping_mul(GOLDEN)).wrapping_add(index))
 }
 
 /// Dimensions of [`Sobol`].
@@ -156,9 +198,7 @@ impl Sobol {
     /// The point set of one receiver: (seed, stage, index) as for [`Rng::stream`].
     #[inline]
     pub fn set(seed: u64, stage: Stage, index: u64) -> Self {
-        let k = key(seed, stage, index);
-        #[allow(clippy::cast_possible_truncation, reason = "folds 64 bits to 32")]
-        Self { seed: (k ^ (k >> 32)) as u32 }
+        stage.key(seed, index).set()
     }
 
     /// Coordinates `dimension` and `dimension + 1` of point `index`, uniform in [0, 1).

@@ -107,7 +107,8 @@ fn stored_radiance_agrees_with_paths() {
             let means: Vec<DVec3> = (0..16u64)
                 .into_par_iter()
                 .map(|replicate| {
-                    let sum: DVec3 = (0..2048).map(|i| world.path(&receiver, i, (100 + replicate, k))).sum();
+                    let sum: DVec3 =
+                        (0..2048).map(|i| world.path(&receiver, i, Stage::Path.key(100 + replicate, k))).sum();
                     sum / 2048.0
                 })
                 .collect();
@@ -210,7 +211,8 @@ fn an_extruded_field_looks_to_n_3_as_to_n_2() {
                 // Paths, which store nothing: what n = 2 stores has an interpolation error of its own.
                 let direct = world.direct(&receiver, 64, &Sobol::set(1, Stage::Test, 0));
                 let indirect =
-                    (0..PATHS).map(|i| world.path(&receiver, i, (1, o as u64))).sum::<DVec3>() / f64::from(PATHS);
+                    (0..PATHS).map(|i| world.path(&receiver, i, Stage::Path.key(1, o as u64))).sum::<DVec3>()
+                        / f64::from(PATHS);
                 stored.lock().unwrap().push(luminance(
                     world.scene.albedo * (direct + world.gathered(&receiver, &solution, 256, o as u64)),
                 ));

@@ -161,8 +161,8 @@ fn integrating_sphere() {
     for v in subset(mesh.local.len(), Some(300)) {
         let at = receiver(&scene, mesh.local[v], c, Side::Lower).unwrap();
         let mut paths = PathTracer::new(&scene, &tracer);
-        let total = paths.outgoing(&at, 256, (5, v as u64));
-        let direct = paths.direct(&at, 256, (5, v as u64));
+        let total = paths.outgoing(&at, 256, Stage::Path.key(5, v as u64));
+        let direct = paths.direct(&at, 256, Stage::Path.key(5, v as u64));
         moments.push((total - reflected(DVec3::splat(rho), direct)).x * std::f64::consts::PI / rho);
     }
     // 0.5 %: triangles cut corners (0.1 % of the area), the light blocks A/πR² = 0.02 %.
@@ -259,8 +259,8 @@ fn a_furnace_at_the_line_where_surface_and_walls_meet() {
         let at = receiver(&scene, mesh.local[v], c, Side::Lower).unwrap();
         let mut moments = [isolume::stats::Moments::default(); 2];
         for i in 0..16 {
-            moments[0].push(paths.0.outgoing(&at, 64, (3, v as u64 * 16 + i)).x);
-            moments[1].push(paths.1.outgoing(&at, 64, (3, v as u64 * 16 + i)).x);
+            moments[0].push(paths.0.outgoing(&at, 64, Stage::Path.key(3, v as u64 * 16 + i)).x);
+            moments[1].push(paths.1.outgoing(&at, 64, Stage::Path.key(3, v as u64 * 16 + i)).x);
         }
         for (m, name) in moments.iter().zip(["graph", "triangles"]) {
             let z = (m.mean() - 1.0) / m.std_error().max(1e-6);
@@ -285,7 +285,7 @@ fn a_rectangle_of_light() {
     for (x, normal, expected) in cases {
         let position = scene.lattice().to_index(x).as_vec3();
         let at = Receiver { position, normal, isovalue: 0.001, departure: Departure::Free };
-        let e = PathTracer::new(&scene, &tracer).direct(&at, 64, (1, 1)).x;
+        let e = PathTracer::new(&scene, &tracer).direct(&at, 64, Stage::Path.key(1, 1)).x;
         assert!((e - expected).abs() < 1e-6, "at {x}: {e}, expected {expected}");
     }
 }

@@ -81,7 +81,7 @@ fn errors_of(
         .par_iter()
         .map(|&o| {
             let receiver = receiver(scene, place(o), scene.field.samples()[o], side).unwrap();
-            let exact = PathTracer::new(scene, &tracer).outgoing(&receiver, paths, (5, o as u64));
+            let exact = PathTracer::new(scene, &tracer).outgoing(&receiver, paths, Stage::Path.key(5, o as u64));
             [f64::from(grid.radiance[o][1]), exact.y]
         })
         .collect();
@@ -140,7 +140,7 @@ fn the_ceiling_is_bright_up_to_the_luminaire() {
                 isovalue: isovalue as f32,
                 departure: Departure::Polygon(wall),
             };
-            PathTracer::new(&scene, &tracer).outgoing(&receiver, 512, (5, i as u64)).y
+            PathTracer::new(&scene, &tracer).outgoing(&receiver, 512, Stage::Path.key(5, i as u64)).y
         })
         .collect();
     // Path tracing reflects it as a level set would.
@@ -250,7 +250,7 @@ fn light_does_not_walk_along_narrow_tubes() {
         let p = DVec3::from_array(lattice.ijk(o).map(|x| x as f64));
         let Some(r) = receiver(&scene, p, scene.field.samples()[o], *side) else { continue };
         let away = ((p.y - 87.0).abs() / 87.0 * 12.0).min(11.0) as usize;
-        sections[away][0] += PathTracer::new(&scene, &tracer).outgoing(&r, 256, (3, o as u64)).y;
+        sections[away][0] += PathTracer::new(&scene, &tracer).outgoing(&r, 256, Stage::Path.key(3, o as u64)).y;
         sections[away][1] += f64::from(grid.radiance[o][1]);
     }
     let ratios = sections.map(|[exact, got]| got / exact);

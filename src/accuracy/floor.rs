@@ -31,7 +31,7 @@ pub fn interpolation_floor<T: Tracer>(
     vertices: Option<usize>,
 ) -> Result<Accuracy> {
     let direct = |r: &Receiver, index: u64| {
-        let e = direct_irradiance(scene, tracer, r, shadow_rays, (0, Stage::Direct, index)).mean;
+        let e = direct_irradiance(scene, tracer, r, shadow_rays, Stage::Direct.key(0, index)).mean;
         reflected(scene.surface.albedo.at(f64::from(r.isovalue)), e)
     };
     let chosen = subset(mesh.local.len(), vertices);
@@ -79,7 +79,8 @@ pub fn total_floor<T: Tracer>(
     let keep = subset(chosen.len(), Some(vertices));
     chosen = keep.into_iter().map(|i| chosen[i]).collect();
     let texture = |seed: u64| {
-        let value = |r: &Receiver, index: u64| PathTracer::new(scene, tracer).outgoing(r, paths, (seed, index));
+        let value =
+            |r: &Receiver, index: u64| PathTracer::new(scene, tracer).outgoing(r, paths, Stage::Path.key(seed, index));
         through_grid(scene, mesh, &chosen, grid, &value)
     };
     let (first, second) = (texture(1_000_001)?, texture(1_000_002)?);

@@ -195,8 +195,9 @@ impl Deviation {
         (index, rays): (usize, &AtomicU64),
     ) -> Self {
         let mut paths = PathTracer::new(scene, tracer);
-        let found =
-            [1, 2].map(|n| display(paths.outgoing(at, settings.paths, (seed(settings, n), index as u64)), exposure));
+        let found = [1, 2].map(|n| {
+            display(paths.outgoing(at, settings.paths, Stage::Path.key(seed(settings, n), index as u64)), exposure)
+        });
         rays.fetch_add(paths.rays, Ordering::Relaxed);
         let off = |shown: DVec3| found.map(|r| display(shown, exposure) - r);
         let ([a, b], [c, d]) = (off(shown[0]), off(shown[1]));

@@ -204,8 +204,9 @@ impl<'a> Contacts<'a> {
             departure: Departure::Surface(side),
         };
         let index = ((STAND_INS * o + 1 + n) * 2 + side.index()) as u64;
-        let direct = direct_irradiance(scene, tracer, &receiver, shadow_rays, (seed, Stage::Direct, index));
-        let gathered = gathered_irradiance(scene, tracer, cache, &receiver, gather_rays, (seed, index)).estimate;
+        let direct = direct_irradiance(scene, tracer, &receiver, shadow_rays, Stage::Direct.key(seed, index));
+        let gathered =
+            gathered_irradiance(scene, tracer, cache, &receiver, gather_rays, Stage::Gather.key(seed, index)).estimate;
         counts.rays += direct.rays + gathered.rays;
         counts.misses += gathered.misses;
         let within = scene.leaves_within(receiver.departure);

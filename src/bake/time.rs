@@ -294,7 +294,7 @@ fn field_seconds(
         let Some(normal) = scene.normal(p, side) else { return };
         let receiver = Receiver { position, normal, isovalue, departure: Departure::Surface(side) };
         black_box(map.irradiance(&receiver, scratch));
-        let key = (settings.seed, Stage::Cache, i as u64);
+        let key = Stage::Cache.key(settings.seed, i as u64);
         black_box(direct_irradiance(scene, tracer, &receiver, settings.cache_shadow_rays, key));
     });
     let per_node = begun.elapsed().as_secs_f64() / tried;

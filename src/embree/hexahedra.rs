@@ -154,6 +154,25 @@ fn decode_target(bits: u32) -> Target {
     }
 }
 
+#[inline]
+fn user_hit(hit: FlattenedHit) -> UserHit {
+    UserHit { t: hit.t, u: f32::from_bits(encode_target(hit.target)), v: 0.0, normal: [0.0; 3] }
+}
+
+/// Writes down what a packet's lanes found; a bit for each lane that found anything.
+#[inline]
+fn user_hits(found: [Option<FlattenedHit>; 16], hits: &mut UserHits16) -> u16 {
+    let mut bits = 0;
+    for (lane, hit) in found.into_iter().enumerate() {
+        if let Some(hit) = hit {
+            hits.t[lane] = hit.t;
+            hits.u[lane] = f32::from_bits(encode_target(hit.target));
+            bits |= 1 << lane;
+        }
+    }
+    bits
+}
+
 impl UserGeometry for Graph<'_> {
     fn len(&self) -> u32 {
         1
@@ -165,8 +184,7 @@ impl UserGeometry for Graph<'_> {
 
     #[inline]
     fn intersect(&self, _: u32, ray: &RayView) -> Option<UserHit> {
-        let hit = self.pyramid.intersect(self.field, &flattened_ray(ray), f64::from(ray.tfar))?;
-        Some(UserHit { t: hit.t, u: f32::from_bits(encode_target(hit.target)), v: 0.0, normal: [0.0; 3] })
+        self.pyramid.intersect(self.field, &flattened_ray(ray), f64::from(ray.tfar)).map(user_hit)
     }
 
     #[inline]
@@ -178,15 +196,7 @@ impl UserGeometry for Graph<'_> {
     fn intersect16(&self, _: u32, active: u16, rays: &Ray16, hits: &mut UserHits16) -> u16 {
         let mut found = [None; 16];
         self.pyramid.intersect16(self.field, active, |lane| flattened_ray(&rays.lane(lane)), &mut found);
-        let mut bits = 0;
-        for (lane, hit) in found.iter().enumerate() {
-            if let Some(hit) = hit {
-                hits.t[lane] = hit.t;
-                hits.u[lane] = f32::from_bits(encode_target(hit.target));
-                bits |= 1 << lane;
-            }
-        }
-        bits
+        user_hits(found, hits)
     }
 
     #[inline]
@@ -207,9 +217,10 @@ impl CompanionGraph<'_> {
         self.companion.ray_to_index(&flattened_ray(ray))
     }
 
+    /// A hit of its own walk, as the scene names what was hit.
     #[inline]
-    fn target(&self, hit: &FlattenedHit) -> f32 {
-        f32::from_bits(encode_target(self.companion.target(hit.target)))
+    fn named(&self, hit: FlattenedHit) -> FlattenedHit {
+        FlattenedHit { target: self.companion.target(hit.target), ..hit }
     }
 }
 
@@ -227,7 +238,7 @@ impl UserGeometry for CompanionGraph<'_> {
     #[inline]
     fn intersect(&self, _: u32, ray: &RayView) -> Option<UserHit> {
         let hit = self.graph.pyramid.intersect(self.graph.field, &self.ray(ray), f64::from(ray.tfar))?;
-        Some(UserHit { t: hit.t, u: self.target(&hit), v: 0.0, normal: [0.0; 3] })
+        Some(user_hit(self.named(hit)))
     }
 
     #[inline]
@@ -239,15 +250,7 @@ impl UserGeometry for CompanionGraph<'_> {
     fn intersect16(&self, _: u32, active: u16, rays: &Ray16, hits: &mut UserHits16) -> u16 {
         let mut found = [None; 16];
         self.graph.pyramid.intersect16(self.graph.field, active, |lane| self.ray(&rays.lane(lane)), &mut found);
-        let mut bits = 0;
-        for (lane, hit) in found.iter().enumerate() {
-            if let Some(hit) = hit {
-                hits.t[lane] = hit.t;
-                hits.u[lane] = self.target(hit);
-                bits |= 1 << lane;
-            }
-        }
-        bits
+        user_hits(found.map(|hit| Some(self.named(hit?))), hits)
     }
 
     #[inline]
@@ -288,11 +291,10 @@ impl UserGeometry for StackedGraphs<'_> {
             let ray = Self::ray(c, &flattened, reach);
             let found = c.graph.pyramid.intersect(c.graph.field, &ray, f64::from(reach));
             if let Some(hit) = found.filter(|h| nearest.is_none_or(|n| h.t < n.t)) {
-                nearest = Some(FlattenedHit { target: c.companion.target(hit.target), ..hit });
+                nearest = Some(c.named(hit));
             }
         }
-        let hit = nearest?;
-        Some(UserHit { t: hit.t, u: f32::from_bits(encode_target(hit.target)), v: 0.0, normal: [0.0; 3] })
+        nearest.map(user_hit)
     }
 
     #[inline]
@@ -316,19 +318,11 @@ impl UserGeometry for StackedGraphs<'_> {
             c.graph.pyramid.intersect16(c.graph.field, active, within, &mut found);
             for (best, hit) in nearest.iter_mut().zip(found) {
                 if let Some(hit) = hit.filter(|h| best.is_none_or(|b| h.t < b.t)) {
-                    *best = Some(FlattenedHit { target: c.companion.target(hit.target), ..hit });
+                    *best = Some(c.named(hit));
                 }
             }
         }
-        let mut bits = 0;
-        for (lane, hit) in nearest.iter().enumerate() {
-            if let Some(hit) = hit {
-                hits.t[lane] = hit.t;
-                hits.u[lane] = f32::from_bits(encode_target(hit.target));
-                bits |= 1 << lane;
-            }
-        }
-        bits
+        user_hits(nearest, hits)
     }
 
     #[inline]

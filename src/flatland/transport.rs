@@ -6,7 +6,7 @@ use crate::error::Result;
 use crate::flattened::{Departure, FlattenedRay, Side, Target};
 use crate::luminaire::{point_term, unoccluded};
 use crate::polygon::Polygon;
-use crate::rng::{Rng, Sobol, Stage};
+use crate::rng::{Key, Rng, Sobol, Stage};
 use crate::tracer::Tracer;
 use crate::warp::{Frame, cosine_hemisphere};
 use glam::{DVec2, DVec3, Vec3};
@@ -338,11 +338,12 @@ impl World {
         [self.direct(receiver, shadow, &set), self.gathered(receiver, solved, gather, key)]
     }
 
-    /// Indirect light per albedo at a receiver, by path `path` of the stream of (seed, index): next-event estimation
+    /// Indirect light per albedo at a receiver, by path `path` of `key`: next-event estimation
     /// with one shadow ray per vertex and Russian roulette after three reflections. Unbiased; no stored radiance.
-    pub fn path(&self, receiver: &Receiver, path: u32, (seed, index): (u64, u64)) -> DVec3 {
-        let set = Sobol::set(seed, Stage::Path, index);
-        let mut rng = Rng::stream(seed ^ 0x9e37, Stage::Path, index << 32 | u64::from(path));
+    pub fn path(&self, receiver: &Receiver, path: u32, key: Key) -> DVec3 {
+        let set = key.set();
+        let rest = Key { seed: key.seed ^ 0x9e37, index: key.index << 32 | u64::from(path), ..key };
+        let mut rng = rest.stream();
         let (mut at, mut weight, mut sum) = (*receiver, DVec3::ONE, DVec3::ZERO);
         for bounce in 0.. {
             let u = if bounce < 2 { set.point2(path, 2 * bounce) } else { rng.unit2() };

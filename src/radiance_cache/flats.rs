@@ -65,7 +65,7 @@ pub(super) fn fill_flat<T: Tracer>(
             isovalue: c as f32,
             departure: flat.departure,
         };
-        let key = (settings.seed, Stage::Cache, !(((number as u64) << 40) | i as u64));
+        let key = Stage::Cache.key(settings.seed, !(((number as u64) << 40) | i as u64));
         let direct = direct_irradiance(scene, tracer, &receiver, shadow_rays, key);
         rays.fetch_add(direct.rays, Ordering::Relaxed);
         direct
@@ -514,7 +514,7 @@ mod tests {
                 isovalue: c as f32,
                 departure: flat.departure,
             };
-            let direct = direct_irradiance(&scene, &Nothing, &receiver, 4, (3, Stage::Test, i)).mean;
+            let direct = direct_irradiance(&scene, &Nothing, &receiver, 4, Stage::Test.key(3, i)).mean;
             let outside = gap > 0.0;
             let expected = if outside { DVec3::splat(dense) } else { direct + dense / 3.0 };
             let x = filled.seen(!outside).unwrap().lookup([u, v, c]).x / reflected(flat.albedo.at(c), expected).x;

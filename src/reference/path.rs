@@ -9,7 +9,7 @@ use crate::landing::{Landing, MOST_LANDINGS, landing};
 use crate::luminaire::{Aim, unoccluded};
 use crate::progress::Progress;
 use crate::render::{Camera, trace_picture};
-use crate::rng::{Rng, Sobol, Stage};
+use crate::rng::{Key, Rng, Sobol, Stage};
 use crate::scene::Scene;
 use crate::tracer::Tracer;
 use crate::warp::{Frame, cosine_hemisphere};
@@ -32,15 +32,15 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
         Self { scene, tracer, rays: 0 }
     }
 
-    /// Radiance that leaves the surface at `receiver`, from `samples` paths. `key` is (seed, index).
-    pub fn outgoing(&mut self, receiver: &Receiver, samples: u32, key: (u64, u64)) -> DVec3 {
+    /// Radiance that leaves the surface at `receiver`, from `samples` paths of `key`.
+    pub fn outgoing(&mut self, receiver: &Receiver, samples: u32, key: Key) -> DVec3 {
         let scene = self.scene;
         let direct = self.direct(receiver, samples, key);
         let frame = Frame::new(receiver.normal);
-        let set = Sobol::set(key.0, Stage::Path, key.1);
+        let set = key.set();
         let mut sum = DVec3::ZERO;
         for i in 0..samples {
-            let mut rng = Rng::stream(key.0, Stage::Path, key.1 << 20 ^ u64::from(i));
+            let mut rng = key.nth(i);
             let direction = frame.to_world(cosine_hemisphere(set.point2(i, 2)));
             sum +=
                 self.incoming(scene.ray(receiver.position, direction, receiver.isovalue, receiver.departure), &mut rng);
@@ -51,8 +51,9 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
 
     /// Direct irradiance by `samples` points uniform over the solid angle of each luminaire, each worth g:
     /// β E₀ + 1/n Σ g (V − β) with E₀ the closed form without blockers. Unbiased for every β; β is the visible share
-    /// seen by a pilot of its own, so that what is fully lit or fully dark has no variance.
-    pub fn direct(&mut self, receiver: &Receiver, samples: u32, (seed, index): (u64, u64)) -> DVec3 {
+    /// seen by a pilot of its own, so that what is fully lit or fully dark has no variance. `key` says seed and index; the
+    /// stage is its own.
+    pub fn direct(&mut self, receiver: &Receiver, samples: u32, key: Key) -> DVec3 {
         let scene = self.scene;
         let x = scene.lattice().to_world(receiver.position.as_dvec3());
         let mut total = DVec3::ZERO;
@@ -65,7 +66,8 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
             if open == 0.0 {
                 continue;
             }
-            let index = index * scene.luminaires().len() as u64 + n as u64;
+            let index = key.index * scene.luminaires().len() as u64 + n as u64;
+            let set = |index| Stage::Direct.key(key.seed, index).set();
             let aim = Aim::new(light, x, receiver.normal);
             let mut shares = |set: Sobol, count: u32| -> (f64, f64) {
                 let (mut all, mut seen) = (0.0, 0.0);
@@ -80,9 +82,9 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
                 (all, seen)
             };
             // The pilot's stream: another index of the same stage, far from all others.
-            let (all, seen) = shares(Sobol::set(seed, Stage::Direct, !index), PILOT);
+            let (all, seen) = shares(set(!index), PILOT);
             let beta = if all > 0.0 { seen / all } else { 0.0 };
-            let (all, seen) = shares(Sobol::set(seed, Stage::Direct, index), samples);
+            let (all, seen) = shares(set(index), samples);
             let mean = (seen - beta * all) / f64::from(samples.max(1));
             total += light.emission * (beta * open + mean);
         }

@@ -8,7 +8,7 @@ use crate::flattened::{Departure, Side};
 use crate::landing::{Landing, landing};
 use crate::nearest::{Neighbours, PointGrid};
 use crate::photon::Photons;
-use crate::rng::{Rng, Sobol, Stage};
+use crate::rng::{Key, Sobol, Stage};
 use crate::scene::Scene;
 use crate::surface_mesh::SurfaceMesh;
 use crate::tracer::Tracer;
@@ -166,16 +166,16 @@ impl SurfaceMap {
         tracer: &T,
         receiver: &Receiver,
         samples: u32,
-        key: (u64, u64),
+        key: Key,
         rays: &mut u64,
     ) -> DVec3 {
         let mut paths = PathTracer::new(scene, tracer);
         let direct = paths.direct(receiver, samples, key);
         let frame = Frame::new(receiver.normal);
-        let set = Sobol::set(key.0, Stage::Path, key.1);
+        let set = key.set();
         let (mut scratch, mut sum) = (Neighbours::default(), DVec3::ZERO);
         for i in 0..samples {
-            let mut rng = Rng::stream(key.0, Stage::Path, key.1 << 20 ^ u64::from(i));
+            let mut rng = key.nth(i);
             let direction = frame.to_world(cosine_hemisphere(set.point2(i, 2)));
             let ray = scene.ray(receiver.position, direction, receiver.isovalue, receiver.departure);
             paths.rays += 1;

@@ -1,7 +1,7 @@
 //! Families of parallel lines: a world direction as a shear of the lattice, and the low-discrepancy sets they come
 //! from.
 
-use crate::rng::{Rng, Sobol, Stage};
+use crate::rng::Key;
 use crate::volume::Lattice;
 use glam::{DMat3, DQuat, DVec3};
 use std::f64::consts::TAU;
@@ -77,17 +77,11 @@ impl Shear {
 
 /// `directions`/2 lines, low-discrepancy and uniform over the projective sphere in **world** space, each family with
 /// its own lattice offset: a Fibonacci lattice of the hemisphere \[Marques13\], turned at random. Sets of different
-/// `index` are independent; the `parts` of one are interleaved, and together as well distributed as one set of that
+/// keys are independent; the `parts` of one are interleaved, and together as well distributed as one set of that
 /// many more. The first 2, 4, 8 … parts of a power of two of them are evenly spread, too.
 #[allow(clippy::cast_possible_truncation, reason = "at most 2³¹ directions")]
-pub(super) fn lines(
-    lattice: &Lattice,
-    (seed, index): (u64, u64),
-    directions: usize,
-    (part, parts): (usize, usize),
-) -> Vec<Shear> {
-    let set = Sobol::set(seed, Stage::Sweep, index);
-    let mut rng = Rng::stream(seed, Stage::Sweep, index);
+pub(super) fn lines(lattice: &Lattice, key: Key, directions: usize, (part, parts): (usize, usize)) -> Vec<Shear> {
+    let (set, mut rng) = (key.set(), key.stream());
     let count = (directions / 2).max(1) as u32;
     let turn = rotation([rng.unit(), rng.unit(), rng.unit()]);
     let (shift, phase) = (rng.unit(), rng.unit());
@@ -122,13 +116,14 @@ fn rotation([u, v, w]: [f64; 3]) -> DMat3 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::rng::{Rng, Stage};
 
     #[test]
     fn a_shear_is_its_direction_whatever_the_axes() {
         let axes = DMat3::from_cols(DVec3::new(-0.5, 0.1, 0.0), DVec3::new(0.2, 0.7, 0.0), DVec3::new(0.0, 0.3, 9.0));
         let lattice = Lattice::new([5, 4, 6], DVec3::ZERO, axes).unwrap();
         let mut total = 0.0;
-        for s in lines(&lattice, (1, 2), 256, (0, 1)) {
+        for s in lines(&lattice, Stage::Sweep.key(1, 2), 256, (0, 1)) {
             let [u, v, a] = s.layout.axes;
             let step = s.slope[0] * axes.col(u) + s.slope[1] * axes.col(v) + axes.col(a);
             assert!((step.normalize() - s.omega).length() < 1e-12);
@@ -154,11 +149,12 @@ mod tests {
             worst.fold(0.0, f64::max) * (all.len() as f64).sqrt()
         };
         let parts = |indices: [u64; 4]| -> Vec<Shear> {
-            (0..4).flat_map(|part| lines(&lattice, (1, indices[part]), 128, (part, 4))).collect()
+            (0..4).flat_map(|part| lines(&lattice, Stage::Sweep.key(1, indices[part]), 128, (part, 4))).collect()
         };
         let (one, others) = (hole(&parts([7; 4])), hole(&parts([7, 8, 9, 10])));
-        let whole = hole(&lines(&lattice, (1, 7), 512, (0, 1)));
-        let first: Vec<Shear> = (0..2).flat_map(|part| lines(&lattice, (1, 7), 128, (part, 4))).collect();
+        let whole = hole(&lines(&lattice, Stage::Sweep.key(1, 7), 512, (0, 1)));
+        let first: Vec<Shear> =
+            (0..2).flat_map(|part| lines(&lattice, Stage::Sweep.key(1, 7), 128, (part, 4))).collect();
         let half = hole(&first);
         println!("holes: a whole set {whole:.2}, four parts {one:.2}, two {half:.2}, parts of four sets {others:.2}");
         assert!(one < 1.02 * whole && others > 1.2 * whole && half < 1.2 * whole);

@@ -16,6 +16,7 @@ use super::settling::Settling;
 use super::state::{Passes, State};
 use super::{Run, SweepSettings};
 use crate::flat;
+use crate::rng::Stage;
 use crate::scene::Scene;
 use std::sync::Mutex;
 
@@ -145,7 +146,7 @@ impl Run<'_> {
                 ((LATE - now.late) as u64, clamped(s.directions >> (LATE - 1 - now.late)), (number, replicates))
             }
         };
-        directions::lines(self.scene.lattice(), (s.seed, index), directions, part)
+        directions::lines(self.scene.lattice(), Stage::Sweep.key(s.seed, index), directions, part)
     }
 
     /// Bounces: coarse passes until what is missing is known and small, then finer ones. Goes on behind the passes of

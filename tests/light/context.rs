@@ -147,7 +147,7 @@ fn light_to_and_from_context_agrees_with_paths() {
         let Some(normal) = scene.normal(position, Side::Lower) else { continue };
         let (position, isovalue) = (position.as_vec3(), h as f32);
         let receiver = Receiver { position, normal, isovalue, departure: Departure::Surface(Side::Lower) };
-        let exact = luminance(paths.outgoing(&receiver, 32, (3, o as u64)));
+        let exact = luminance(paths.outgoing(&receiver, 32, Stage::Path.key(3, o as u64)));
         let bin = &mut bins[((h * 4.0) as usize).min(3)];
         let baked = luminance(DVec3::from_array(bake.sides[0].1.radiance[o].map(f64::from)));
         bin[0].push(baked - exact);
@@ -172,7 +172,8 @@ fn light_to_and_from_context_agrees_with_paths() {
                 departure: Departure::Polygon(id as u32),
             };
             // `outgoing` reflects by the level sets' albedo.
-            let exact = luminance(paths.outgoing(&receiver, 16, (4, (id as u64) << 32 | i))) * 0.8 / 0.75;
+            let exact =
+                luminance(paths.outgoing(&receiver, 16, Stage::Path.key(4, (id as u64) << 32 | i))) * 0.8 / 0.75;
             let [u, v] = p.texture(x);
             let baked = luminance(texture.lookup([u, v, c]));
             let m = match (sheet, p.other_face) {

@@ -14,6 +14,7 @@ use isolume::photon_map::EstimateSettings;
 use isolume::radiance::{Indirect, RadianceSample, sample_radiance};
 use isolume::radiance_cache::{CacheSettings, RadianceCache};
 use isolume::reference::{ReferenceSettings, reference};
+use isolume::rng::Stage;
 use isolume::scene::{Scene, Surface, cornell_box};
 use isolume::stats::Moments;
 use isolume::surface_mesh::SurfaceMesh;
@@ -167,7 +168,8 @@ fn sealed_receivers_stop_early() {
             departure: Departure::Surface(Side::Higher),
         };
         for rays in [16, 64, 256, 1024] {
-            let got = gathered_irradiance(&views[0], &tracers[0], &cache, &receiver, rays, (1, 2)).estimate;
+            let got =
+                gathered_irradiance(&views[0], &tracers[0], &cache, &receiver, rays, Stage::Gather.key(1, 2)).estimate;
             println!("x = {x}: {} of {rays} rays, {:?}", got.rays, got.mean);
             assert_eq!(got.mean == DVec3::ZERO, sealed);
             assert!(if sealed {

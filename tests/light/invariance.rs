@@ -277,7 +277,7 @@ fn a_plateau_outside_the_sweep_is_no_end_to_interpolate_from() {
         let Some(normal) = scene.normal(p, Side::Lower).filter(|_| (0.2..0.3).contains(&c)) else { continue };
         #[allow(clippy::cast_possible_truncation)]
         let receiver = Receiver { position, normal, isovalue: c as f32, departure: Departure::Surface(Side::Lower) };
-        let exact = direct_irradiance(&scene, &tracer, &receiver, 64, (1, Stage::Direct, count)).mean.y;
+        let exact = direct_irradiance(&scene, &tracer, &receiver, 64, Stage::Direct.key(1, count)).mean.y;
         let got = grid.interpolate(scene.lattice(), p).y * PI / 0.01;
         (squares, light, count) = (squares + (got - exact).powi(2), light + exact * exact, count + 1);
     }

@@ -10,6 +10,7 @@ use isolume::landing::MOST_LANDINGS;
 use isolume::mask::Mask;
 use isolume::polygon::Polygon;
 use isolume::reference::{PathTracer, receiver};
+use isolume::rng::Stage;
 use isolume::scene::{Scene, Surface};
 use std::f64::consts::PI;
 
@@ -56,7 +57,8 @@ fn nothing_passes_through_a_luminaire_that_reflects() {
                 see(0, grid.radiance[o].map(f64::from));
                 if by_paths {
                     let receiver = receiver(&scene, scene.lattice().to_index(x), scene.field.samples()[o], *side);
-                    let paths = PathTracer::new(&scene, &tracer).outgoing(&receiver.unwrap(), 16, (1, o as u64));
+                    let paths =
+                        PathTracer::new(&scene, &tracer).outgoing(&receiver.unwrap(), 16, Stage::Path.key(1, o as u64));
                     see(1, paths.to_array());
                 }
             }
@@ -102,8 +104,9 @@ fn paths_among_white_surfaces_end() {
         Side::Lower,
     );
     let receiver = receiver.unwrap();
-    let path = PathTracer::new(&scene, &tracer).outgoing(&receiver, 2, (1, 1)).x;
-    let gathered = gathered_irradiance(&scene, &tracer, &Unknown, &receiver, 2, (1, 1)).estimate.mean.x / PI;
+    let path = PathTracer::new(&scene, &tracer).outgoing(&receiver, 2, Stage::Path.key(1, 1)).x;
+    let gathered =
+        gathered_irradiance(&scene, &tracer, &Unknown, &receiver, 2, Stage::Gather.key(1, 1)).estimate.mean.x / PI;
     println!("{path}, {gathered}");
     let landings = f64::from(MOST_LANDINGS);
     assert!((path / (landings + 1.0) - 1.0).abs() < 1e-9 && (gathered / landings - 1.0).abs() < 1e-9);

@@ -57,7 +57,7 @@ fn against_next_event(
         let normal = scene.normal(position.as_dvec3(), Side::Higher).unwrap();
         #[allow(clippy::cast_possible_truncation)]
         let receiver = Receiver { position, normal, isovalue: c as f32, departure: Departure::Surface(Side::Higher) };
-        let e = direct_irradiance(scene, &tracer, &receiver, 4, (1, Stage::Direct, bins[0].count())).mean.x;
+        let e = direct_irradiance(scene, &tracer, &receiver, 4, Stage::Direct.key(1, bins[0].count())).mean.x;
         let estimate = map.irradiance(&receiver, &mut scratch).mean.x;
         bins[((c * 10.0) as usize).min(9)].push(estimate / e);
     }
@@ -207,8 +207,9 @@ fn forward_is_backward() {
         &|_| true,
     );
     let backward = |receiver: &Receiver, index: u64| {
-        let direct = direct_irradiance(&scene, &tracer, receiver, 8, (2, Stage::Direct, index)).mean;
-        [direct, gathered_irradiance(&scene, &tracer, &cache, receiver, 16, (2, index)).estimate.mean].map(luminance)
+        let direct = direct_irradiance(&scene, &tracer, receiver, 8, Stage::Direct.key(2, index)).mean;
+        [direct, gathered_irradiance(&scene, &tracer, &cache, receiver, 16, Stage::Gather.key(2, index)).estimate.mean]
+            .map(luminance)
     };
     let mut family = Family::new("forward = backward", 0.015);
     let mut judge = |what: String, photons: [(f64, f64); 2], back: [Moments; 2], first: usize| {

@@ -11,6 +11,7 @@ use isolume::photon::{PhotonSettings, Photons, trace_photons};
 use isolume::polygon::Polygon;
 use isolume::progress::Progress;
 use isolume::reference::{PathTracer, receiver};
+use isolume::rng::Stage;
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
 use isolume::stats::{Moments, normal_quantile, sidak};
 use isolume::volume::{Lattice, Samples, Volume};
@@ -194,7 +195,7 @@ pub(crate) fn against_paths(scene: &Scene, side: Side, radiance: &[[f32; 3]], po
         .map(|&o| {
             let place = DVec3::from_array(scene.lattice().ijk(o).map(|i| i as f64));
             let receiver = receiver(scene, place, scene.field.samples()[o], side).unwrap();
-            let exact = PathTracer::new(scene, &tracer).outgoing(&receiver, 512, (5, o as u64));
+            let exact = PathTracer::new(scene, &tracer).outgoing(&receiver, 512, Stage::Path.key(5, o as u64));
             [f64::from(radiance[o][1]), exact.y]
         })
         .collect();

@@ -108,7 +108,7 @@ fn bright_rooms_are_as_bright_as_they_should_be() {
     let paths = |o: usize| {
         let place = DVec3::from_array(scene.lattice().ijk(o).map(|x| x as f64));
         let receiver = receiver(&scene, place, scene.field.samples()[o], Side::Lower).unwrap();
-        PathTracer::new(&scene, &tracer).outgoing(&receiver, 1024, (5, o as u64)).y
+        PathTracer::new(&scene, &tracer).outgoing(&receiver, 1024, Stage::Path.key(5, o as u64)).y
     };
     let exact: f64 = some.par_iter().map(|&o| paths(o)).collect::<Vec<_>>().iter().sum();
     let levels: Vec<f64> = (1..=6)

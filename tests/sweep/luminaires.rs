@@ -102,7 +102,7 @@ fn level_sets_cut_open_hide_a_luminaire_outside() {
                     isovalue: scene.field.samples()[o],
                     departure: Departure::Surface(Side::Lower),
                 };
-                let exact = direct_irradiance(&scene, &tracer, &receiver, 2048, (1, Stage::Test, o as u64)).mean.y;
+                let exact = direct_irradiance(&scene, &tracer, &receiver, 2048, Stage::Test.key(1, o as u64)).mean.y;
                 [f64::from(got.sides[0].irradiance[o][1]), exact]
             })
             .collect();
@@ -138,7 +138,7 @@ fn light_next_to_a_luminaire_agrees_with_exact_shadow_rays() {
                 isovalue: scene.field.samples()[o],
                 departure: Departure::Surface(Side::Lower),
             };
-            direct_irradiance(&scene, &tracer, &receiver, 1024, (1, Stage::Test, o as u64)).mean.y
+            direct_irradiance(&scene, &tracer, &receiver, 1024, Stage::Test.key(1, o as u64)).mean.y
         })
         .collect();
     let all = exact.iter().sum::<f64>() / exact.len() as f64;
@@ -177,7 +177,9 @@ fn one_bounce_near_a_luminaire_keeps_its_energy() {
                 return 0.0;
             };
             let Some(Landing { receiver, .. }) = landing(&scene, &ray, hit) else { return 0.0 };
-            direct_irradiance(&scene, &tracer, &receiver, 32, (1, Stage::Test, (o as u64) << 16 | u64::from(i))).mean.y
+            direct_irradiance(&scene, &tracer, &receiver, 32, Stage::Test.key(1, (o as u64) << 16 | u64::from(i)))
+                .mean
+                .y
         };
         (0..rays).map(hit).sum::<f64>() / f64::from(rays)
     };
