@@ -13,7 +13,7 @@ pub use obj::{Placement, read_context, read_obj};
 use crate::digits::{Shortest, brief_within};
 use crate::emission;
 use crate::error::{Error, Result};
-use crate::field::Field;
+use crate::field::{Field, Sweep};
 use crate::flattened::{Departure, FlattenedRay, MAX_POLYGONS, MAX_TARGETS, Side};
 use crate::luminaire::unoccluded;
 use crate::polygon::Polygon;
@@ -62,6 +62,30 @@ impl Surface {
     pub fn stored_sides(&self) -> Vec<Side> {
         if self.both_sides { vec![self.outside, self.outside.opposite()] } else { vec![self.outside] }
     }
+
+    /// Whether surfaces reflect no more than they receive.
+    ///
+    /// # Errors
+    /// `Invalid` for an albedo outside [0, 1], with the isovalue of `sweep`.
+    pub(crate) fn check_albedo(&self, sweep: Sweep) -> Result<()> {
+        let stops = self.albedo.stops();
+        for (s, albedo) in stops {
+            if !(albedo.cmpge(DVec3::ZERO).all() && albedo.cmple(DVec3::ONE).all()) {
+                let isovalue = brief_within(sweep.from_unit(*s), [sweep.lo(), sweep.hi()]);
+                let at = if stops.len() > 1 { format!(" at isovalue {isovalue}") } else { String::new() };
+                return Err(Error::Invalid(format!("surface albedo {albedo}{at}: every channel must lie in [0, 1]")));
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether f32 holds what surfaces emit.
+    ///
+    /// # Errors
+    /// `Invalid` for an emission out of range.
+    pub(crate) fn check_emission(&self) -> Result<()> {
+        emission::check(self.emission).map_err(|e| Error::Invalid(format!("surface {e}")))
+    }
 }
 
 /// A scene: {graph of h, walls × I, luminaires × I}. \[BB09 §2.3\]
@@ -103,18 +127,10 @@ pub(crate) fn check_spacing(lattice: &Lattice) -> Result<()> {
 
 /// Whether a field can stand among `polygons`.
 fn check(surface: &Surface, boundary: Boundary, field: &Field, polygons: &[Polygon]) -> Result<()> {
-    let fail = |what: String| Err(Error::Invalid(what));
-    let (lattice, sweep) = (field.lattice(), field.sweep());
+    let lattice = field.lattice();
     check_spacing(lattice)?;
-    let stops = surface.albedo.stops();
-    for (s, albedo) in stops {
-        if !(albedo.cmpge(DVec3::ZERO).all() && albedo.cmple(DVec3::ONE).all()) {
-            let isovalue = brief_within(sweep.from_unit(*s), [sweep.lo(), sweep.hi()]);
-            let at = if stops.len() > 1 { format!(" at isovalue {isovalue}") } else { String::new() };
-            return fail(format!("surface albedo {albedo}{at}: every channel must lie in [0, 1]"));
-        }
-    }
-    emission::check(surface.emission).or_else(|e| fail(format!("surface {e}")))?;
+    surface.check_albedo(field.sweep())?;
+    surface.check_emission()?;
     if boundary == Boundary::Capped {
         // A cap is a surface of its own: a wall in the same plane would hide it or be hidden.
         let far = lattice.far();
@@ -123,10 +139,10 @@ fn check(surface: &Surface, boundary: Boundary, field: &Field, polygons: &[Polyg
             for a in 0..3 {
                 for plane in [0.0, far[a]] {
                     if local.iter().all(|v| (v[a] - plane).abs() < 1e-6 * far[a]) {
-                        return fail(format!(
+                        return Err(Error::Invalid(format!(
                             "boundary = \"capped\": polygon '{}' lies in a face of the volume; give the box a margin",
                             p.name
-                        ));
+                        )));
                     }
                 }
             }
@@ -309,29 +325,38 @@ pub fn nearest_axes(lattice: &Lattice) -> [(usize, bool); 3] {
 /// The largest margin of a box: farther off, f32 coordinates of rays are coarser than voxels.
 const MOST_MARGIN: f64 = 1000.0;
 
+/// Whether the walls of a box around a lattice have an area.
+///
+/// # Errors
+/// `Invalid` if its edges differ by a factor of 10¹¹.
+pub(crate) fn check_edges(lattice: &Lattice) -> Result<()> {
+    let edges = lattice.spacing() * lattice.far();
+    if edges.min_element() > THINNEST * edges.max_element() {
+        return Ok(());
+    }
+    let [x, y, z] = lattice.spacing().to_array().map(Shortest);
+    Err(Error::Invalid(format!(
+        "spacing {x}, {y}, {z}: the volume is so thin that the walls of a box around it have no area; its edges may differ \
+         by a factor of {:e}",
+        1.0 / THINNEST
+    )))
+}
+
 /// The default scene's polygons: a Cornell box that coincides with Ω's faces, grown by `margin` × Ω's edge on every
 /// side. x_min red, x_max green, floor, ceiling and y_max white, y_min open; a square luminaire of radiance 1 and side
 /// 0.4 · min(Lx, Ly), 0.001 Lz under the ceiling. x, y, z are the world axes nearest the lattice's.
 ///
 /// # Errors
-/// `Invalid` for a margin that is no number from 0 to 1000.
+/// `Invalid` for a margin that is no number from 0 to 1000, and for volumes too thin for walls.
 pub fn cornell_box(lattice: &Lattice, margin: f64) -> Result<Vec<Polygon>> {
     if !(0.0..=MOST_MARGIN).contains(&margin) {
         return Err(Error::Invalid(format!(
             "box margin {margin}: must be a fraction of the volume's edges, 0 to {MOST_MARGIN}"
         )));
     }
+    check_edges(lattice)?;
     let nearest = nearest_axes(lattice);
     let far = lattice.far();
-    let edges = lattice.spacing() * far;
-    if !(edges.min_element() > THINNEST * edges.max_element()) {
-        let [x, y, z] = lattice.spacing().to_array().map(Shortest);
-        return Err(Error::Invalid(format!(
-            "spacing {x}, {y}, {z}: the volume is so thin that the walls of a box around it have no area; its edges may differ \
-             by a factor of {:e}",
-            1.0 / THINNEST
-        )));
-    }
     // Box coordinates along world-like axes, 0 … 1 from min to max face.
     let corner = |x: f64, y: f64, z: f64| {
         let mut p = DVec3::ZERO;

@@ -19,7 +19,7 @@ use crate::bake::BakeOptions;
 use crate::error::{Error, Result};
 use crate::field::{Field, Sweep};
 use crate::polygon::Polygon;
-use crate::scene::{Placement, Scene, check_spacing, cornell_box, read_context, read_obj};
+use crate::scene::{Placement, Scene, check_edges, check_spacing, cornell_box, read_context, read_obj};
 use crate::volume::generate::Generator;
 use crate::volume::raw::RawLayout;
 use crate::volume::statistics::VolumeStatistics;
@@ -383,27 +383,26 @@ pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
     let of_volume = |e: Error| e.in_file(&volume.name);
     check_spacing(field.lattice()).map_err(of_volume)?;
     let key: &[&str] = if file.surroundings.kind.is_some() { &["box", "kind"] } else { &["box", "margin"] };
+    if kind(&file.surroundings, &options.surroundings) == CORNELL {
+        check_edges(field.lattice()).map_err(of_volume)?;
+    }
     let around = surroundings(&file.surroundings, &options.surroundings, &folder, field.lattice());
-    let mut polygons = around.map_err(|e| match e.to_string().starts_with("spacing ") {
-        true => of_volume(e),
-        false => blame(key, boxed)(e),
-    })?;
+    let mut polygons = around.map_err(blame(key, boxed))?;
     polygons.extend(context(&file.context, &folder, source.as_ref())?);
     let by_flag = [options.surface.albedo.is_some(), options.surface.emission.is_some()];
     let (surface, boundary) =
         surface(&file.surface, &options.surface, sweep).map_err(blame(&["surface", "albedo"], by_flag[0]))?;
-    // What the surface's material cannot be begins with its key.
-    let in_scene = |e: Error| match (&e.to_string(), &source) {
-        (text, Some(s)) if text.starts_with("surface albedo ") && !by_flag[0] => {
-            e.in_file(s.place(&["surface", "albedo"]))
+    let in_scene = |key: &'static str, flag: bool| {
+        let place =
+            source.as_ref().map(|s| if flag { input.display().to_string() } else { s.place(&["surface", key]) });
+        |e: Error| match place {
+            Some(place) => e.in_file(place),
+            None => e,
         }
-        (text, Some(s)) if text.starts_with("surface emission ") && !by_flag[1] => {
-            e.in_file(s.place(&["surface", "emission"]))
-        }
-        (_, Some(_)) => e.in_file(input),
-        (_, None) => e,
     };
-    let scene = Scene::new(field, surface, boundary, polygons).map_err(in_scene)?;
+    surface.check_albedo(sweep).map_err(in_scene("albedo", by_flag[0]))?;
+    surface.check_emission().map_err(in_scene("emission", by_flag[1]))?;
+    let scene = Scene::new(field, surface, boundary, polygons).map_err(in_scene("", true))?;
     Ok(Loaded { volume, companions: Vec::new(), scene, bake: file.bake, source })
 }
 
@@ -445,21 +444,26 @@ fn load_volume(source: &VolumeSource, folder: &Path, raw: &RawOptions) -> Result
     }
 }
 
+/// The box around a volume unless another is named.
+const CORNELL: &str = "cornell";
+
+/// What kind of box is asked for: flags win.
+fn kind<'a>(file: &'a BoxOptions, flags: &'a BoxOptions) -> &'a str {
+    flags.kind.as_deref().or(file.kind.as_deref()).unwrap_or(CORNELL)
+}
+
 fn surroundings(file: &BoxOptions, flags: &BoxOptions, folder: &Path, lattice: &Lattice) -> Result<Vec<Polygon>> {
     let margin = flags.margin.or(file.margin);
     // A path in a scene file is relative to it, one in a flag to the working folder.
-    let (kind, folder) = match (&flags.kind, &file.kind) {
-        (Some(kind), _) => (kind.as_str(), Path::new("")),
-        (None, Some(kind)) => (kind.as_str(), folder),
-        (None, None) => ("cornell", folder),
-    };
+    let folder = if flags.kind.is_some() { Path::new("") } else { folder };
+    let kind = kind(file, flags);
     match kind {
-        "cornell" => cornell_box(lattice, margin.unwrap_or(0.0)),
+        CORNELL => cornell_box(lattice, margin.unwrap_or(0.0)),
         _ if margin.is_some() => Err(Error::Invalid(format!("box margin: only the Cornell box has one, not '{kind}'"))),
         "none" => Ok(Vec::new()),
         path => {
             let file = folder.join(path);
-            match fault::nearest(path, &["cornell", "none"]).filter(|_| !file.exists()) {
+            match fault::nearest(path, &[CORNELL, "none"]).filter(|_| !file.exists()) {
                 Some(meant) => Err(Error::Invalid(format!("'{path}' is no file; did you mean `{meant}`?"))),
                 None => read_obj(&file),
             }
