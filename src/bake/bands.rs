@@ -88,12 +88,14 @@ impl Levels {
     pub(super) fn bands(&self, count: usize) -> Vec<Band> {
         let total: u64 = self.own.iter().sum();
         let mut edges = vec![0.0];
-        let mut below = 0;
+        let (mut below, mut shares) = (0, 0);
         for (n, own) in self.own.iter().enumerate().take(STEPS - 1) {
             below += own;
-            let after = total - below;
-            // Exact in f32: the steps are a power of two.
-            if below * count as u64 >= total * edges.len() as u64 && after > 0 && edges.len() < count {
+            // Whole shares that end here; one step may hold several.
+            let ended = below * count as u64 / total.max(1);
+            if ended > shares && below < total {
+                shares = ended;
+                // Exact in f32: the steps are a power of two.
                 edges.push((n + 1) as f32 / STEPS as f32);
             }
         }
@@ -165,5 +167,18 @@ mod tests {
         let levels = Levels { own: vec![0; STEPS], least: vec![0; STEPS], most: vec![0; STEPS] };
         let own = (0..STEPS).map(|n| if n == 7 { 1000 } else { 0 }).collect();
         assert_eq!(Levels { own, ..levels }.bands(8).len(), 1);
+    }
+
+    /// A peak holds several shares, which cannot be told apart; what comes after it is no band for each of them.
+    #[test]
+    fn beside_a_peak_no_band_is_empty() {
+        for (peaks, bands) in [(&[(7, 1000), (4000, 1)][..], 2), (&[(7, 700), (2000, 200), (4000, 100)], 3)] {
+            let own = (0..STEPS).map(|n| peaks.iter().find(|p| p.0 == n).map_or(0, |p| p.1)).collect();
+            let levels = Levels { own, least: vec![0; STEPS], most: vec![0; STEPS] };
+            let found = levels.bands(4);
+            let held = |b: &Band| peaks.iter().filter(|p| b.holds(p.0 as f32 / STEPS as f32)).map(|p| p.1).sum();
+            let held: Vec<u64> = found.iter().map(held).collect();
+            assert!(held.len() == bands && held.iter().all(|&n| n > 0), "{held:?}");
+        }
     }
 }

@@ -1,6 +1,7 @@
 //! The bake as one `.vti`: the volume, its illumination, the box's light and every setting, for viewers and for
 //! `render`, `compare` and `view`. Of several volumes, a `.vti` each and a `.vtm` that names them.
 
+mod arrays;
 mod description;
 
 use super::multi_block;
@@ -17,8 +18,9 @@ use crate::mask::Mask;
 use crate::polygon::Polygon;
 use crate::scene::{Boundary, Member, Policy, Scene, Surface};
 use crate::split::Split;
-use crate::volume::vti::{self, VtiArray, VtiFile, VtiWriter};
+use crate::volume::vti::{self, VtiFile, VtiWriter};
 use crate::volume::{Lattice, Samples, Volume};
+use arrays::Arrays;
 use description::{DESCRIPTION, Description, PolygonDescription, TextureDescription};
 use glam::DVec3;
 use rayon::prelude::*;
@@ -140,38 +142,7 @@ fn completed(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
     let rows = FieldRows::new(&scene.field, lattice);
     let value = |o: usize| if own { volume.value(o) } else { sweep.from_unit(rows.value(lattice.ijk(o))) };
     let exposure = bake.exposure as f32;
-    let mut textures = Vec::new();
-    let mut texels: Vec<(String, Cow<'_, [f32]>)> = Vec::new();
-    // Much context geometry would be as many arrays.
-    let mut context = Vec::new();
-    let flats = bake.flats.iter().enumerate().filter_map(|(n, light)| Some((n, light.as_ref()?)));
-    let flats = flats.flat_map(|(n, light)| light.textures().enumerate().map(move |(i, t)| (n, light, i, t)));
-    for (n, light, i, t) in flats {
-        let (array, start) = match scene.polygons().get(n) {
-            Some(p) if p.other_face != 0 => (CONTEXT.to_owned(), context.len() / 3),
-            _ => (format!("wall_{}{}", flat_name(scene, n), suffix(i)), 0),
-        };
-        // Names in OBJ files may repeat.
-        let array =
-            if array != CONTEXT && texels.iter().any(|t| t.0 == array) { format!("{array}_{n}") } else { array };
-        if array == CONTEXT {
-            context.extend_from_slice(t.texels.as_flattened());
-        } else {
-            texels.push((array.clone(), Cow::Borrowed(t.texels.as_flattened())));
-        }
-        textures.push(TextureDescription {
-            flat: n,
-            array,
-            dims: t.dims,
-            middle: t.axis.middle(),
-            start,
-            inside: i > 0,
-            outside_only: light.within == Within::Unknown,
-        });
-    }
-    if !context.is_empty() {
-        texels.push((CONTEXT.to_owned(), Cow::Owned(context)));
-    }
+    let (textures, texels) = textures(scene, &bake.flats);
     let description = Description {
         isovalues: [sweep.lo(), sweep.hi()],
         exposure: bake.exposure,
@@ -236,6 +207,47 @@ fn completed(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
         writer = writer.field_data(name, 1, samples);
     }
     writer.field_string(vti::SPACE, volume.space.name()).field_string(DESCRIPTION, &json).complete(path)
+}
+
+/// Arrays of colours by name.
+type Colours<'a> = Vec<(String, Cow<'a, [f32]>)>;
+
+/// Where the file holds what of the flats' light, and the arrays that it is in.
+fn textures<'a>(scene: &Scene, flats: &'a [Option<FlatLight>]) -> (Vec<TextureDescription>, Colours<'a>) {
+    let mut textures = Vec::new();
+    let mut texels = Colours::new();
+    // Much context geometry would be as many arrays.
+    let mut context = Vec::new();
+    let flats = flats.iter().enumerate().filter_map(|(n, light)| Some((n, light.as_ref()?)));
+    let flats = flats.flat_map(|(n, light)| light.textures().enumerate().map(move |(i, t)| (n, light, i, t)));
+    for (n, light, i, t) in flats {
+        let (mut array, start) = match scene.polygons().get(n) {
+            Some(p) if p.other_face != 0 => (CONTEXT.to_owned(), context.len() / 3),
+            _ => (format!("wall_{}{}", flat_name(scene, n), suffix(i)), 0),
+        };
+        // Names in OBJ files may repeat, and one may be what another becomes here.
+        while array != CONTEXT && texels.iter().any(|t| t.0 == array) {
+            array = format!("{array}_{n}");
+        }
+        if array == CONTEXT {
+            context.extend_from_slice(t.texels.as_flattened());
+        } else {
+            texels.push((array.clone(), Cow::Borrowed(t.texels.as_flattened())));
+        }
+        textures.push(TextureDescription {
+            flat: n,
+            array,
+            dims: t.dims,
+            middle: t.axis.middle(),
+            start,
+            inside: i > 0,
+            outside_only: light.within == Within::Unknown,
+        });
+    }
+    if !context.is_empty() {
+        texels.push((CONTEXT.to_owned(), Cow::Owned(context)));
+    }
+    (textures, texels)
 }
 
 /// Whether f32 tells a sweep's isovalues apart too coarsely, as with a large offset or among its smallest numbers.
@@ -354,45 +366,28 @@ impl BakedVolume {
 
     fn from_parts(path: &Path, file: VtiFile, d: Description) -> Result<Self> {
         let points = file.lattice.len();
-        let array = |arrays: &[VtiArray], name: &str| -> Result<Samples> {
-            let found = arrays.iter().find(|a| a.name == name);
-            found.map(|a| a.samples.clone()).ok_or_else(|| Error::Invalid(format!("the array '{name}' is missing")))
-        };
-        let all = |arrays: &[VtiArray], name: &str| -> Result<Vec<f32>> {
-            match array(arrays, name)? {
-                Samples::F32(v) => Ok(v),
-                _ => Err(Error::Invalid(format!("the array '{name}' holds no 32-bit floats"))),
-            }
-        };
-        let floats = |arrays: &[VtiArray], name: &str, count: usize| -> Result<Vec<f32>> {
-            let v = all(arrays, name)?;
-            if v.len() == count {
-                return Ok(v);
-            }
-            Err(Error::Invalid(format!("the array '{name}' holds {} values, not {count} floats", v.len())))
-        };
-        let triples = |v: Vec<f32>| -> Vec<[f32; 3]> { v.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect() };
+        let (point_data, field_data) = (Arrays(&file.point_data), Arrays(&file.field_data));
         let surface = Surface { albedo: d.albedo, emission: d.emission, outside: d.outside, both_sides: d.both_sides };
         let mut sides = Vec::new();
         for (i, side) in surface.stored_sides().into_iter().enumerate() {
             let s = suffix(i);
-            let mask = match array(&file.point_data, &format!("mask{s}"))? {
+            let mask = match point_data.samples(&format!("mask{s}"))? {
                 Samples::U8(v) if v.len() == points => v,
                 _ => return Err(Error::Invalid(format!("the array 'mask{s}' does not hold a byte per point"))),
             };
-            let split = match file.point_data.iter().any(|a| a.name == format!("visible{s}")) {
+            let split = match point_data.holds(&format!("visible{s}")) {
                 true => Some(Split {
-                    indirect: triples(floats(&file.point_data, &format!("indirect{s}"), 3 * points)?),
-                    visible: triples(floats(&file.point_data, &format!("visible{s}"), 3 * points)?),
+                    indirect: point_data.colours_of(&format!("indirect{s}"), points)?,
+                    visible: point_data.colours_of(&format!("visible{s}"), points)?,
                 }),
                 false => None,
             };
             let grid = IlluminationGrid {
                 split,
-                radiance: triples(floats(&file.point_data, &format!("radiance{s}"), 3 * points)?),
-                std_error: floats(&file.point_data, &format!("std_error{s}"), points)?,
+                radiance: point_data.colours_of(&format!("radiance{s}"), points)?,
+                std_error: point_data.floats_of(&format!("std_error{s}"), points)?,
                 mask: mask
-                    .into_iter()
+                    .iter()
                     .map(|m| match m {
                         1 => Mask::Valid,
                         2 => Mask::Filled,
@@ -402,9 +397,9 @@ impl BakedVolume {
             };
             sides.push((side, grid));
         }
-        let values = match array(&file.point_data, "value")? {
-            values @ Samples::F64(_) if values.len() == points => values,
-            _ => Samples::F32(floats(&file.point_data, "value", points)?),
+        let values = match point_data.samples("value")? {
+            values @ Samples::F64(_) if values.len() == points => values.clone(),
+            _ => Samples::F32(point_data.floats_of("value", points)?),
         };
         let volume = Volume::new(path.display().to_string(), file.lattice, values)?;
         let mut field = Field::new(&volume, Sweep::new(d.isovalues[0], d.isovalues[1])?)?;
@@ -434,7 +429,7 @@ impl BakedVolume {
             let slot = flats.get_mut(t.flat).ok_or_else(|| t.wrong(format!("there are {number} flats")))?;
             let texels = match &read {
                 Some((name, texels)) if *name == t.array => texels,
-                _ => &read.insert((t.array.clone(), triples(all(&file.field_data, &t.array)?))).1,
+                _ => &read.insert((t.array.clone(), field_data.colours(&t.array)?)).1,
             };
             let texture = t.of(texels)?;
             match slot {
@@ -449,7 +444,7 @@ impl BakedVolume {
         }
         let (exposure, report) = (d.exposure, d.report);
         // Such bakes hold the parameter that their fields share.
-        let among_others = !d.independent && file.point_data.iter().any(|a| a.name == "s");
+        let among_others = !d.independent && point_data.holds("s");
         Ok(Self {
             scene,
             sides,

@@ -7,18 +7,18 @@ use crate::files;
 use crate::polygon::Polygon;
 use glam::{DQuat, DVec3, EulerRot};
 use std::cell::RefCell;
-use std::io::BufReader;
+use std::io::{BufRead, BufReader};
 use std::path::Path;
 
 /// Reads all faces as polygons, in file order; vertices counter-clockwise from the visible side. A face without a
 /// material is white as the default box's walls.
 ///
 /// # Errors
-/// `Io` if the OBJ or its MTL cannot be read, `Invalid` for faces that are no planar convex polygons and for malformed
-/// lines of the MTL; messages name the file and the face or line.
+/// `Io` if the OBJ or its MTL cannot be read, `Invalid` for faces that are no planar convex polygons, for materials
+/// that no library has, and for malformed lines of the MTL; messages name the file and the face or line.
 pub fn read_obj(path: &Path) -> Result<Vec<Polygon>> {
     let mut polygons = Vec::new();
-    for face in faces(path)? {
+    for face in faces(path, true)? {
         let polygon = Polygon::new(&face.name, face.vertices, face.albedo, face.emission)
             .map_err(|e| Error::invalid(path, format!("{}: {e}", face.place)))?;
         polygons.push(polygon);
@@ -52,13 +52,14 @@ impl Default for Placement {
 ///
 /// # Errors
 /// `Io` if the OBJ or its MTL cannot be read; `Invalid` if no face has an area, for coordinates that are not finite,
-/// for an albedo or emission out of range, and for malformed lines of the MTL.
+/// for an albedo or emission out of range, for malformed lines of the MTL, and for materials that no library has unless
+/// `placement` has an albedo in place of them.
 pub fn read_context(path: &Path, placement: &Placement) -> Result<Vec<Polygon>> {
     let Placement { scale, rotate, translate, .. } = *placement;
     let [x, y, z] = rotate.to_array().map(f64::to_radians);
     let turn = DQuat::from_euler(EulerRot::ZYX, z, y, x);
     let mut polygons = Vec::new();
-    for face in faces(path)? {
+    for face in faces(path, placement.albedo.is_none())? {
         let vertices: Vec<DVec3> = face.vertices.iter().map(|&v| turn * (scale * v) + translate).collect();
         if !vertices.iter().all(|v| v.is_finite()) {
             return Err(Error::invalid(path, format!("{}: a vertex is not finite", face.place)));
@@ -99,7 +100,8 @@ struct Face {
     emission: DVec3,
 }
 
-fn faces(path: &Path) -> Result<Vec<Face>> {
+/// All faces; `must_exist`: whether what they name for a material must.
+fn faces(path: &Path, must_exist: bool) -> Result<Vec<Face>> {
     let options = tobj::LoadOptions { single_index: false, triangulate: false, ..Default::default() };
     let folder = path.parent().unwrap_or(Path::new(""));
     // tobj takes none of our errors.
@@ -117,6 +119,9 @@ fn faces(path: &Path) -> Result<Vec<Face>> {
     }
     let (models, materials) = loaded.map_err(|e| Error::invalid(path, e))?;
     let materials = materials.map_err(|e| Error::invalid(path, format!("its material library: {e}")))?;
+    if must_exist {
+        check_materials(path, &materials.iter().map(|m| m.name.as_str()).collect::<Vec<_>>())?;
+    }
     let mut faces = Vec::new();
     for model in &models {
         let mesh = &model.mesh;
@@ -143,9 +148,57 @@ fn faces(path: &Path) -> Result<Vec<Face>> {
     Ok(faces)
 }
 
+/// Whether every material that faces use is among `known`: tobj takes others for none at all, which would make a white
+/// wall of a luminaire.
+fn check_materials(path: &Path, known: &[&str]) -> Result<()> {
+    for (n, line) in BufReader::new(files::open(path)?).lines().enumerate() {
+        let line = line.map_err(|e| Error::io(path, e))?;
+        let Some(name) = line.trim().strip_prefix("usemtl").filter(|rest| rest.starts_with(char::is_whitespace)) else {
+            continue;
+        };
+        let name = name.trim();
+        if !known.contains(&name) {
+            let known =
+                if known.is_empty() { "none; name their library by mtllib".to_owned() } else { known.join(", ") };
+            let place = format!("{}:{}", path.display(), n + 1);
+            return Err(Error::invalid(place, format!("usemtl {name}: there is no such material; known: {known}")));
+        }
+    }
+    Ok(())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// A misspelt luminaire would be a white wall.
+    #[test]
+    fn materials_must_exist() {
+        let dir = tempfile::tempdir().unwrap();
+        let obj = dir.path().join("box.obj");
+        std::fs::write(dir.path().join("box.mtl"), "newmtl my lamp\nKe 2 3 4\n").unwrap();
+        let triangle = "v 0 0 0\nv 0 1 0\nv 0 1 1\n";
+        for (head, name, found) in [
+            ("mtllib box.mtl\n", "my lamp ", None),
+            (
+                "mtllib box.mtl\n",
+                "My lamp",
+                Some("box.obj:5: usemtl My lamp: there is no such material; known: my lamp"),
+            ),
+            ("", "my lamp", Some("box.obj:4: usemtl my lamp: there is no such material; known: none; ")),
+        ] {
+            std::fs::write(&obj, format!("{head}{triangle}usemtl {name}\nf 1 2 3\n")).unwrap();
+            let context = |albedo| read_context(&obj, &Placement { albedo, ..Placement::default() });
+            for error in [read_obj(&obj).err(), context(None).err()] {
+                match (found, error) {
+                    (None, None) => (),
+                    (Some(found), Some(e)) => assert!(e.to_string().contains(found), "{e}"),
+                    (_, other) => panic!("{head}usemtl {name}: {other:?}"),
+                }
+            }
+            assert!(context(Some(DVec3::splat(0.5))).is_ok());
+        }
+    }
 
     #[test]
     fn a_box_with_a_light() {

@@ -169,6 +169,7 @@ impl VolumeEntry {
                 "held: a surface that stands still cannot emit light; use a luminaire".into(),
             ));
         }
+        surface.check_albedo(sweep)?;
         let lattice = field.lattice();
         let mesh = isosurface::extract(lattice.dims(), field.samples(), sweep.isovalue(isovalue))?;
         let most = MAX_POLYGONS as usize / 2;
@@ -183,7 +184,7 @@ impl VolumeEntry {
         let mut polygons = Vec::new();
         for (n, t) in mesh.triangles.iter().enumerate() {
             let corners = t.map(|v| world[v as usize]).to_vec();
-            // Triangles without an area show nothing.
+            // Nothing else can be wrong with a triangle here than that it has no area, and shows nothing.
             if let Ok(p) = Polygon::new(&format!("{}_{n}", self.name), corners, albedo, DVec3::ZERO) {
                 polygons.extend(p.both_faces());
             }
@@ -342,6 +343,8 @@ mod tests {
         assert!(of("b_").all(|p| (p.albedo - DVec3::new(0.9, 0.1, 0.1)).length() < 1e-12));
         assert!(error_of(&held("3")).contains("volume 'b': held = 3"));
         assert!(error_of(&held("0.09\nemission = 1")).contains("emit"));
+        let bright = held("0.09").replace("albedo = [0.9, 0.1, 0.1]", "albedo = 1.5");
+        assert!(error_of(&bright).contains("volume 'b': surface albedo [1.5, 1.5, 1.5]"), "{}", error_of(&bright));
         assert!(error_of(&held("0.09\nisovalues = [0, 1]")).contains("exclude"));
     }
 }

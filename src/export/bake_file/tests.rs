@@ -23,6 +23,9 @@ fn read(changed: impl FnOnce(&mut Value)) -> Result<BakedVolume> {
         .computed("std_error", 1, |_| 0.0)
         .computed_bytes("mask", 1, |_| 1)
         .field_data("wall_a", 3, &[0.125f32; 24][..])
+        .field_data("twice", 3, &[0.125f32; 24][..])
+        .field_data("twice", 3, &[0.25f32; 24][..])
+        .field_data("broken", 1, &[0.125f32; 25][..])
         .field_string(DESCRIPTION, &description.to_string());
     writer.write(&path).unwrap();
     BakedVolume::read(&path)
@@ -45,6 +48,8 @@ fn descriptions_that_do_not_hold_are_refused() {
         ("flat", json!(7), "flat 7"),
         ("flat", json!(u64::MAX), "flat"),
         ("array", json!("wall_b"), "wall_b"),
+        ("array", json!("twice"), "twice"),
+        ("array", json!("broken"), "broken"),
     ] {
         let found = read(|d| d["textures"][0][key] = value.clone());
         let Err(error) = found else { panic!("{key} = {value} is accepted") };
@@ -92,5 +97,41 @@ fn sides_are_told_by_their_names() {
     for name in ["Higher", "upper", ""] {
         let message = outside(name).unwrap_err().to_string();
         assert!(message.contains("a.vti") && message.contains("higher"), "{name}: {message}");
+    }
+}
+
+/// Names in OBJ files repeat, and one may be what another is given for it: each wall shows its own light.
+#[test]
+fn every_wall_has_an_array_of_its_own() {
+    let lattice = Lattice::aligned([3; 3], DVec3::ZERO, DVec3::ONE).unwrap();
+    let volume = Volume::new("x", lattice, Samples::F32((0..27).map(|o| (o % 3) as f32).collect())).unwrap();
+    let field = Field::new(&volume, Sweep::new(0.5, 1.5).unwrap()).unwrap();
+    let corners = [[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]];
+    let wall = |(n, name)| {
+        let vertices = corners.map(|[x, y]| DVec3::new(x, y, -1.0 - n as f64)).to_vec();
+        Polygon::new(name, vertices, DVec3::splat(0.5), DVec3::ZERO).unwrap()
+    };
+    let names = ["a_2", "a", "a", "a", "a_inside", "b", "b"];
+    let scene =
+        Scene::new(field, Surface::default(), Boundary::Open, names.into_iter().enumerate().map(wall).collect())
+            .unwrap();
+    let texture = |n: f32| crate::flat::FlatTexture {
+        dims: [1; 3],
+        axis: crate::isovalue_axis::IsovalueAxis::EVEN,
+        texels: vec![[n; 3]],
+    };
+    // Of the second one each side has its own light.
+    let light = |n: usize| {
+        let within = if n == 1 { Within::Own(texture(n as f32 + 0.5)) } else { Within::Same };
+        Some(FlatLight { outside: texture(n as f32), within })
+    };
+    let flats: Vec<_> = (0..names.len()).map(light).collect();
+    let (found, texels) = textures(&scene, &flats);
+    assert_eq!(found.len(), names.len() + 1);
+    for t in &found {
+        let held: Vec<_> = texels.iter().filter(|(name, _)| *name == t.array).collect();
+        assert_eq!(held.len(), 1, "{}: {found:?}", t.array);
+        let expected = if t.inside { t.flat as f32 + 0.5 } else { t.flat as f32 };
+        assert_eq!(held[0].1[0], expected, "{}", t.array);
     }
 }
