@@ -152,7 +152,7 @@ fn main() {
         vertices: Some(1000),
         ..ReferenceSettings::default()
     };
-    let (found, seconds) = timed(|| reference(&scene, &tracer, &mesh, isovalue, &settings, &|_| true));
+    let (found, seconds) = timed(|| reference(&scene, &tracer, &mesh, isovalue, &settings, &|_| true).unwrap());
     println!(
         "reference on {} triangles: {:.0} vertices/s of {} paths, {:.2} M rays/s",
         mesh.triangles.len(),

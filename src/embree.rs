@@ -1,4 +1,5 @@
-//! Embree 4 behind a safe fence. All `unsafe` of this crate is in the files of this module.
+//! Embree 4 behind a safe fence. All `unsafe` of this crate is in the files of this module, but for vectors' intrinsics
+//! (`isa`, and the SIMD modules of the pyramid and of sweeps).
 //!
 //! Three layers: `abi`, the structs that are handed to the library, generated from `wrapper/embree_abi.h`; [`Device`],
 //! the library itself and its errors; [`Scene`], a committed set of triangles and of user geometries that borrows or

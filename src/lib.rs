@@ -44,7 +44,7 @@ pub mod scene;
 pub mod flat;
 // The one seam: nearest hit and visibility.
 pub mod tracer;
-#[allow(unsafe_code, reason = "FFI to Embree: the one place in this crate")]
+#[allow(unsafe_code, reason = "FFI to Embree, here only")]
 pub mod embree;
 // Light transport, generic over the tracer.
 pub mod direct;

@@ -73,7 +73,7 @@ pub fn octant(n: Vec3) -> u8 {
 /// A photon that landed on a textured flat: a polygon or a cap.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FlatPhoton {
-    /// Which: polygons first, then the six caps.
+    /// Which: polygons first, then six caps of each field.
     pub flat: u32,
     /// Texture coordinates and isovalue, [0, 1]³.
     pub uvc: [f32; 3],

@@ -13,9 +13,10 @@ pub use path::{PathTracer, path_picture};
 pub use surface_map::{SurfaceMap, SurfaceMapSettings};
 
 use crate::direct::Receiver;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::export::ply;
 use crate::flattened::{Departure, Side};
+use crate::isosurface;
 use crate::isovalue_axis::IsovalueAxis;
 use crate::photon::{PhotonSettings, trace_photons};
 use crate::rng::{Rng, Stage};
@@ -27,14 +28,33 @@ use rayon::prelude::*;
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+/// Counts changes of what references hold: those that a study keeps are made anew by another version.
+pub const VERSION: u32 = 1;
+
 /// How outgoing radiance is found.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum Integrator {
     /// Path tracing with next-event estimation: unbiased.
     #[default]
     Path,
-    /// A photon map on the mesh and final gather, as BB09's reference.
+    /// A photon map on the mesh and final gather, as BB09's reference; not for isosurfaces that emit light.
     Photon,
+}
+
+impl Integrator {
+    /// Whether it can light `scene`.
+    ///
+    /// # Errors
+    /// `NotSupported` for photons of isosurfaces that emit light, which leave from all of the sweep.
+    pub fn check(self, scene: &Scene) -> Result<()> {
+        let emits = || scene.members().iter().any(|m| m.surface.emission != DVec3::ZERO);
+        if self == Self::Photon && emits() {
+            return Err(Error::NotSupported(
+                "--integrator photon: isosurfaces that emit light are for --integrator path".into(),
+            ));
+        }
+        Ok(())
+    }
 }
 
 /// How much work a reference is worth.
@@ -131,17 +151,21 @@ pub fn receiver(scene: &Scene, p: DVec3, isovalue: f32, side: Side) -> Option<Re
 }
 
 /// The scene seen from each companion, with its isosurface, which may be empty.
-fn companion_meshes(scene: &Scene, isovalue: f32) -> Vec<(Scene, SurfaceMesh)> {
+fn companion_meshes(scene: &Scene, isovalue: f32) -> Result<Vec<(Scene, SurfaceMesh)>> {
     let seen = scene.companions().iter().map(|c| scene.seen_from(c.number));
     seen.map(|s| {
-        let mesh = SurfaceMesh::extract(&s, isovalue, 1).unwrap_or_default();
-        (s, mesh)
+        let mesh = isosurface::extract(s.lattice().dims(), s.field.samples(), isovalue)?;
+        let mesh = if mesh.triangles.is_empty() { SurfaceMesh::default() } else { SurfaceMesh::new(&s, mesh)? };
+        Ok((s, mesh))
     })
     .collect()
 }
 
 /// Outgoing radiance of the outside at the vertices of `mesh`, the isosurface at `isovalue` (units of the sweep).
 /// `tick(n)` reports n of batches × vertices done; returning false stops early.
+///
+/// # Errors
+/// As [`Integrator::check`]; from the extraction of companions' isosurfaces.
 #[allow(clippy::cast_possible_truncation, reason = "batches are few")]
 pub fn reference<T: Tracer>(
     scene: &Scene,
@@ -150,11 +174,12 @@ pub fn reference<T: Tracer>(
     isovalue: f32,
     settings: &ReferenceSettings,
     tick: &(dyn Fn(u64) -> bool + Sync),
-) -> Reference {
+) -> Result<Reference> {
+    settings.integrator.check(scene)?;
     let side = scene.surface.outside;
     let companions = match settings.integrator {
         Integrator::Path => Vec::new(),
-        Integrator::Photon => companion_meshes(scene, isovalue),
+        Integrator::Photon => companion_meshes(scene, isovalue)?,
     };
     let chosen = subset(mesh.local.len(), settings.vertices);
     let receivers: Vec<Option<Receiver>> =
@@ -221,5 +246,5 @@ pub fn reference<T: Tracer>(
         out.variance[v] = squares[i] / (n * (n - 1.0));
         out.sampled[v] = true;
     }
-    out
+    Ok(out)
 }

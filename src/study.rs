@@ -17,7 +17,7 @@ use crate::embree::{Device, SurfaceTracer};
 use crate::error::{Error, Result};
 use crate::export::ply;
 use crate::progress::{Progress, processor_seconds, say};
-use crate::reference::{Origin, ReferenceSettings, reference};
+use crate::reference::{Origin, ReferenceSettings, VERSION, reference};
 use crate::scene::Scene;
 use crate::surface_mesh::SurfaceMesh;
 use glam::DVec3;
@@ -166,14 +166,14 @@ impl Study {
             let settings =
                 ReferenceSettings { samples, vertices: Some(vertices), seed, ..ReferenceSettings::default() };
             let isovalue = exactly(isovalue);
-            let digest = digest(&format!("{job}{settings:?} at {isovalue}"));
+            let digest = digest(&format!("{job}{settings:?} at {isovalue}, version {VERSION}"));
             let name = format!("{}-{isovalue}-{vertices}x{samples}-{seed}-{digest}.ply", subject.name);
             let path = self.folder.join("references").join(name);
             if !path.exists() {
                 let tracer = SurfaceTracer::new(&self.device, scene, c, 1)?;
                 let count = vertices.min(mesh.local.len()) as u64 * u64::from(settings.batches);
                 let stage = self.progress.stage(&format!("reference {isovalue}"), count);
-                let result = reference(scene, &tracer, &mesh, c, &settings, &|n| stage.tick(n));
+                let result = reference(scene, &tracer, &mesh, c, &settings, &|n| stage.tick(n))?;
                 stage.end()?;
                 result.write(&path, &mesh, Origin::comment(scene, at, &settings))?;
             }

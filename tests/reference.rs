@@ -184,7 +184,7 @@ fn furnaces() {
     let tracer = SurfaceTracer::new(&device, &scene, c, 1).unwrap();
     let mesh = SurfaceMesh::extract(&scene, c, 1).unwrap();
     let settings = ReferenceSettings { samples: 512, batches: 16, vertices: Some(200), ..ReferenceSettings::default() };
-    let result = reference(&scene, &tracer, &mesh, c, &settings, &|_| true);
+    let result = reference(&scene, &tracer, &mesh, c, &settings, &|_| true).unwrap();
     let level = normal_quantile(sidak(0.01, 600));
     for v in (0..mesh.local.len()).filter(|&v| result.sampled[v]) {
         for k in 0..3 {
@@ -212,7 +212,7 @@ fn furnaces() {
     let scene = balls(25, surface, walls);
     let tracer = GraphTracer::new(&device, &scene).unwrap();
     let mesh = SurfaceMesh::extract(&scene, c, 1).unwrap();
-    let result = reference(&scene, &tracer, &mesh, c, &settings, &|_| true);
+    let result = reference(&scene, &tracer, &mesh, c, &settings, &|_| true).unwrap();
     for v in (0..mesh.local.len()).filter(|&v| result.sampled[v]) {
         let off = (result.radiance[v] - rho).abs().max_element();
         // 2 %: next-event points behind the trilinear surface's own horizon, which the shared normal does not know.
@@ -313,8 +313,8 @@ fn the_photon_map_agrees_with_the_path_tracer() {
             seed,
             ..ReferenceSettings::default()
         };
-        let photon = reference(&scene, &tracer, &mesh, c, &settings(Integrator::Photon, 1), &|_| true);
-        let path = reference(&scene, &tracer, &mesh, c, &settings(Integrator::Path, 2), &|_| true);
+        let photon = reference(&scene, &tracer, &mesh, c, &settings(Integrator::Photon, 1), &|_| true).unwrap();
+        let path = reference(&scene, &tracer, &mesh, c, &settings(Integrator::Path, 2), &|_| true).unwrap();
         let of_scene: Vec<f64> = (0..mesh.local.len())
             .filter(|&v| path.sampled[v])
             .map(|v| {
@@ -516,7 +516,7 @@ fn the_same_bits_on_any_number_of_threads() {
         };
         let run = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| reference(&scene, &tracer, &mesh, c, &settings, &|_| true)).radiance
+            pool.install(|| reference(&scene, &tracer, &mesh, c, &settings, &|_| true).unwrap()).radiance
         };
         assert_eq!(run(1), run(3));
     }

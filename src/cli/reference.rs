@@ -11,7 +11,6 @@ use crate::render::Camera;
 use crate::scene::Scene;
 use crate::scene_file::{Inputs, SceneOptions};
 use crate::surface_mesh::{SurfaceMesh, unit_isovalue};
-use glam::DVec3;
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -87,12 +86,7 @@ impl ReferenceArgs {
         baked.map_or(Ok(()), |b| b.whole()).map_err(|e| e.in_file(&self.input))?;
         // Alone, if the scene's volumes give each other no light.
         let scene = scene.lit(scene.number());
-        // Emitting level sets send their photons from all of the sweep.
-        if self.integrator == Integrator::Photon && scene.members().iter().any(|m| m.surface.emission != DVec3::ZERO) {
-            return Err(Error::NotSupported(
-                "--integrator photon: isosurfaces that emit light are for --integrator path".into(),
-            ));
-        }
+        self.integrator.check(&scene)?;
         let isovalue = unit_isovalue(&scene.field, self.isovalue).map_err(|e| other_sweep(e, of_bake))?;
         let settings = ReferenceSettings {
             integrator: self.integrator,
@@ -154,10 +148,10 @@ pub(super) fn compute(
     let tick = |n| stage.tick(n);
     let (result, inside) = if trilinear {
         let tracer = GraphTracer::new(device, scene)?;
-        (reference(scene, &tracer, &mesh, isovalue, settings, &tick), 0)
+        (reference(scene, &tracer, &mesh, isovalue, settings, &tick)?, 0)
     } else {
         let tracer = SurfaceTracer::new(device, scene, isovalue, refine)?;
-        let result = reference(scene, &tracer, &mesh, isovalue, settings, &tick);
+        let result = reference(scene, &tracer, &mesh, isovalue, settings, &tick)?;
         let inside = tracer.inside_starts();
         (result, inside)
     };

@@ -51,8 +51,8 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
 
     /// Direct irradiance by `samples` points uniform over the solid angle of each luminaire, each worth g:
     /// β E₀ + 1/n Σ g (V − β) with E₀ the closed form without blockers. Unbiased for every β; β is the visible share
-    /// seen by a pilot of its own, so that what is fully lit or fully dark has no variance. `key` says seed and index; the
-    /// stage is its own.
+    /// seen by a pilot of its own, so that what is fully lit or fully dark has no variance. `key` says seed and
+    /// index; the stage is its own.
     pub fn direct(&mut self, receiver: &Receiver, samples: u32, key: Key) -> DVec3 {
         let scene = self.scene;
         let x = scene.lattice().to_world(receiver.position.as_dvec3());

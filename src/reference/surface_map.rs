@@ -159,7 +159,8 @@ impl SurfaceMap {
 
     /// Radiance that leaves the surface at `receiver`: direct light, and a final gather of `samples` rays that find
     /// direct light by a shadow ray and the rest in the map. A hit nearer than its kernel reaches would bring the
-    /// kernel's bias whole (in a corner half of all rays find the same photons): such rays go on as paths. \[Jensen01\]
+    /// kernel's bias whole (in a corner half of all rays find the same photons): such rays go on as paths, \[Jensen01\]
+    /// and so do those that land on caps.
     pub fn outgoing<T: Tracer>(
         &self,
         scene: &Scene,
@@ -185,8 +186,10 @@ impl SurfaceMap {
             if albedo != DVec3::ZERO {
                 let distance = (scene.lattice().axes() * ray.direction.as_dvec3()).length() * f64::from(hit.t);
                 let surface = Receiver { departure: on, ..landed };
-                let (mapped, radius) = self.irradiance(scene, &surface, &mut scratch);
-                let indirect = if distance < radius { paths.indirect_once(&landed, &mut rng) } else { mapped };
+                let indirect = match self.irradiance(scene, &surface, &mut scratch) {
+                    Some((mapped, radius)) if distance >= radius => mapped,
+                    _ => paths.indirect_once(&landed, &mut rng),
+                };
                 sum += reflected(albedo, paths.direct_once(&landed, &mut rng) + indirect);
             }
         }
@@ -196,10 +199,10 @@ impl SurfaceMap {
     }
 
     /// Irradiance of reflected photons, and the kernel's radius r: Σ w K / ∫_A K dA with K = 1 − (d/r)², r the distance
-    /// of the k-th photon and A what lies within r, on the same side, with a similar normal, on mesh or polygon. 0 on
-    /// caps.
+    /// of the k-th photon and A what lies within r, on the same side, with a similar normal, on mesh or polygon. `None`
+    /// on caps, which hold no photons.
     #[allow(clippy::cast_possible_truncation, reason = "distances are f32")]
-    pub fn irradiance(&self, scene: &Scene, at: &Receiver, scratch: &mut Neighbours) -> (DVec3, f64) {
+    pub fn irradiance(&self, scene: &Scene, at: &Receiver, scratch: &mut Neighbours) -> Option<(DVec3, f64)> {
         let world = scene.lattice().to_world(at.position.as_dvec3());
         let q = (world - self.origin).as_vec3();
         let cone = self.settings.cone as f32;
@@ -211,7 +214,7 @@ impl SurfaceMap {
                 (surface, &surface.sides[side.index()], lower_normal(at, side))
             }
             Departure::Polygon(id) => (own, &self.walls[id as usize], Vec3::ZERO),
-            Departure::Free | Departure::Cap(..) => return (DVec3::ZERO, 0.0),
+            Departure::Free | Departure::Cap(..) => return None,
         };
         let wall = normal == Vec3::ZERO;
         let k = self.settings.photons;
@@ -219,7 +222,7 @@ impl SurfaceMap {
         share.grid.nearest(q, k, self.radius, accept, scratch);
         let found = scratch.found();
         if found.is_empty() {
-            return (DVec3::ZERO, 0.0);
+            return Some((DVec3::ZERO, 0.0));
         }
         let farthest = found.iter().map(|e| e.0).fold(0.0, f32::max);
         let most = match at.departure {
@@ -232,7 +235,7 @@ impl SurfaceMap {
         };
         let radius = if found.len() < k { most } else { farthest.sqrt() };
         if radius == 0.0 {
-            return (DVec3::ZERO, 0.0);
+            return Some((DVec3::ZERO, 0.0));
         }
         let weight = |d2: f32| f64::from((1.0 - d2 / (radius * radius)).max(0.0));
         let power: DVec3 = found.iter().map(|&(d2, slot)| share.photons[slot as usize].0.as_dvec3() * weight(d2)).sum();
@@ -245,7 +248,7 @@ impl SurfaceMap {
                 found.iter().map(|&(d2, slot)| f64::from(surface.areas[slot as usize].0) * weight(d2)).sum()
             }
         };
-        (if area > 0.0 { power / area } else { DVec3::ZERO }, f64::from(radius))
+        Some((if area > 0.0 { power / area } else { DVec3::ZERO }, f64::from(radius)))
     }
 
     /// ∫ K dA over the part of the disk on polygon `id` that lies on the receiver's side of the level sets.

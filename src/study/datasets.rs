@@ -184,7 +184,7 @@ fn triangle_error(study: &Study, subject: &Subject, mesh: &SurfaceMesh, isovalue
     let graph = GraphTracer::new(&study.device, scene)?;
     let on_triangles = |seed| reference(scene, &triangles, mesh, isovalue, &settings(seed), &tick);
     let on_graph = |seed| reference(scene, &graph, mesh, isovalue, &settings(seed), &tick);
-    let pairs = [[on_graph(13), on_triangles(11)], [on_graph(14), on_triangles(12)]];
+    let pairs = [[on_graph(13)?, on_triangles(11)?], [on_graph(14)?, on_triangles(12)?]];
     stage.end()?;
     Ok(displayed_difference(&pairs, scene.exposure()))
 }

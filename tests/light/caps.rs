@@ -61,7 +61,7 @@ fn caps_are_lit_like_walls() {
 /// goes away from it.
 #[test]
 fn no_photon_gets_through_a_cap() {
-    let (scene, at) = solid();
+    let (scene, _) = solid();
     let got = photons(&scene, &emission(1 << 17, 2));
     let through = got.surface.iter().filter(|p| p.side == Side::Higher).count();
     let caps = got.flat.iter().filter(|p| p.flat >= 2).count();
@@ -90,7 +90,6 @@ fn no_photon_gets_through_a_cap() {
             }
         }
     }
-    assert!(at.is_finite());
 }
 
 /// A ray that leaves a cap where another one landed goes away from it, on either side of the cap: the place it starts

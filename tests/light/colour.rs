@@ -105,7 +105,7 @@ fn a_cavity_reflects_by_the_albedo_of_its_own_isovalue() {
     for c in [0.25f32, 0.75] {
         let mesh = SurfaceMesh::extract(&scene, c, 1).unwrap();
         let settings = ReferenceSettings { samples: 64, vertices: Some(400), ..ReferenceSettings::default() };
-        let paths = reference(&scene, &tracer, &mesh, c, &settings, &|_| true);
+        let paths = reference(&scene, &tracer, &mesh, c, &settings, &|_| true).unwrap();
         let mut m = Moments::default();
         for v in (0..mesh.local.len()).filter(|&v| paths.sampled[v]) {
             m.push(ratio(paths.radiance[v], mesh.positions[v], f64::from(c)));

@@ -9,7 +9,7 @@ use isolume::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target};
 use isolume::mask::Mask;
 use isolume::polygon::Polygon;
 use isolume::progress::Progress;
-use isolume::reference::{Integrator, ReferenceSettings, reference};
+use isolume::reference::{Integrator, ReferenceSettings, SurfaceMapSettings, reference};
 use isolume::rng::{Rng, Stage};
 use isolume::scene::{Boundary, Member, Policy, Scene, Surface, cornell_box};
 use isolume::stats::Moments;
@@ -383,9 +383,9 @@ fn cross_light_agrees_with_paths_between_two_meshes() {
             seed,
             ..ReferenceSettings::default()
         };
-        let paths =
-            [1, 2].map(|seed| reference(&seen, &tracer, &mesh, c, &settings(Integrator::Path, seed), &|_| true));
-        let photons = reference(&seen, &tracer, &mesh, c, &settings(Integrator::Photon, 3), &|_| true);
+        let paths = [1, 2]
+            .map(|seed| reference(&seen, &tracer, &mesh, c, &settings(Integrator::Path, seed), &|_| true).unwrap());
+        let photons = reference(&seen, &tracer, &mesh, c, &settings(Integrator::Photon, 3), &|_| true).unwrap();
         let exposure = scene.exposure();
         let (mut square, mut bias, mut mean, mut n) = (0.0, DVec3::ZERO, DVec3::ZERO, 0.0);
         for v in (0..mesh.local.len()).filter(|&v| paths[0].sampled[v]) {
@@ -415,6 +415,43 @@ fn cross_light_agrees_with_paths_between_two_meshes() {
     assert!(shadow > 0.03 && reddened > 0.01, "{shadow} {reddened}");
 }
 
+/// Below a block with caps most of the light that is reflected comes from caps, which hold no photons.
+#[test]
+fn light_from_caps_is_in_references_by_photons() {
+    let device = Device::new(1).unwrap();
+    let white = coloured([0.9; 3]);
+    let floor = field(unit(9), 0.1, 0.5, |x| x.z);
+    let walls = cornell_box(floor.lattice(), 0.1).unwrap();
+    let block = field(lattice([9; 3], DVec3::new(0.2, 0.2, 0.3), DVec3::new(0.8, 0.8, 0.9)), 0.1, 0.7, |x| x.x);
+    let members = vec![
+        member("floor", floor, Surface { outside: Side::Higher, ..white.clone() }),
+        Member { boundary: Boundary::Capped, ..member("block", block, white) },
+    ];
+    let (scene, c) = (joint(members, walls), 0.3);
+    let tracer = GraphTracer::new(&device, &scene).unwrap();
+    let mesh = SurfaceMesh::extract(&scene, c, 1).unwrap();
+    // The sum over the vertices below the block, and its variance.
+    let sum = |integrator, seed| {
+        let settings = ReferenceSettings {
+            integrator,
+            samples: 1024,
+            batches: 8,
+            photons: 1 << 20,
+            map: SurfaceMapSettings { photons: 32, ..SurfaceMapSettings::default() },
+            seed,
+            ..ReferenceSettings::default()
+        };
+        let found = reference(&scene, &tracer, &mesh, c, &settings, &|_| true).unwrap();
+        let below = |v: &usize| (mesh.positions[*v] - DVec3::splat(0.5)).abs().truncate().max_element() < 0.3;
+        let below: Vec<usize> = (0..mesh.local.len()).filter(below).collect();
+        [&found.radiance, &found.variance].map(|values| below.iter().map(|&v| values[v].y).sum::<f64>())
+    };
+    let [photons, paths] = [sum(Integrator::Photon, 1), sum(Integrator::Path, 2)];
+    let (ratio, noise) = (photons[0] / paths[0], (photons[1] + paths[1]).sqrt() / paths[0]);
+    println!("photons : paths = {ratio:.4} ± {noise:.4}");
+    assert!(noise < 0.05 && (ratio - 1.0).abs() < 3.3 * noise, "{ratio} ± {noise}");
+}
+
 /// A volume held at an isovalue gives what it gives where it sweeps through that isovalue: in paths and in bakes.
 #[test]
 fn a_held_volume_lights_as_one_that_sweeps() {
@@ -437,7 +474,7 @@ fn a_held_volume_lights_as_one_that_sweeps() {
         let tracer = SurfaceTracer::new(&device, scene, c, 1).unwrap();
         let settings =
             ReferenceSettings { samples: 128, vertices: Some(400), seed, batches: 8, ..ReferenceSettings::default() };
-        let paths = reference(scene, &tracer, &mesh, c, &settings, &|_| true);
+        let paths = reference(scene, &tracer, &mesh, c, &settings, &|_| true).unwrap();
         let bake = run(scene, &quick(seed));
         let (mut sum, mut variance, mut baked, mut n) = (0.0, 0.0, 0.0, 0.0);
         for v in (0..mesh.local.len()).filter(|&v| paths.sampled[v]) {

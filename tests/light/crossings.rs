@@ -76,7 +76,7 @@ fn at_vertices(
         let paths = [1, 2].map(|seed| {
             let settings =
                 ReferenceSettings { samples, vertices: Some(vertices as usize), seed, ..ReferenceSettings::default() };
-            reference(seen, &triangles, &mesh, c, &settings, &|_| true)
+            reference(seen, &triangles, &mesh, c, &settings, &|_| true).unwrap()
         });
         let chosen: Vec<usize> = (0..mesh.local.len()).filter(|&v| paths[0].sampled[v]).collect();
         let at: Vec<_> = chosen.iter().map(|&v| mesh.local[v].as_vec3()).collect();
