@@ -96,10 +96,10 @@ pub fn direct_irradiance<T: Tracer>(
     let x = lattice.to_world(receiver.position.as_dvec3());
     let mut out = Estimate::default();
     for &l in scene.luminaires() {
-        if receiver.departure == Departure::Polygon(l) {
+        let light = &scene.polygons()[l as usize];
+        if light.is_left(l, receiver.departure) {
             continue;
         }
-        let light = &scene.polygons()[l as usize];
         let open = unoccluded(light, x, receiver.normal);
         if open == 0.0 {
             continue;
@@ -145,7 +145,7 @@ pub fn direct_once<T: Tracer>(scene: &Scene, tracer: &T, receiver: &Receiver, rn
     for &l in scene.luminaires() {
         let light = &scene.polygons()[l as usize];
         let (y, g) = Aim::new(light, x, receiver.normal).sample(rng.unit2());
-        if g > 0.0 && receiver.departure != Departure::Polygon(l) {
+        if g > 0.0 && !light.is_left(l, receiver.departure) {
             *rays += 1;
             if !tracer.occluded(&receiver.shadow_ray(scene, y, l)) {
                 total += light.emission * g;

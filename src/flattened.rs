@@ -73,6 +73,18 @@ pub struct FlattenedRay {
     pub departure: Departure,
     /// The polygon the ray ends on, which must not block it.
     pub target: Option<u32>,
+    /// Whether light runs along it, as from a luminaire, instead of against it, as to an eye. What has one face only
+    /// stops light that comes from behind, which whoever sees that face does not see.
+    pub with_light: bool,
+}
+
+/// What a ray starts and ends on, and which way light runs: as in [`FlattenedRay`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs, reason = "as in the ray")]
+pub struct Ends {
+    pub departure: Departure,
+    pub target: Option<u32>,
+    pub with_light: bool,
 }
 
 /// A face of Ω as caps and departures number it: axis + 3 · far end; of companion n's Ω: 6 (n + 1) more.
@@ -97,11 +109,18 @@ pub const MAX_COMPANIONS: u8 = 30;
 impl FlattenedRay {
     /// A ray from a point of space, of infinite reach.
     pub fn free(origin: Vec3, direction: Vec3, isovalue: f32) -> Self {
-        Self { origin, direction, isovalue, reach: f32::INFINITY, departure: Departure::Free, target: None }
+        let (departure, target, with_light) = (Departure::Free, None, false);
+        Self { origin, direction, isovalue, reach: f32::INFINITY, departure, target, with_light }
     }
 
-    /// Departure and target in 32 bits, for the spare word of an Embree ray: 2 bits of kind, 18 of polygon, of side and
-    /// face, or of side and companion + 1, 12 of target + 1.
+    /// Its ends.
+    #[inline]
+    pub fn ends(&self) -> Ends {
+        Ends { departure: self.departure, target: self.target, with_light: self.with_light }
+    }
+
+    /// Its ends in 32 bits, for the spare word of an Embree ray: 2 bits of kind, 17 of polygon, of side and face, or of
+    /// side and companion + 1, 1 of which way light runs, 12 of target + 1.
     #[inline]
     pub fn pack_ends(&self) -> u32 {
         let departure = match self.departure {
@@ -112,13 +131,13 @@ impl FlattenedRay {
             Departure::Polygon(id) => 2 | id << 2,
             Departure::Cap(face, side) => 3 | (u32::from(face) << 1 | side.index() as u32) << 2,
         };
-        departure | self.target.map_or(0, |id| id + 1) << 20
+        departure | u32::from(self.with_light) << 19 | self.target.map_or(0, |id| id + 1) << 20
     }
 
     /// The inverse of [`FlattenedRay::pack_ends`].
     #[inline]
-    pub fn unpack_ends(bits: u32) -> (Departure, Option<u32>) {
-        let payload = bits >> 2 & 0x3_ffff;
+    pub fn unpack_ends(bits: u32) -> Ends {
+        let payload = bits >> 2 & 0x1_ffff;
         let side = if payload & 1 == 0 { Side::Lower } else { Side::Higher };
         #[allow(clippy::cast_possible_truncation, reason = "packed from bytes")]
         let number = (payload >> 1) as u8;
@@ -129,7 +148,7 @@ impl FlattenedRay {
             2 => Departure::Polygon(payload),
             _ => Departure::Cap(number, side),
         };
-        (departure, (bits >> 20).checked_sub(1))
+        Ends { departure, target: (bits >> 20).checked_sub(1), with_light: bits >> 19 & 1 == 1 }
     }
 
     /// The point at `t`, evaluated in f64.
@@ -195,8 +214,11 @@ mod tests {
         ];
         for departure in departures {
             for target in [None, Some(0), Some(7), Some(MAX_TARGETS - 1)] {
-                let ray = FlattenedRay { departure, target, ..FlattenedRay::free(Vec3::ZERO, Vec3::X, 0.5) };
-                assert_eq!(FlattenedRay::unpack_ends(ray.pack_ends()), (departure, target));
+                for with_light in [false, true] {
+                    let free = FlattenedRay::free(Vec3::ZERO, Vec3::X, 0.5);
+                    let ray = FlattenedRay { departure, target, with_light, ..free };
+                    assert_eq!(FlattenedRay::unpack_ends(ray.pack_ends()), ray.ends());
+                }
             }
         }
     }

@@ -2,7 +2,7 @@
 //! kept to the last bit. \[BB09 §2.3; Jensen01\]
 
 use crate::flat;
-use crate::flattened::{Departure, Side, Target};
+use crate::flattened::{Departure, FlattenedRay, Side, Target};
 use crate::isovalue_axis::IsovalueAxis;
 use crate::landing::{Landing, MOST_LANDINGS, landing};
 use crate::rng::{Rng, Sobol, Stage};
@@ -321,6 +321,7 @@ fn trace_photon<T: Tracer>(
     let first = photon.bounces;
     for bounces in first..=MOST_LANDINGS {
         let ray = scene.ray(photon.origin, photon.direction, photon.isovalue, photon.departure);
+        let ray = FlattenedRay { with_light: true, ..ray };
         out.rays += 1;
         let Some(hit) = tracer.intersect(&ray) else {
             out.energy[bin].escaped += photon.power.element_sum();

@@ -3,7 +3,7 @@
 
 use crate::emission;
 use crate::error::{Error, Result};
-use crate::flattened::{Departure, FlattenedRay};
+use crate::flattened::{Departure, Ends, FlattenedRay};
 use crate::volume::Lattice;
 use glam::{DVec2, DVec3};
 
@@ -167,6 +167,12 @@ impl Polygon {
         sample_convex(&self.vertices, u)
     }
 
+    /// Whether what leaves from `departure` leaves from this polygon, number `id`, or from its other face.
+    #[inline]
+    pub fn is_left(&self, id: u32, departure: Departure) -> bool {
+        departs(departure, id, self.other_face)
+    }
+
     /// Whether a point of the plane lies inside.
     pub fn contains(&self, x: DVec3) -> bool {
         let (v, n) = (&self.vertices, self.vertices.len());
@@ -261,6 +267,12 @@ pub struct LocalPolygon {
     other_face: i32,
 }
 
+/// Whether `departure` is polygon `id`, or its other face.
+#[inline]
+fn departs(departure: Departure, id: u32, other_face: i32) -> bool {
+    matches!(departure, Departure::Polygon(from) if from == id || from == id.wrapping_add_signed(other_face))
+}
+
 impl LocalPolygon {
     /// `polygon` in the index coordinates of `lattice`.
     pub fn new(polygon: &Polygon, lattice: &Lattice) -> Self {
@@ -299,25 +311,29 @@ impl LocalPolygon {
     }
 
     /// t at which `ray` meets polygon number `id` (this one) with 0 ≤ t ≤ `reach`. Fronts only, unless the back is
-    /// opaque. A ray that departs from it or its other face, or ends on it, does not meet it; one that starts on the
-    /// plane (within the rounding of f32 coordinates) and goes into it meets it at 0.
+    /// opaque, or stops light that comes from well behind it. A ray that departs from it or its other face, or ends on
+    /// it, does not meet it; one that starts on the plane (within the rounding of f32 coordinates) and goes into it meets
+    /// it at 0.
     #[inline]
-    pub fn intersect(&self, id: u32, ends: (Departure, Option<u32>), o: DVec3, d: DVec3, reach: f64) -> Option<f64> {
+    pub fn intersect(&self, id: u32, ends: Ends, o: DVec3, d: DVec3, reach: f64) -> Option<f64> {
         let slope = self.normal.dot(d);
-        if slope == 0.0 || (slope > 0.0 && !self.opaque_back) || ends.1 == Some(id) {
+        let dark_back = slope > 0.0 && !self.opaque_back;
+        if slope == 0.0 || (dark_back && !(ends.with_light && self.other_face == 0)) || ends.target == Some(id) {
             return None;
         }
-        if let Departure::Polygon(from) = ends.0
-            && (from == id || from == id.wrapping_add_signed(self.other_face))
-        {
+        if departs(ends.departure, id, self.other_face) {
             return None;
         }
         let height = self.normal.dot(o) - self.offset;
         let before = if slope < 0.0 { height } else { -height };
-        if before < -self.slack {
+        if before < if dark_back { self.slack } else { -self.slack } {
             return None;
         }
-        let t = (before / slope.abs()).max(0.0);
+        let mut t = (before / slope.abs()).max(0.0);
+        if dark_back {
+            // A front in the same plane counts first.
+            t += (self.slack / slope).max(1e-6 * t);
+        }
         if !(t <= reach) {
             return None;
         }
@@ -337,7 +353,7 @@ impl LocalPolygon {
     /// [`LocalPolygon::intersect`] for a whole ray.
     pub fn meet(&self, id: u32, ray: &FlattenedRay) -> Option<f64> {
         let (o, d) = (ray.origin.as_dvec3(), ray.direction.as_dvec3());
-        self.intersect(id, (ray.departure, ray.target), o, d, f64::from(ray.reach))
+        self.intersect(id, ray.ends(), o, d, f64::from(ray.reach))
     }
 }
 
@@ -443,6 +459,14 @@ mod tests {
         assert_eq!(wall.meet(0, &ray), Some(2.0), "t is in world units");
         let behind = FlattenedRay::free(local(1.5, 0.5, 1.0), -down, 0.0);
         assert_eq!(wall.meet(0, &behind), None, "seen from the front only");
+        let light = FlattenedRay { with_light: true, ..behind };
+        let t = wall.meet(0, &light).expect("light from behind is stopped");
+        assert!((2.0..2.0001).contains(&t), "after a front in the same plane: {t}");
+        let on = FlattenedRay { origin: local(1.5, 0.5, 3.0), ..light };
+        assert_eq!(wall.meet(0, &on), None, "what begins on a wall is before it");
+        let faces = square().both_faces().map(|p| LocalPolygon::new(&p, &lattice));
+        let met = [0, 1].map(|n| faces[n].meet(n as u32, &light));
+        assert_eq!(met, [None, Some(2.0)], "of two faces light meets the front");
         let on = FlattenedRay::free(local(1.5, 0.5, 3.0), down, 0.0);
         assert_eq!(wall.meet(0, &on), Some(0.0), "a start on the plane sees it at 0");
         assert_eq!(wall.meet(0, &FlattenedRay { departure: Departure::Polygon(0), ..on }), None);

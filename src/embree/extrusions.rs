@@ -2,7 +2,7 @@
 
 use super::{Ray, RayView, SceneBuilder, UserGeometry, UserHit};
 use crate::error::Result;
-use crate::flattened::FlattenedRay;
+use crate::flattened::{Ends, FlattenedRay};
 use crate::polygon::LocalPolygon;
 use crate::scene::Scene;
 use glam::{DVec3, Vec3};
@@ -28,7 +28,7 @@ pub(super) fn embree_ray(ray: &FlattenedRay) -> Ray {
 /// The inverse of [`embree_ray`].
 #[inline]
 pub(super) fn flattened_ray(r: &RayView) -> FlattenedRay {
-    let (departure, target) = FlattenedRay::unpack_ends(r.time);
+    let Ends { departure, target, with_light } = FlattenedRay::unpack_ends(r.time);
     FlattenedRay {
         origin: Vec3::from_array(r.org),
         direction: Vec3::from_array(r.dir),
@@ -36,6 +36,7 @@ pub(super) fn flattened_ray(r: &RayView) -> FlattenedRay {
         reach: r.tfar,
         departure,
         target,
+        with_light,
     }
 }
 

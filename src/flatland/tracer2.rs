@@ -12,7 +12,7 @@ use super::{FlatScene, HeightField, Segment};
 use crate::cubic::Cubic;
 use crate::embree::{Device, Ray, RayHit, RayView, Scene as Bvh, SceneBuilder, UserGeometry, UserHit};
 use crate::error::Result;
-use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target};
+use crate::flattened::{Departure, Ends, FlattenedHit, FlattenedRay, Side, Target};
 use crate::tracer::Tracer;
 use glam::{DVec2, DVec3, Vec3};
 use std::sync::Arc;
@@ -244,7 +244,7 @@ impl Extrusions {
     #[inline]
     fn meet(&self, id: u32, ray: &RayView) -> Option<f64> {
         let ([a, b], opaque_back) = self.segments[id as usize];
-        let (departure, target) = FlattenedRay::unpack_ends(ray.time);
+        let Ends { departure, target, .. } = FlattenedRay::unpack_ends(ray.time);
         if departure == Departure::Polygon(id) || target == Some(id) {
             return None;
         }
@@ -312,7 +312,7 @@ fn embree_ray(ray: &FlattenedRay) -> Ray {
 
 #[inline]
 fn flattened_ray(r: &RayView) -> FlattenedRay {
-    let (departure, target) = FlattenedRay::unpack_ends(r.time);
+    let Ends { departure, target, with_light } = FlattenedRay::unpack_ends(r.time);
     FlattenedRay {
         origin: Vec3::from_array(r.org),
         direction: Vec3::from_array(r.dir),
@@ -320,6 +320,7 @@ fn flattened_ray(r: &RayView) -> FlattenedRay {
         reach: r.tfar,
         departure,
         target,
+        with_light,
     }
 }
 

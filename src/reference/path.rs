@@ -4,7 +4,7 @@ use crate::brdf::reflected;
 use crate::direct::{Receiver, direct_once};
 use crate::error::Result;
 use crate::export::picture::Picture;
-use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Target};
+use crate::flattened::{FlattenedHit, FlattenedRay, Target};
 use crate::landing::{Landing, MOST_LANDINGS, landing};
 use crate::luminaire::{Aim, unoccluded};
 use crate::progress::Progress;
@@ -59,7 +59,7 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
         let mut total = DVec3::ZERO;
         for (n, &l) in scene.luminaires().iter().enumerate() {
             let light = &scene.polygons()[l as usize];
-            if receiver.departure == Departure::Polygon(l) {
+            if light.is_left(l, receiver.departure) {
                 continue;
             }
             let open = unoccluded(light, x, receiver.normal);

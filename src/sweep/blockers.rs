@@ -1,6 +1,6 @@
 //! Polygons between a luminaire and its receivers.
 
-use crate::flattened::Departure;
+use crate::flattened::{Departure, Ends};
 use crate::polygon::LocalPolygon;
 use crate::scene::Scene;
 use glam::DVec3;
@@ -31,10 +31,11 @@ impl Blockers {
         self.polygons.is_empty()
     }
 
+    /// Whether one hides local point `y` of luminaire `light` from `x`, which lies on polygon `receiver`, if any. As
+    /// seen from there: walls have one face.
     pub(super) fn block(&self, light: u32, receiver: Option<u32>, y: DVec3, x: DVec3) -> bool {
-        self.polygons.iter().any(|(i, p)| {
-            receiver != Some(*i)
-                && p.intersect(*i, (Departure::Polygon(light), receiver), y, x - y, 1.0 - 1e-9).is_some()
-        })
+        let departure = receiver.map_or(Departure::Free, Departure::Polygon);
+        let ends = Ends { departure, target: Some(light), with_light: false };
+        self.polygons.iter().any(|(i, p)| p.intersect(*i, ends, x, y - x, 1.0 - 1e-9).is_some())
     }
 }

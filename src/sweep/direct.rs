@@ -244,7 +244,7 @@ fn walls(
             let (i, j) = (texel % nu, texel / nu);
             let place = |a: f64, b: f64| flat.at([(i as f64 + a) / nu as f64, (j as f64 + b) / nv as f64]);
             let e = unoccluded(light, place(0.5, 0.5), flat.normal);
-            if e == 0.0 {
+            if e == 0.0 || light.is_left(number, flat.departure) {
                 return;
             }
             let stream = stream(part.replicate, number, id, texel);

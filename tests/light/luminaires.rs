@@ -1,16 +1,17 @@
-//! Luminaires that reflect, and light without an end.
+//! Luminaires that reflect or stand behind walls, and light without an end.
 
 use crate::support::*;
 use glam::DVec3;
 use isolume::bake::{BakeSettings, Engine};
+use isolume::direct::{Receiver, direct_irradiance, direct_once};
 use isolume::embree::{Device, GraphTracer};
-use isolume::flattened::{Side, SurfacePoint};
+use isolume::flattened::{Departure, Side, SurfacePoint};
 use isolume::gather::{KnownLight, gathered_irradiance};
 use isolume::landing::MOST_LANDINGS;
 use isolume::mask::Mask;
 use isolume::polygon::Polygon;
 use isolume::reference::{PathTracer, receiver};
-use isolume::rng::Stage;
+use isolume::rng::{Rng, Stage};
 use isolume::scene::{Scene, Surface};
 use std::f64::consts::PI;
 
@@ -77,6 +78,65 @@ fn nothing_passes_through_a_luminaire_that_reflects() {
             assert_eq!((lit(higher_above[by]), dark(higher_above[by])), ([true, false], [false, true]));
             assert_eq!(dark(higher_below[by]), [true, true]);
         }
+    }
+}
+
+/// A tilted lamp with two faces, each of which shines and reflects, alone: no place on it, whichever side of its plane
+/// f32 rounds it to, gets light of the other face.
+#[test]
+fn a_lamp_with_two_faces_does_not_light_itself() {
+    let planes = field(lattice([9; 3], DVec3::ZERO, DVec3::ONE), 0.05, 0.95, |x| x.z);
+    let (s, t) = (DVec3::new(0.3, 0.05, 0.1), DVec3::new(-0.04, 0.25, 0.07));
+    let lamp = rectangle("lamp", DVec3::new(0.47, 0.52, 1.4), s, t, 0.9, 1.0).both_faces();
+    let scene = scene(planes, grey(0.5, Side::Lower), lamp.to_vec());
+    let device = Device::new(0).unwrap();
+    let tracer = GraphTracer::new(&device, &scene).unwrap();
+    let mut behind = [0; 2];
+    for i in 0..2000 {
+        let mut rng = Rng::stream(1, Stage::Test, i);
+        let id = (i % 2) as u32;
+        let p = &scene.polygons()[id as usize];
+        let position = scene.lattice().to_index(p.sample(rng.unit2())).as_vec3();
+        let height = (scene.lattice().to_world(position.as_dvec3()) - p.vertices()[0]).dot(p.normal());
+        behind[usize::from(height < 0.0)] += 1;
+        let receiver = Receiver { position, normal: p.normal(), isovalue: 0.5, departure: Departure::Polygon(id) };
+        let mut paths = PathTracer::new(&scene, &tracer);
+        let found = [
+            direct_irradiance(&scene, &tracer, &receiver, 16, Stage::Direct.key(1, i)).mean,
+            paths.direct(&receiver, 16, Stage::Path.key(1, i)),
+            direct_once(&scene, &tracer, &receiver, &mut rng, &mut 0),
+        ];
+        assert_eq!(found, [DVec3::ZERO; 3], "{receiver:?}, {height:e}");
+    }
+    assert!(behind.iter().all(|&n| n > 500), "{behind:?}");
+}
+
+/// A wall with one face between luminaire and volume: from its front nothing is seen of what is behind, from behind the
+/// wall is not there. By lines, shadow rays, and photons, which would light the floor behind the wall.
+#[test]
+fn a_wall_hides_what_is_behind_from_those_before_it() {
+    let facing = |name: &str, x: f64, half: f64, right: bool, emission: f64| {
+        let (s, t) = (half * DVec3::Y, half * DVec3::Z);
+        let (s, t) = if right { (s, t) } else { (t, s) };
+        rectangle(name, DVec3::new(x, 0.5, 0.5), s, t, 0.0, emission)
+    };
+    let ball = field(lattice([17; 3], DVec3::ZERO, DVec3::ONE), 0.55, 0.8, |x| 1.0 - (x - 0.5).length());
+    let floor = rectangle("floor", DVec3::new(0.85, 0.5, -0.1), DVec3::X, 2.0 * DVec3::Y, 0.8, 0.0);
+    let mean = |engine: Engine, wall: Option<bool>, floor: Option<&Polygon>| {
+        let mut polygons = vec![facing("lamp", -0.5, 0.3, true, 1.0)];
+        polygons.extend(wall.map(|right| facing("wall", -0.2, 4.0, right, 0.0)));
+        polygons.extend(floor.cloned());
+        let scene = scene(ball.clone(), grey(0.5, Side::Lower), polygons);
+        let bake = run(&scene, &BakeSettings { engine, gather_rays: 32, photons: 1 << 14, ..at_nodes(1) });
+        let found = valid(&bake, &scene);
+        found.iter().map(|v| v.3).sum::<f64>() / found.len() as f64
+    };
+    for engine in [Engine::Photon, Engine::Sweep] {
+        let open = mean(engine, None, None);
+        let behind = mean(engine, Some(false), None);
+        let before = mean(engine, Some(true), Some(&floor));
+        println!("{engine:?}: {open:.5} without a wall, {behind:.5} behind it, {before:.2e} before it");
+        assert!(open > 0.005 && (behind / open - 1.0).abs() < 0.01 && before == 0.0);
     }
 }
 
