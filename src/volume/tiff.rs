@@ -132,7 +132,17 @@ fn decode<R: Read + Seek>(mut reader: R, path: &Path) -> Result<Volume> {
                 limits.decoding_buffer_size = wanted.max(trusted);
                 decoder = decoder.with_limits(limits.clone());
             }
-            let (element, bytes) = page_bytes(decoder.read_image()?);
+            let white_is_zero = decoder.find_tag_unsigned::<u16>(Tag::PhotometricInterpretation)? == Some(0);
+            let (element, mut bytes) = page_bytes(decoder.read_image()?);
+            if white_is_zero {
+                if !matches!(element, ElementType::U8 | ElementType::U16 | ElementType::U32 | ElementType::U64) {
+                    let message =
+                        format!("page {page} shows 0 as white, in {}; save it with 0 as black", element.name());
+                    return Ok(Err(Error::not_supported(path, message)));
+                }
+                // That is how it is shown. What was measured stands in the file: the decoder's inversion is undone.
+                bytes.iter_mut().for_each(|b| *b = !*b);
+            }
             limits.decoding_buffer_size = trusted;
             decoder = decoder.with_limits(limits.clone());
             match &mut pages {
@@ -326,6 +336,34 @@ mod tests {
             w.write_all(bytes).unwrap();
         }
         w.finish().unwrap().into_inner()
+    }
+
+    /// Shown inverted or not, samples are what the file holds.
+    #[test]
+    fn white_as_zero_changes_no_sample() {
+        // Entry 262 of a directory: one 16-bit number.
+        let entry = |value: u8| [6, 1, 3, 0, 1, 0, 0, 0, value, 0, 0, 0];
+        let inverted = |mut bytes: Vec<u8>| {
+            let at = |bytes: &[u8]| bytes.windows(12).position(|w| w == entry(1));
+            let mut pages = 0;
+            while let Some(at) = at(&bytes) {
+                bytes[at..at + 12].copy_from_slice(&entry(0));
+                pages += 1;
+            }
+            assert_eq!(pages, 2);
+            bytes
+        };
+        let sample = |i: usize| (10 * i) as u8;
+        for bytes in [
+            stack::<colortype::Gray8>(2, "", sample),
+            stack::<colortype::Gray16>(2, "", |i| u16::from(sample(i))),
+            stack::<colortype::Gray32>(2, "", |i| u32::from(sample(i))),
+        ] {
+            let v = open(&inverted(bytes)).unwrap();
+            assert!((0..12).all(|i| v.value(i) == f64::from(sample(i))), "{:?}", v.samples().element_type());
+        }
+        let floats = inverted(stack::<colortype::Gray32Float>(2, "", |i| i as f32));
+        assert!(open(&floats).unwrap_err().to_string().contains("a.tif: page 0 shows 0 as white"));
     }
 
     #[test]
