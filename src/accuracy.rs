@@ -119,6 +119,9 @@ pub struct Accuracy {
     pub percent_rms_lit: f64,
     /// Share of such vertices.
     pub lit: f64,
+    /// Share of the vertices that are as bright as can be displayed in all channels, by the bake and by the references:
+    /// no error is seen there.
+    pub clamped: f64,
     /// 95 % confidence interval of `percent_rms`, from the scatter over vertices (as if they were independent).
     pub confidence: [f64; 2],
     /// What a perfect bake would show against one reference: 100 √⟨Σ variance⟩ of clamped rgb, as if the reference's
@@ -198,6 +201,7 @@ pub fn compare(texture: &[DVec3], references: &[ReferenceMesh], exposure: f64) -
     let count = references.len() as f64;
     let mut per_vertex = vec![0.0; n];
     let (mut sum, mut squares, mut area_sum, mut area, mut lit_sum, mut lit) = (0.0, 0.0, 0.0, 0.0, 0.0, 0usize);
+    let mut clamped = 0usize;
     let mut out = Accuracy { vertices: chosen.len(), references: references.len(), exposure, ..Accuracy::default() };
     for &v in &chosen {
         let t = display(texture[v], exposure);
@@ -213,6 +217,7 @@ pub fn compare(texture: &[DVec3], references: &[ReferenceMesh], exposure: f64) -
         }
         let distance = (t - mean).length();
         per_vertex[v] = distance;
+        clamped += usize::from(t == DVec3::ONE && r.iter().all(|&r| r == DVec3::ONE));
         out.mean += distance;
         out.max = out.max.max(100.0 * distance);
         out.bias += (t - mean).element_sum() / 3.0;
@@ -227,6 +232,7 @@ pub fn compare(texture: &[DVec3], references: &[ReferenceMesh], exposure: f64) -
     out.percent_rms_area = if area > 0.0 { percent(area_sum / area) } else { 0.0 };
     out.percent_rms_lit = if lit > 0 { percent(lit_sum / lit as f64) } else { 0.0 };
     out.lit = lit as f64 / vertices;
+    out.clamped = clamped as f64 / vertices;
     out.confidence = [percent(square - 1.96 * deviation), percent(square + 1.96 * deviation)];
     let floor = out.noise_floor / vertices;
     out.noise_floor = percent(floor);

@@ -312,8 +312,8 @@ impl LocalPolygon {
 
     /// t at which `ray` meets polygon number `id` (this one) with 0 ≤ t ≤ `reach`. Fronts only, unless the back is
     /// opaque, or stops light that comes from well behind it. A ray that departs from it or its other face, or ends on
-    /// it, does not meet it; one that starts on the plane (within the rounding of f32 coordinates) and goes into it meets
-    /// it at 0.
+    /// it, does not meet it; one that starts on the plane (within the rounding of f32 coordinates) and goes into it
+    /// meets it at 0.
     #[inline]
     pub fn intersect(&self, id: u32, ends: Ends, o: DVec3, d: DVec3, reach: f64) -> Option<f64> {
         let slope = self.normal.dot(d);

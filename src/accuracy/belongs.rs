@@ -10,14 +10,17 @@ const ROUNDING: f64 = 1e-4;
 
 /// Share of the spread that h may be off where the isovalue is not known: those that fit best lie nearer.
 const UNKNOWN: f64 = 0.3;
+/// The same where isovalue and samples are known.
+const EXACT: f64 = 0.02;
 
 /// Refuses vertices (world) that are of no isosurface of `field`'s sweep: some lie outside of the volume, or h at most
 /// of them is further from `isovalue` (source units; their median if `None`) than the samples of its cell are from
-/// each other (a share of it if `None`), which the same volume on another grid is at few of them.
+/// each other (a share of it if `None`), which the same volume on another grid is at few of them. `exact`: the field
+/// has the volume's own samples, whose isosurface lies where h is the isovalue.
 ///
 /// # Errors
 /// `Invalid` for such vertices, and for an isovalue outside the sweep.
-pub fn belongs(positions: &[DVec3], isovalue: Option<f64>, field: &Field) -> Result<()> {
+pub fn belongs(positions: &[DVec3], isovalue: Option<f64>, field: &Field, exact: bool) -> Result<()> {
     let (lattice, sweep) = (field.lattice(), field.sweep());
     let local: Vec<DVec3> = positions.iter().map(|&x| lattice.to_index(x)).collect();
     // Files in f32 move vertices far from the origin by up to a voxel.
@@ -52,7 +55,11 @@ pub fn belongs(positions: &[DVec3], isovalue: Option<f64>, field: &Field) -> Res
             "is of isovalue {said}, outside of the bake's sweep {sweep}; make one inside, or bake a wider sweep"
         )));
     }
-    let share = if isovalue.is_some() { 1.0 } else { UNKNOWN };
+    let share = match isovalue {
+        None => UNKNOWN,
+        Some(_) if exact => EXACT,
+        Some(_) => 1.0,
+    };
     let off = found.iter().filter(|[h, spread]| (h - c).abs() > share * spread + ROUNDING).count();
     if 2 * off > found.len() {
         return Err(Error::Invalid(format!(

@@ -76,6 +76,9 @@ pub struct Survey {
     pub bias: f64,
     /// The error in fifths of the sweep.
     pub parts: Vec<Part>,
+    /// Share of the points that are as bright as can be displayed in all channels, by the bake and by paths: no error
+    /// is seen there.
+    pub clamped: f64,
     /// Points left out since ∇h vanishes there, or since a luminaire covers them.
     pub left_out: usize,
     /// Rays traced.
@@ -164,6 +167,7 @@ pub fn survey<T: Tracer>(
         confidence_grid_points: of_grid_points.map(|(_, confidence)| confidence.map(percent)),
         bias: 100.0 * all.iter().map(|d| d.bias).sum::<f64>() / (all.len() as f64).max(1.0),
         parts: parts.collect(),
+        clamped: all.iter().filter(|d| d.clamped).count() as f64 / (all.len() as f64).max(1.0),
         left_out: chosen.len() - all.len(),
         rays: rays.into_inner(),
     })
@@ -183,6 +187,8 @@ struct Deviation {
     texture_square: f64,
     /// t − r, mean over channels.
     bias: f64,
+    /// See [`Survey::clamped`].
+    clamped: bool,
 }
 
 impl Deviation {
@@ -202,7 +208,8 @@ impl Deviation {
         let off = |shown: DVec3| found.map(|r| display(shown, exposure) - r);
         let ([a, b], [c, d]) = (off(shown[0]), off(shown[1]));
         let bias = (a + b).element_sum() / 6.0;
-        Self { isovalue: f64::from(at.isovalue), square: a.dot(b), texture_square: c.dot(d), bias }
+        let clamped = found.into_iter().chain([display(shown[0], exposure)]).all(|c| c == DVec3::ONE);
+        Self { isovalue: f64::from(at.isovalue), square: a.dot(b), texture_square: c.dot(d), bias, clamped }
     }
 }
 

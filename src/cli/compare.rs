@@ -80,9 +80,11 @@ impl Compare {
         if baked.scene.fields() > 1 {
             return Err(Error::not_supported(&self.bake, "holds several volumes; name the .vti of one of them"));
         }
+        // Also on a finer grid; other grids hold other samples.
+        let exact = baked.source().is_ok_and(|own| own.is_some());
         for ((reference, file), path) in references.iter().zip(&files).zip(&self.references) {
             let origin = Origin::from_comments(&file.comments);
-            belongs(&reference.positions, origin.isovalue, &baked.scene.field).map_err(|e| e.in_file(path))?;
+            belongs(&reference.positions, origin.isovalue, &baked.scene.field, exact).map_err(|e| e.in_file(path))?;
             if origin.of_bake {
                 say!(
                     "warning: {}: holds the light of a bake (isolume extract), not of a reference; it is taken for exact",
@@ -107,6 +109,7 @@ impl Compare {
         let mut colours = vec![DVec3::ZERO; first.positions.len()];
         chosen.into_iter().zip(found.radiance).for_each(|(v, light)| colours[v] = light);
         let (accuracy, errors) = compare(&colours, &references, baked.exposure)?;
+        warn_of_clamped(accuracy.clamped, "vertices");
         if self.json {
             println!("{}", serde_json::to_string_pretty(&accuracy).expect("the numbers are plain data"));
         } else {
@@ -167,6 +170,7 @@ impl Compare {
             survey(&scene, &tracer, (baked.lattice(), grid), &shown, baked.exposure, &settings, &|n| stage.tick(n));
         stage.end()?;
         let found = found.map_err(in_file)?;
+        warn_of_clamped(found.clamped, "points");
         if self.json {
             println!("{}", serde_json::to_string_pretty(&found).expect("the numbers are plain data"));
         } else {
@@ -179,6 +183,18 @@ impl Compare {
             print!("{}", everywhere(&found, advice));
         }
         Ok(())
+    }
+}
+
+/// Says that much of what was compared shows no error, as of surfaces that shine more than is displayed.
+fn warn_of_clamped(share: f64, of: &str) {
+    // Beside lamps some always are.
+    if share > 0.25 {
+        say!(
+            "warning: {:.0} % of the {of} are too bright to be displayed, by the bake and by what it is compared with: their \
+             error counts as 0",
+            100.0 * share
+        );
     }
 }
 

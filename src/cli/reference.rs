@@ -49,12 +49,12 @@ pub(super) struct ReferenceArgs {
     /// Independent batches that tell the variance
     #[arg(long, default_value_t = 16, value_name = "N")]
     batches: u32,
-    /// Photons over all batches (--integrator photon)
-    #[arg(long, default_value_t = 1 << 24, value_name = "N")]
-    photons: u64,
-    /// Photons per irradiance estimate (--integrator photon)
-    #[arg(long, default_value_t = 64, value_name = "K")]
-    photons_per_estimate: usize,
+    /// With --integrator photon: photons over all batches (default: 16777216)
+    #[arg(long, value_name = "N")]
+    photons: Option<u64>,
+    /// With --integrator photon: photons per irradiance estimate (default: 64)
+    #[arg(long, value_name = "K")]
+    photons_per_estimate: Option<usize>,
     /// Seed of all random numbers
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -78,8 +78,12 @@ impl ReferenceArgs {
         if !(1..=1 << 20).contains(&self.samples) || !(2..=1024).contains(&self.batches) {
             return Err(Error::Invalid("--samples: 1 to 1048576; --batches: 2 to 1024".into()));
         }
-        if self.photons == 0 || !(2..=4096).contains(&self.photons_per_estimate) || self.vertices == Some(0) {
+        let out_of_range = self.photons_per_estimate.is_some_and(|k| !(2..=4096).contains(&k));
+        if self.photons == Some(0) || out_of_range || self.vertices == Some(0) {
             return Err(Error::Invalid("--photons, --vertices: at least 1; --photons-per-estimate: 2 to 4096".into()));
+        }
+        if self.integrator == Integrator::Path && (self.photons.is_some() || self.photons_per_estimate.is_some()) {
+            return Err(Error::Invalid("--photons, --photons-per-estimate: are for --integrator photon".into()));
         }
         let (scene, baked) = open_scene(&self.input, &self.scene, self.field.as_deref())?;
         let of_bake = baked.is_some();
@@ -88,12 +92,16 @@ impl ReferenceArgs {
         let scene = scene.lit(scene.number());
         self.integrator.check(&scene)?;
         let isovalue = unit_isovalue(&scene.field, self.isovalue).map_err(|e| other_sweep(e, of_bake))?;
+        let default = ReferenceSettings::default();
         let settings = ReferenceSettings {
             integrator: self.integrator,
             samples: self.samples,
             batches: self.batches,
-            photons: self.photons,
-            map: SurfaceMapSettings { photons: self.photons_per_estimate, ..SurfaceMapSettings::default() },
+            photons: self.photons.unwrap_or(default.photons),
+            map: SurfaceMapSettings {
+                photons: self.photons_per_estimate.unwrap_or(default.map.photons),
+                ..default.map
+            },
             vertices: self.vertices,
             seed: self.seed,
         };

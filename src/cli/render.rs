@@ -41,7 +41,7 @@ pub(super) struct Render {
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// Plain local shading of the same view, for comparison
-    #[arg(long, conflicts_with_all = ["shadow_rays", "gather_rays"])]
+    #[arg(long, conflicts_with_all = ["shadow_rays", "gather_rays", "trilinear"])]
     local: bool,
     /// Path-trace the isosurface's triangles instead of using the bake's light
     #[arg(long, conflicts_with_all = ["local", "shadow_rays", "gather_rays"])]

@@ -164,9 +164,17 @@ impl VolumeEntry {
         let sweep = Sweep::new(lo, hi)?;
         let field = Field::new(volume, sweep)?;
         let (surface, _) = self.surface(file, sweep)?;
-        if surface.emission != DVec3::ZERO {
+        // What [surface] says of both is for those that sweep.
+        if self.emission.is_some_and(|e| e.vector() != DVec3::ZERO) {
             return Err(Error::NotSupported(
-                "held: a surface that stands still cannot emit light; use a luminaire".into(),
+                "emission: a surface that is held cannot emit light; use a luminaire".into(),
+            ));
+        }
+        if self.boundary == Some(BoundaryName::Capped) {
+            return Err(Error::NotSupported(
+                "boundary: a surface that is held is not closed where its volume's faces cut it; give the volume a margin \
+                 of samples outside the solid"
+                    .into(),
             ));
         }
         surface.check_albedo(sweep)?;
@@ -343,6 +351,9 @@ mod tests {
         assert!(of("b_").all(|p| (p.albedo - DVec3::new(0.9, 0.1, 0.1)).length() < 1e-12));
         assert!(error_of(&held("3")).contains("volume 'b': held = 3"));
         assert!(error_of(&held("0.09\nemission = 1")).contains("emit"));
+        assert!(error_of(&held("0.09\nboundary = \"capped\"")).contains("scene.toml:15: volume 'b': boundary: "));
+        let shining = held("0.09").replace("albedo = 0.5", "albedo = 0.5\nemission = 1");
+        assert!(load_text(&shining, &SceneOptions::default()).is_ok(), "what [surface] says is for the others");
         let bright = held("0.09").replace("albedo = [0.9, 0.1, 0.1]", "albedo = 1.5");
         assert!(error_of(&bright).contains("volume 'b': surface albedo [1.5, 1.5, 1.5]"), "{}", error_of(&bright));
         assert!(error_of(&held("0.09\nisovalues = [0, 1]")).contains("exclude"));

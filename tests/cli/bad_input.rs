@@ -46,6 +46,12 @@ fn bad_input_is_one_clear_line_and_leaves_nothing() {
     refused(dir, &["bake", "ramp.nrrd", "-o", "out.png"], &["out.png", ".vti"]);
     refused(dir, &["bake", "ramp.nrrd", "-o", "out.nrrd"], &["out.nrrd", "isolume export"]);
 
+    // Options of another mode.
+    let reference = ["reference", "ramp.nrrd", "--isovalue", "200", "-o", "out.ply"];
+    for option in ["--photons", "--photons-per-estimate"] {
+        refused(dir, &[&reference[..], &[option, "9"]].concat(), &[option, "--integrator photon"]);
+    }
+
     // Files of another kind, by what is wanted instead.
     fs::write(dir.join("s.toml"), "[volume]\ngenerator = \"bumps\"\n").unwrap();
     for file in ["ramp.nrrd", "s.toml"] {

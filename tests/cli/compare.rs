@@ -61,6 +61,16 @@ fn references_of_other_volumes_and_isovalues_are_refused() {
         refused(dir, &["compare", "lit.vti", &own, &cone], &[&cone, "no isosurface"]);
         ok(dir, &["compare", "lit.vti", &own]);
     }
+    // The next moment: a third of what the samples of a cell differ by.
+    let now = Volume::open(dir.join("b.vti")).unwrap();
+    let later = Samples::F64((0..now.lattice.len()).map(|o| now.value(o) + 2.0).collect());
+    Volume::new("later", now.lattice.clone(), later).unwrap().write(dir.join("later.vti")).unwrap();
+    reference(dir, "later.vti", "later.ply", &[&RANGE[..], &["--isovalue", "20"]].concat());
+    bake(dir, "b.vti", "fine.vti", &[&RANGE[..], &["--grid", "2x"]].concat());
+    for bake in ["lit.vti", "fine.vti"] {
+        refused(dir, &["compare", bake, "later.ply"], &["later.ply", "no isosurface of the bake's volume"]);
+        ok(dir, &["compare", bake, "r-b.vti.ply"]);
+    }
 }
 
 #[test]
@@ -320,6 +330,26 @@ fn what_is_for_the_other_way_to_compare_is_refused() {
         refused(dir, &["compare", "lit.vti", wrong[0], wrong[1]], &[wrong[0]]);
     }
     refused(dir, &["compare", "b.vti"], &["b.vti", "is no bake"]);
+}
+
+/// Surfaces that shine brighter than what is displayed show no error, however wrong they are.
+#[test]
+fn what_is_too_bright_to_show_an_error_is_told() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
+    let few = ["--points", "100", "--paths", "4"];
+    for (emission, shines) in [("0", false), ("9", true)] {
+        bake(dir, "b.vti", "lit.vti", &[&RANGE[..], &["--emission", emission]].concat());
+        reference(dir, "lit.vti", "r.ply", &["--isovalue", "47"]);
+        let clamped = survey(dir, "lit.vti", &few)["clamped"].as_f64().unwrap();
+        assert!(if shines { clamped == 1.0 } else { (0.0..0.2).contains(&clamped) }, "{clamped}");
+        for arguments in [&["r.ply"][..], &few] {
+            let said = text(&ok(dir, &[&["compare", "lit.vti"], arguments].concat()).stderr);
+            let warned = said.contains("warning: 100 % of the ") && said.contains("error counts as 0");
+            assert_eq!(warned, shines, "{emission} {arguments:?}: {said}");
+        }
+    }
 }
 
 /// `error` and colour of every vertex of `compare -o`, from the two files that were compared.

@@ -149,14 +149,13 @@ fn rays_need_a_bake_that_has_use_for_them() {
         let given = ["render", "lit.vti", "--isovalue", "30", "-o", "p.png", flag, number];
         refused(dir, &given, &[flag, "1 to 1048576"]);
     }
-    let said = text(
-        &super::isolume(
-            dir,
-            &["render", "lit.vti", "--isovalue", "30", "-o", "p.png", "--local", "--gather-rays", "8"],
-        )
-        .stderr,
-    );
-    assert!(said.contains("--local") && said.contains("--gather-rays"), "{said}");
+    for other in [&["--gather-rays", "8"][..], &["--trilinear"]] {
+        let given = [&["render", "lit.vti", "--isovalue", "30", "-o", "p.png", "--local"], other].concat();
+        let output = super::isolume(dir, &given);
+        let said = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(2));
+        assert!(said.contains("--local") && said.contains(other[0]), "{said}");
+    }
     // What others lit needs them, and what they did not must not see them.
     for (policy, file, words) in
         [("joint", "two-ball.vti", "name the .vtm"), ("independent", "two.vtm", "name the .vti")]
