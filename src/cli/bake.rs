@@ -89,6 +89,8 @@ impl Bake {
             self.print(&json);
             return Ok(());
         };
+        // Frames are of one volume.
+        expect_extension(&self.output, &["vti"])?;
         let frames: Vec<Self> = (0..series.times().len()).map(|n| self.frame(n)).collect();
         let collection = self.output.with_extension("pvd");
         outputs(frames.iter().flat_map(Self::outputs).chain([collection]), &inputs)?;
@@ -189,7 +191,10 @@ impl Bake {
         let extension = self.output.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
         match (loaded.scene.fields(), extension.as_str()) {
             (1, "vtm") => {
-                return Err(Error::invalid(&self.output, "is for several volumes; name a .vti for the bake of one"));
+                return Err(Error::invalid(
+                    &self.output,
+                    "is for several volumes that sweep, the scene has one; name a .vti",
+                ));
             }
             (n @ 2.., "vti") => {
                 return Err(Error::invalid(

@@ -50,6 +50,9 @@ pub(super) struct Compare {
     /// Without references, of several volumes: the one to look at, by its name (default: the first)
     #[arg(long, value_name = "NAME", conflicts_with = "references")]
     field: Option<String>,
+    /// Brightness: multiplies the bake's exposure; colours are compared as displayed, 0 to 1
+    #[arg(long, default_value_t = 1.0, value_name = "FACTOR")]
+    exposure: f64,
     #[command(flatten)]
     rays: FinalGatherOptions,
     /// Print JSON
@@ -64,6 +67,9 @@ pub(super) struct Compare {
 impl Compare {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
         let rays = self.rays.settings()?;
+        if !(self.exposure > 0.0 && self.exposure.is_finite()) {
+            return Err(Error::Invalid(format!("--exposure {}: must be a positive finite number", self.exposure)));
+        }
         if self.references.is_empty() {
             return self.everywhere(rays, progress);
         }
@@ -108,7 +114,7 @@ impl Compare {
         let found = light(&baked, rays, &positions, progress).map_err(|e| e.in_file(&self.bake))?;
         let mut colours = vec![DVec3::ZERO; first.positions.len()];
         chosen.into_iter().zip(found.radiance).for_each(|(v, light)| colours[v] = light);
-        let (accuracy, errors) = compare(&colours, &references, baked.exposure)?;
+        let (accuracy, errors) = compare(&colours, &references, baked.exposure * self.exposure)?;
         warn_of_clamped(accuracy.clamped, "vertices");
         if self.json {
             println!("{}", serde_json::to_string_pretty(&accuracy).expect("the numbers are plain data"));
@@ -166,8 +172,8 @@ impl Compare {
             light.expect("the outside is stored")
         };
         let stage = progress.stage("paths", 2 * self.points as u64);
-        let found =
-            survey(&scene, &tracer, (baked.lattice(), grid), &shown, baked.exposure, &settings, &|n| stage.tick(n));
+        let exposure = baked.exposure * self.exposure;
+        let found = survey(&scene, &tracer, (baked.lattice(), grid), &shown, exposure, &settings, &|n| stage.tick(n));
         stage.end()?;
         let found = found.map_err(in_file)?;
         warn_of_clamped(found.clamped, "points");
@@ -192,7 +198,7 @@ fn warn_of_clamped(share: f64, of: &str) {
     if share > 0.25 {
         say!(
             "warning: {:.0} % of the {of} are too bright to be displayed, by the bake and by what it is compared with: their \
-             error counts as 0",
+             error counts as 0; --exposure 0.1 shows it, say",
             100.0 * share
         );
     }

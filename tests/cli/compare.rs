@@ -326,7 +326,7 @@ fn what_is_for_the_other_way_to_compare_is_refused() {
         let output = isolume(dir, wrong);
         assert_eq!(output.status.code(), Some(2), "{wrong:?}");
     }
-    for wrong in [["--points", "0"], ["--paths", "0"]] {
+    for wrong in [["--points", "0"], ["--paths", "0"], ["--exposure", "0"], ["--exposure", "inf"]] {
         refused(dir, &["compare", "lit.vti", wrong[0], wrong[1]], &[wrong[0]]);
     }
     refused(dir, &["compare", "b.vti"], &["b.vti", "is no bake"]);
@@ -348,6 +348,8 @@ fn what_is_too_bright_to_show_an_error_is_told() {
             let said = text(&ok(dir, &[&["compare", "lit.vti"], arguments].concat()).stderr);
             let warned = said.contains("warning: 100 % of the ") && said.contains("error counts as 0");
             assert_eq!(warned, shines, "{emission} {arguments:?}: {said}");
+            let darker = [&["compare", "lit.vti", "--exposure", "0.01"], arguments].concat();
+            assert!(!text(&ok(dir, &darker).stderr).contains("error counts as 0"));
         }
     }
 }
