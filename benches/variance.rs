@@ -71,8 +71,7 @@ fn main() {
     .flatten()
     .take(RECEIVERS)
     .collect();
-    let light = &scene.polygons()[scene.luminaires()[0] as usize];
-    let id = scene.luminaires()[0];
+    let (id, light) = (0, &scene.luminaires()[0]);
     let world = |r: &Receiver| scene.lattice().to_world(r.position.as_dvec3());
     let visible = |r: &Receiver, y: DVec3| {
         let direction: Vec3 = scene.lattice().to_index(y).as_vec3() - r.position;

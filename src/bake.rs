@@ -5,13 +5,15 @@ mod grid_points;
 mod contacts;
 mod memory;
 mod photon_engine;
+mod preset;
 mod settings;
 mod sweep_engine;
 mod time;
 
 pub use memory::MemoryEstimate;
+pub use preset::Preset;
 pub(crate) use settings::common_size;
-pub use settings::{BakeOptions, BakeSettings, Engine, Interpolation, MOST_BANDS, Preset, StrategyName};
+pub use settings::{BakeOptions, BakeSettings, Engine, Interpolation, MOST_BANDS, StrategyName};
 pub use time::TimeEstimate;
 
 use crate::checkpoint::{self, Checkpoint};

@@ -1,6 +1,6 @@
 //! Direct light at a receiver: closed-form irradiance times the visible share, by shadow rays.
 
-use crate::flattened::{Departure, FlattenedRay};
+use crate::flattened::{Departure, FlattenedRay, Side};
 use crate::luminaire::{Aim, unoccluded};
 use crate::rng::{Key, Rng};
 use crate::scene::Scene;
@@ -21,6 +21,14 @@ pub struct Receiver {
 }
 
 impl Receiver {
+    /// On the level set at `isovalue` through local `p`, on `side`; `None` where ∇h vanishes.
+    #[inline]
+    pub fn on_level_set(scene: &Scene, p: DVec3, isovalue: f32, side: Side) -> Option<Self> {
+        let position = p.as_vec3();
+        let normal = scene.normal(position.as_dvec3(), side)?;
+        Some(Self { position, normal, isovalue, departure: Departure::Surface(side) })
+    }
+
     /// The ray that asks whether world point `y` of luminaire `l` is seen.
     #[inline]
     pub fn shadow_ray(&self, scene: &Scene, y: DVec3, l: u32) -> FlattenedRay {
@@ -57,7 +65,7 @@ pub fn luminance(rgb: DVec3) -> f64 {
 /// \[Lambert1760\]
 pub fn open_irradiance(scene: &Scene, p: DVec3, n: DVec3) -> DVec3 {
     let x = scene.lattice().to_world(p);
-    let lights = scene.luminaires().iter().map(|&l| &scene.polygons()[l as usize]);
+    let lights = scene.luminaires().iter();
     lights.map(|light| light.emission * unoccluded(light, x, n)).sum()
 }
 
@@ -84,7 +92,7 @@ fn budget(scene: &Scene, open: f64, shadow_rays: u32) -> u32 {
 /// in penumbras. Receivers that could get less than half of E₀ ([`Scene::reference_irradiance`]) get fewer rays, in
 /// proportion down to an eighth. The ratio's bias falls with 1/shadow_rays; of more than 64 rays, light or shadow below
 /// a 64th of what is open may be missed.
-/// Polygon l of L luminaires takes the points of `key` with L · index + l for its index.
+/// Luminaire l of L takes the points of `key` with L · index + l for its index.
 pub fn direct_irradiance<T: Tracer>(
     scene: &Scene,
     tracer: &T,
@@ -95,8 +103,7 @@ pub fn direct_irradiance<T: Tracer>(
     let lattice = scene.lattice();
     let x = lattice.to_world(receiver.position.as_dvec3());
     let mut out = Estimate::default();
-    for &l in scene.luminaires() {
-        let light = &scene.polygons()[l as usize];
+    for (l, light) in (0..).zip(scene.luminaires()) {
         if light.is_left(l, receiver.departure) {
             continue;
         }
@@ -142,8 +149,7 @@ pub fn direct_irradiance<T: Tracer>(
 pub fn direct_once<T: Tracer>(scene: &Scene, tracer: &T, receiver: &Receiver, rng: &mut Rng, rays: &mut u64) -> DVec3 {
     let x = scene.lattice().to_world(receiver.position.as_dvec3());
     let mut total = DVec3::ZERO;
-    for &l in scene.luminaires() {
-        let light = &scene.polygons()[l as usize];
+    for (l, light) in (0..).zip(scene.luminaires()) {
         let (y, g) = Aim::new(light, x, receiver.normal).sample(rng.unit2());
         if g > 0.0 && !light.is_left(l, receiver.departure) {
             *rays += 1;
@@ -194,7 +200,7 @@ mod tests {
         let field = Field::new(&volume, Sweep::new(0.5, 7.5).unwrap()).unwrap();
         let walls = cornell_box(field.lattice(), 0.0).unwrap();
         let scene = Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap();
-        let light = &scene.polygons()[scene.luminaires()[0] as usize];
+        let light = &scene.luminaires()[0];
         let x = DVec3::new(0.4, 0.55, 0.3);
         let receiver = Receiver {
             position: scene.lattice().to_index(x).as_vec3(),

@@ -114,7 +114,7 @@ impl<'a, T: Tracer> FinalGather<'a, T> {
         let (rest, gathered) = match settings.gather_rays {
             0 => (indirect(baked, receiver.departure, p)?, Estimate::default()),
             gather_rays => {
-                let known = Landings { baked, least_distance: settings.least_distance() };
+                let known = BakedLight { baked, least_distance: settings.least_distance() };
                 let light =
                     gathered_irradiance(scene, tracer, &known, receiver, gather_rays, Stage::Gather.key(SEED, index))
                         .estimate;
@@ -139,11 +139,9 @@ impl<'a, T: Tracer> FinalGather<'a, T> {
     pub fn outside(&self, p: DVec3, isovalue: f32, index: u64) -> Option<Estimate> {
         let scene = &self.baked.scene;
         let side = scene.surface.outside;
-        let position = p.as_vec3();
-        let Some(normal) = scene.normal(position.as_dvec3(), side) else {
+        let Some(receiver) = Receiver::on_level_set(scene, p, isovalue, side) else {
             return Some(Estimate { mean: self.baked.radiance(side, p)?, ..Estimate::default() });
         };
-        let receiver = Receiver { position, normal, isovalue, departure: Departure::Surface(side) };
         self.leaving(&receiver, scene.surface.albedo.at(f64::from(isovalue)), scene.surface.emission, index)
     }
 
@@ -227,12 +225,12 @@ fn cap(baked: &BakedVolume, face: u8, p: DVec3, isovalue: f32) -> Option<DVec3> 
 
 /// A bake where gather rays land. Rays go on where it holds nothing: from sides and cells that are not stored, from
 /// caps within solids, and from walls there unless these hold light of their own.
-struct Landings<'a> {
+struct BakedLight<'a> {
     baked: &'a BakedVolume,
     least_distance: f32,
 }
 
-impl KnownLight for Landings<'_> {
+impl KnownLight for BakedLight<'_> {
     fn least_distance(&self) -> f32 {
         self.least_distance
     }

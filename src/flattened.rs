@@ -34,6 +34,12 @@ impl Side {
         }
     }
 
+    /// The normal on this side, given the one on the lower side, or the other way around.
+    #[inline]
+    pub fn facing<N: std::ops::Neg<Output = N>>(self, lower: N) -> N {
+        if self == Side::Lower { lower } else { -lower }
+    }
+
     /// 0 for lower, 1 for higher: an index into pairs.
     #[inline]
     pub fn index(self) -> usize {

@@ -1,7 +1,7 @@
 //! What a ray finds where it lands, whatever stands there.
 
 use crate::direct::Receiver;
-use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target};
+use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Target};
 use crate::scene::Scene;
 use glam::DVec3;
 
@@ -41,7 +41,7 @@ pub fn landing(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> Option<L
         Target::Cap(face, side) => {
             let n = scene.face_normal(face);
             let albedo = scene.face_surface(face).albedo.at(f64::from(isovalue));
-            (if side == Side::Lower { n } else { -n }, Departure::Cap(face, side), albedo, none)
+            (side.facing(n), Departure::Cap(face, side), albedo, none)
         }
         Target::Polygon(id) => {
             let p = &scene.polygons()[id as usize];

@@ -50,7 +50,7 @@ impl SurfacePhoton {
         normal: Option<DVec3>,
         gradient: DVec3,
     ) -> Self {
-        let falling = normal.map_or(DVec3::ZERO, |n| if side == Side::Lower { n } else { -n });
+        let falling = normal.map_or(DVec3::ZERO, |n| side.facing(n));
         Self {
             position,
             isovalue: flight.isovalue,
@@ -274,19 +274,13 @@ pub fn trace_photons<T: Tracer>(
 
 /// Luminaires at flux Φ = π L_e A per hyperplane (times the sweep's length 1), and the level sets if they emit.
 fn sources(scene: &Scene) -> Vec<Source> {
-    let mut sources: Vec<Source> = scene
-        .luminaires()
-        .iter()
-        .map(|&l| {
-            let p = &scene.polygons()[l as usize];
-            Source::Luminaire(l, PI * p.area() * p.emission)
-        })
-        .collect();
+    let mut sources: Vec<Source> =
+        (0..).zip(scene.luminaires()).map(|(l, p)| Source::Luminaire(l, PI * p.area() * p.emission)).collect();
     for (number, member) in scene.members().iter().enumerate().filter(|(_, m)| m.surface.emission != DVec3::ZERO) {
         // Both sides emit π L_e |∇h| per volume; |∇h| multiplies the single photon. The mean slope of the sweep across
         // Ω's diagonal only balances this source against luminaires.
         let lattice = member.field.lattice();
-        let diagonal = (lattice.axes() * lattice.far()).length();
+        let diagonal = lattice.diagonal();
         sources.push(Source::Field(number, 2.0 * PI * member.surface.emission * lattice.world_volume() / diagonal));
     }
     sources
@@ -424,8 +418,8 @@ fn emit(scene: &Scene, settings: &PhotonSettings, sources: &[Source], total: f64
                 Side::Higher
             };
             let falling = field.falling_normal(origin.as_dvec3())?;
-            let normal = if side == Side::Lower { falling } else { -falling };
-            let diagonal = (lattice.axes() * lattice.far()).length();
+            let normal = side.facing(falling);
+            let diagonal = lattice.diagonal();
             // On a plateau beside a slope there is a normal, and nothing to emit.
             let power = share * field.gradient(origin.as_dvec3()).length() * diagonal;
             if power == DVec3::ZERO {

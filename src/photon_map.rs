@@ -126,7 +126,7 @@ impl<'a> PhotonMap<'a> {
         match &self.arrangement {
             Arrangement::Points(points) => points.irradiance(position, f64::from(receiver.isovalue), scratch),
             Arrangement::Density(density) => {
-                let falling = if self.side == Side::Lower { receiver.normal } else { -receiver.normal };
+                let falling = self.side.facing(receiver.normal);
                 density.irradiance(position, receiver.isovalue, falling.as_vec3())
             }
         }

@@ -3,7 +3,7 @@
 use crate::brdf::reflected;
 use crate::checkpoint;
 use crate::direct::{Receiver, direct_irradiance, luminance};
-use crate::flattened::{Departure, Side};
+use crate::flattened::Side;
 use crate::gather::gathered_irradiance;
 use crate::nearest::Neighbours;
 use crate::photon_map::PhotonMap;
@@ -120,12 +120,7 @@ impl<T: Tracer> Sampler<'_, T> {
         if !isovalue.is_finite() {
             return None;
         }
-        let receiver = Receiver {
-            position,
-            normal: scene.normal(p, side)?,
-            isovalue: isovalue as f32,
-            departure: Departure::Surface(side),
-        };
+        let receiver = Receiver::on_level_set(scene, p, isovalue as f32, side)?;
         if scene.covers(scene.lattice().to_world(p)) {
             let radiance = scene.surface.emission.as_vec3();
             return Some(RadianceSample { position, radiance, ..RadianceSample::default() });

@@ -3,6 +3,7 @@
 //! \[Christensen99\]
 
 mod openings;
+mod binned;
 mod flats;
 mod pools;
 
@@ -11,7 +12,7 @@ use crate::checkpoint;
 use crate::direct::{Receiver, direct_irradiance};
 use crate::field::Field;
 use crate::flat::{self, FlatLight};
-use crate::flattened::{Departure, Side, SurfacePoint, Target};
+use crate::flattened::{Side, SurfacePoint, Target};
 use crate::isovalue_axis::IsovalueAxis;
 use crate::mask::{Mask, masks, stand_ins};
 use crate::nearest::Neighbours;
@@ -450,10 +451,8 @@ impl<T: Tracer> Fill<'_, T> {
         let (mut sum, mut count) = (DVec3::ZERO, 0.0);
         let places = stand_ins::<2>(&scene.field, scene.lattice(), node, settings.seed);
         for (stand_in, p) in places.into_iter().flatten().enumerate() {
-            let position = p.as_vec3();
-            let Some(normal) = scene.normal(position.as_dvec3(), side) else { continue };
-            let isovalue = scene.field.value(position.as_dvec3()) as f32;
-            let receiver = Receiver { position, normal, isovalue, departure: Departure::Surface(side) };
+            let isovalue = scene.field.value(p.as_vec3().as_dvec3()) as f32;
+            let Some(receiver) = Receiver::on_level_set(scene, p, isovalue, side) else { continue };
             let index = (node as u64 * 2 + stand_in as u64) * 2 + side.index() as u64;
             let key = Stage::Cache.key(settings.seed, index);
             let direct = direct_irradiance(scene, self.tracer, &receiver, settings.node_shadow_rays, key);

@@ -15,7 +15,6 @@ pub use surface_map::{SurfaceMap, SurfaceMapSettings};
 use crate::direct::Receiver;
 use crate::error::{Error, Result};
 use crate::export::ply;
-use crate::flattened::{Departure, Side};
 use crate::isosurface;
 use crate::isovalue_axis::IsovalueAxis;
 use crate::photon::{PhotonSettings, trace_photons};
@@ -143,13 +142,6 @@ pub fn subset(total: usize, count: Option<usize>) -> Vec<usize> {
     all
 }
 
-/// The receiver at local `p` of hyperplane `isovalue`; `None` where ∇h vanishes.
-pub fn receiver(scene: &Scene, p: DVec3, isovalue: f32, side: Side) -> Option<Receiver> {
-    let position = p.as_vec3();
-    let normal = scene.normal(position.as_dvec3(), side)?;
-    Some(Receiver { position, normal, isovalue, departure: Departure::Surface(side) })
-}
-
 /// The scene seen from each companion, with its isosurface, which may be empty.
 fn companion_meshes(scene: &Scene, isovalue: f32) -> Result<Vec<(Scene, SurfaceMesh)>> {
     let seen = scene.companions().iter().map(|c| scene.seen_from(c.number));
@@ -183,7 +175,7 @@ pub fn reference<T: Tracer>(
     };
     let chosen = subset(mesh.local.len(), settings.vertices);
     let receivers: Vec<Option<Receiver>> =
-        chosen.iter().map(|&v| receiver(scene, mesh.local[v], isovalue, side)).collect();
+        chosen.iter().map(|&v| Receiver::on_level_set(scene, mesh.local[v], isovalue, side)).collect();
     let batches = settings.batches.max(2);
     let samples = settings.samples.div_ceil(batches);
     let rays = AtomicU64::new(0);

@@ -103,7 +103,8 @@ pub struct Scene {
     companions: Vec<Companion>,
     policy: Policy,
     polygons: Vec<Polygon>,
-    luminaires: Vec<u32>,
+    /// How many of them emit; these come first.
+    emitting: usize,
     interior: [DVec3; 2],
     reference_irradiance: f64,
 }
@@ -177,12 +178,10 @@ impl Scene {
         }
         let mut lo = DVec3::INFINITY;
         let mut hi = DVec3::NEG_INFINITY;
-        let corners = (0..8)
-            .map(|n| lattice.to_world(lattice.far() * DVec3::from_array([n & 1, n >> 1 & 1, n >> 2].map(f64::from))));
-        for x in corners.chain(polygons.iter().flat_map(|p| p.vertices().iter().copied())) {
+        let corners = lattice.corners().map(|p| lattice.to_world(p));
+        for x in corners.into_iter().chain(polygons.iter().flat_map(|p| p.vertices().iter().copied())) {
             (lo, hi) = (lo.min(x), hi.max(x));
         }
-        let luminaires = (0..u32::try_from(count).expect("checked above")).collect();
         let mut scene = Self {
             field,
             surface,
@@ -192,7 +191,7 @@ impl Scene {
             companions: Vec::new(),
             policy: Policy::default(),
             polygons,
-            luminaires,
+            emitting: count,
             interior: [lo, hi],
             reference_irradiance: 0.0,
         };
@@ -213,9 +212,9 @@ impl Scene {
         &self.polygons
     }
 
-    /// Numbers of the polygons that emit.
-    pub fn luminaires(&self) -> &[u32] {
-        &self.luminaires
+    /// The polygons that emit, in the order of their numbers.
+    pub fn luminaires(&self) -> &[Polygon] {
+        &self.polygons[..self.emitting]
     }
 
     /// World bounds of everything.
@@ -232,7 +231,7 @@ impl Scene {
     #[inline]
     pub fn normal(&self, p: DVec3, side: Side) -> Option<DVec3> {
         let n = self.field.falling_normal(p)?;
-        Some(if side == Side::Lower { n } else { -n })
+        Some(side.facing(n))
     }
 
     /// A ray from local `origin` along the world direction `direction`; t counts in lengths of it.
@@ -289,11 +288,11 @@ impl Scene {
         let first = self.companions.iter().find(|c| c.number == 0).map_or(self.lattice(), |c| c.member.field.lattice());
         let centre = first.to_world(0.5 * first.far());
         let flux = |p: &Polygon| p.emission.max_element() * p.area();
-        let lights = || self.luminaires.iter().map(|&l| &self.polygons[l as usize]);
-        let Some(strongest) = lights().max_by(|a, b| flux(a).total_cmp(&flux(b))) else { return 0.0 };
+        let lights = self.luminaires();
+        let Some(strongest) = lights.iter().max_by(|a, b| flux(a).total_cmp(&flux(b))) else { return 0.0 };
         let aim = strongest.vertices().iter().sum::<DVec3>() / strongest.vertices().len() as f64 - centre;
         let Some(n) = aim.try_normalize() else { return 0.0 };
-        lights().map(|p| p.emission * unoccluded(p, centre, n)).sum::<DVec3>().max_element()
+        lights.iter().map(|p| p.emission * unoccluded(p, centre, n)).sum::<DVec3>().max_element()
     }
 
     /// Display exposure: rgb = radiance × π / (ρ_max E₀), ρ_max over all channels and the sweep; 1 where that is
@@ -423,7 +422,7 @@ mod tests {
         let scene = scene_on(lattice, 0.0, Boundary::Open).unwrap();
         assert!((scene.reference_irradiance() - 0.53002).abs() < 1e-5, "{}", scene.reference_irradiance());
         let named = |n: &str| scene.polygons().iter().find(|p| p.name == n).unwrap();
-        assert_eq!(scene.luminaires(), [0]);
+        assert_eq!(scene.luminaires().iter().map(|p| p.name.as_str()).collect::<Vec<_>>(), ["luminaire"]);
         assert!((named("luminaire").area() - 0.16).abs() < 1e-12);
         for (name, normal) in [
             ("x_min", DVec3::X),

@@ -212,7 +212,7 @@ pub fn supported(scene: &Scene) -> Result<()> {
 /// through samples that are not finite.
 pub fn lit_within_solids(scene: &Scene) -> bool {
     let inside = ends::inside(scene);
-    let lamp = scene.luminaires().iter().any(|&number| inside[number as usize]);
+    let lamp = inside.iter().zip(scene.luminaires()).any(|(inside, _)| *inside);
     lamp || scene.surface.emission != DVec3::ZERO || scene.field.has_gaps()
 }
 

@@ -218,7 +218,7 @@ const MOST_CORNERS: usize = 64;
 /// What direct light of a split bake is computed from; none where the page takes radiance instead.
 fn luminaires(baked: &BakedVolume, frame: &Frame) -> Vec<Value> {
     let scene = &baked.scene;
-    let all: Vec<&Polygon> = scene.luminaires().iter().map(|&l| &scene.polygons()[l as usize]).collect();
+    let all = scene.luminaires();
     let corners: usize = all.iter().map(|l| l.vertices().len()).sum();
     let split = baked.sides.iter().all(|(_, grid)| grid.split.is_some());
     if !split || all.len() > MOST_LUMINAIRES || corners > MOST_CORNERS {
@@ -231,7 +231,7 @@ fn luminaires(baked: &BakedVolume, frame: &Frame) -> Vec<Value> {
             "power": (l.emission * baked.exposure).to_array(),
         })
     };
-    all.into_iter().map(describe).collect()
+    all.iter().map(describe).collect()
 }
 
 /// Points of the grid between the samples that normals come from, along each axis.

@@ -182,6 +182,16 @@ impl Lattice {
         DVec3::from_array(self.cells().map(|n| n as f64))
     }
 
+    /// Length of Ω's diagonal from its first to its far corner, world.
+    pub fn diagonal(&self) -> f64 {
+        (self.axes * self.far()).length()
+    }
+
+    /// Ω's corners, index coordinates.
+    pub fn corners(&self) -> [DVec3; 8] {
+        std::array::from_fn(|n| self.far() * DVec3::from_array([n & 1, n >> 1 & 1, n >> 2].map(|i| i as f64)))
+    }
+
     /// Whether index coordinates lie in Ω, or as near as rounding puts what stands on its faces (10⁻⁶ of a step).
     #[inline]
     pub fn holds(&self, p: DVec3) -> bool {

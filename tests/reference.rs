@@ -11,7 +11,7 @@ use isolume::field::{Field, Sweep};
 use isolume::flattened::{Departure, FlattenedRay, Side, Target};
 use isolume::illumination_grid::GridSize;
 use isolume::polygon::Polygon;
-use isolume::reference::{Integrator, PathTracer, ReferenceSettings, receiver, reference, subset};
+use isolume::reference::{Integrator, PathTracer, ReferenceSettings, reference, subset};
 use isolume::rng::{Rng, Stage};
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
 use isolume::stats::{normal_quantile, sidak};
@@ -159,7 +159,7 @@ fn integrating_sphere() {
     let expected = rho * flux / (4.0 * std::f64::consts::PI * radius * radius * (1.0 - rho));
     let mut moments = isolume::stats::Moments::default();
     for v in subset(mesh.local.len(), Some(300)) {
-        let at = receiver(&scene, mesh.local[v], c, Side::Lower).unwrap();
+        let at = Receiver::on_level_set(&scene, mesh.local[v], c, Side::Lower).unwrap();
         let mut paths = PathTracer::new(&scene, &tracer);
         let total = paths.outgoing(&at, 256, Stage::Path.key(5, v as u64));
         let direct = paths.direct(&at, 256, Stage::Path.key(5, v as u64));
@@ -256,7 +256,7 @@ fn a_furnace_at_the_line_where_surface_and_walls_meet() {
     let level = normal_quantile(sidak(0.01, 2 * vertices.len()));
     let mut paths = (PathTracer::new(&scene, &graph), PathTracer::new(&scene, &triangles));
     for v in vertices {
-        let at = receiver(&scene, mesh.local[v], c, Side::Lower).unwrap();
+        let at = Receiver::on_level_set(&scene, mesh.local[v], c, Side::Lower).unwrap();
         let mut moments = [isolume::stats::Moments::default(); 2];
         for i in 0..16 {
             moments[0].push(paths.0.outgoing(&at, 64, Stage::Path.key(3, v as u64 * 16 + i)).x);

@@ -480,8 +480,7 @@ fn texels_that_solids_cover_in_part_are_as_bright_as_the_rest() {
     let scene = Scene::new(f, Surface::default(), Boundary::Open, polygons).unwrap();
     let settings = SweepSettings { light_points: 256, max_bounces: 0, flat_resolution: (8, 64), ..ONE_BOUNCE };
     let got = run(&scene, settings);
-    let lamp = scene.luminaires()[0] as usize;
-    let texture = &got.flats[1 - lamp].as_ref().unwrap().outside;
+    let texture = &got.flats[1].as_ref().unwrap().outside;
     let [nu, nv, nc] = texture.dims;
     let (mut straddled, mut worst) = (0, 0f64);
     for (t, j, i) in (0..nc).flat_map(|t| (0..nv).flat_map(move |j| (0..nu).map(move |i| (t, j, i)))) {
@@ -493,7 +492,7 @@ fn texels_that_solids_cover_in_part_are_as_bright_as_the_rest() {
             continue;
         }
         straddled += usize::from(open < 0.9);
-        let expected = 0.5 / PI * unoccluded(&scene.polygons()[lamp], at, DVec3::Z);
+        let expected = 0.5 / PI * unoccluded(&scene.luminaires()[0], at, DVec3::Z);
         let off = f64::from(texture.texels[(t * nv + j) * nu + i][1]) / expected - 1.0;
         worst = worst.max(off.abs());
     }

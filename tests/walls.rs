@@ -9,7 +9,7 @@ use isolume::field::{Field, Sweep};
 use isolume::flattened::{Departure, Side};
 use isolume::mask::Mask;
 use isolume::progress::Progress;
-use isolume::reference::{PathTracer, receiver};
+use isolume::reference::PathTracer;
 use isolume::rng::{Rng, Stage};
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
 use isolume::volume::{Lattice, Samples, Volume};
@@ -80,7 +80,7 @@ fn errors_of(
     let light: Vec<[f64; 2]> = points
         .par_iter()
         .map(|&o| {
-            let receiver = receiver(scene, place(o), scene.field.samples()[o], side).unwrap();
+            let receiver = Receiver::on_level_set(scene, place(o), scene.field.samples()[o], side).unwrap();
             let exact = PathTracer::new(scene, &tracer).outgoing(&receiver, paths, Stage::Path.key(5, o as u64));
             [f64::from(grid.radiance[o][1]), exact.y]
         })
@@ -248,7 +248,7 @@ fn light_does_not_walk_along_narrow_tubes() {
     let mut sections = [[0.0; 2]; 12];
     for o in (0..lattice.len()).filter(|&o| grid.mask[o] == Mask::Valid) {
         let p = DVec3::from_array(lattice.ijk(o).map(|x| x as f64));
-        let Some(r) = receiver(&scene, p, scene.field.samples()[o], *side) else { continue };
+        let Some(r) = Receiver::on_level_set(&scene, p, scene.field.samples()[o], *side) else { continue };
         let away = ((p.y - 87.0).abs() / 87.0 * 12.0).min(11.0) as usize;
         sections[away][0] += PathTracer::new(&scene, &tracer).outgoing(&r, 256, Stage::Path.key(3, o as u64)).y;
         sections[away][1] += f64::from(grid.radiance[o][1]);
@@ -310,7 +310,7 @@ fn no_light_seeps_along_walls() {
     let walls = cornell_box(&lattice, 0.0).unwrap();
     let scene = Scene::new(Field::new(&volume, sweep).unwrap(), surface, Boundary::Open, walls).unwrap();
     // The luminaire's lowest corner is above all of these.
-    let most = scene.polygons()[scene.luminaires()[0] as usize].vertices().iter().map(|&x| height(x));
+    let most = scene.luminaires()[0].vertices().iter().map(|&x| height(x));
     let most = (most.fold(f64::INFINITY, f64::min) - 0.2 - sweep.lo()) / (sweep.hi() - sweep.lo());
     // Stored are the lower sides; walls are lit as if both were.
     let (field, walls) = (Field::new(&volume, sweep).unwrap(), scene.polygons().to_vec());

@@ -6,7 +6,7 @@ use crate::direct::{Receiver, direct_irradiance};
 use crate::error::{Error, Result};
 use crate::illumination_grid::GridSize;
 use crate::mask::stand_ins;
-use crate::reference::{PathTracer, receiver, subset};
+use crate::reference::{PathTracer, subset};
 use crate::rng::Stage;
 use crate::scene::Scene;
 use crate::surface_mesh::SurfaceMesh;
@@ -40,7 +40,9 @@ pub fn interpolation_floor<T: Tracer>(
     let (mut texture, mut radiance, mut sampled) = (vec![DVec3::ZERO; n], vec![DVec3::ZERO; n], vec![false; n]);
     let exact: Vec<Option<DVec3>> = chosen
         .par_iter()
-        .map(|&v| Some(direct(&receiver(scene, mesh.local[v], isovalue, scene.surface.outside)?, !(v as u64))))
+        .map(|&v| {
+            Some(direct(&Receiver::on_level_set(scene, mesh.local[v], isovalue, scene.surface.outside)?, !(v as u64)))
+        })
         .collect();
     for ((&v, exact), through) in chosen.iter().zip(exact).zip(interpolated) {
         if let (Some(exact), Some(through)) = (exact, through) {
@@ -120,7 +122,7 @@ pub fn through_grid(
         .map(|&o| {
             let (mut sum, mut count) = (DVec3::ZERO, 0.0);
             for (i, p) in stand_ins::<2>(&scene.field, &lattice, o, 0).into_iter().flatten().enumerate() {
-                if let Some(r) = receiver(scene, p, scene.field.value(p) as f32, scene.surface.outside) {
+                if let Some(r) = Receiver::on_level_set(scene, p, scene.field.value(p) as f32, scene.surface.outside) {
                     (sum, count) = (sum + value(&r, (o * 2 + i) as u64), count + 1.0);
                 }
             }

@@ -8,7 +8,7 @@ use crate::error::{Error, Result};
 use crate::field::Field;
 use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, local_position};
-use crate::reference::{PathTracer, receiver};
+use crate::reference::PathTracer;
 use crate::rng::{Rng, Stage};
 use crate::sampling::{Strategy, positions};
 use crate::scene::Scene;
@@ -120,7 +120,7 @@ pub fn survey<T: Tracer>(
     let rays = AtomicU64::new(0);
     let compare = |p: DVec3, shown: [DVec3; 2], index: usize| {
         #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
-        let receiver = receiver(scene, p, scene.field.value(p) as f32, side)?;
+        let receiver = Receiver::on_level_set(scene, p, scene.field.value(p) as f32, side)?;
         let open = !scene.covers(scene.lattice().to_world(p)) && tick(0);
         open.then(|| Deviation::new(&receiver, shown, exposure, settings, (scene, tracer), (index, &rays)))
     };

@@ -395,13 +395,7 @@ impl Parts {
 /// sets, first landings left out.
 fn landings(scene: &Scene, settings: &BakeSettings, device: &Device) -> Result<[f64; 3]> {
     let tracer = GraphTracer::new(device, scene)?;
-    let pilot = PhotonSettings {
-        count: PILOTS.min(settings.photons),
-        max_bounces: settings.bounces,
-        seed: settings.seed,
-        axis: IsovalueAxis::EVEN,
-        fixed_isovalue: None,
-    };
+    let pilot = PhotonSettings { count: PILOTS.min(settings.photons), ..settings.emission(IsovalueAxis::EVEN) };
     let pilots = trace_photons(scene, &tracer, &pilot, &|_| true);
     let each = settings.photons as f64 / pilots.emitted.max(1) as f64;
     let of = |side: Side| pilots.surface.iter().filter(|p| p.side == side && p.bounces > 0).count() as f64 * each;

@@ -14,7 +14,7 @@ use crate::irradiance_caching::interpolate;
 use crate::isovalue_axis::IsovalueAxis;
 use crate::mask::Mask;
 use crate::node_set::NodeSet;
-use crate::photon::{PhotonSettings, trace_photons};
+use crate::photon::trace_photons;
 use crate::progress::{Clock, Progress, interrupted};
 use crate::radiance::{BLOCK, Indirect, RadianceSample, Sampler, sample_places};
 use crate::radiance_cache::{NodePhotons, RadianceCache};
@@ -53,14 +53,7 @@ pub(super) fn light(
     let stage = progress.stage("photons", settings.photons);
     let fields = std::iter::once(&first.field).chain(first.companions().iter().map(|c| &c.member.field));
     let axis = IsovalueAxis::of(fields.map(|field| field.samples()));
-    let photon_settings = PhotonSettings {
-        count: settings.photons,
-        max_bounces: settings.bounces,
-        seed: settings.seed,
-        axis,
-        fixed_isovalue: None,
-    };
-    let photons = trace_photons(first, &tracers[0], &photon_settings, &|n| stage.tick(n));
+    let photons = trace_photons(first, &tracers[0], &settings.emission(axis), &|n| stage.tick(n));
     stage.end()?;
     lit.spend(clock, |s| &mut s.photons);
     lit.rays = photons.rays;

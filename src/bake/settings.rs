@@ -1,9 +1,11 @@
 //! What a user may set about a bake, and the presets.
 
+use super::preset::Preset;
 use super::{can_sweep, left_out};
 use crate::error::{Error, Result};
 use crate::illumination_grid::GridSize;
 use crate::isovalue_axis::IsovalueAxis;
+use crate::photon::PhotonSettings;
 use crate::photon_map::{EstimateSettings, Estimator, Normalisation};
 use crate::radiance_cache::CacheSettings;
 use crate::sampling::Strategy;
@@ -16,19 +18,6 @@ pub const MOST_BANDS: usize = 256;
 
 /// Photons, and samples, at most: more than any machine holds, and so few that what they take can be estimated.
 const MOST_COUNTED: u64 = 1 << 40;
-
-/// How much work a bake is worth.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-pub enum Preset {
-    /// Seconds: a first look.
-    Preview,
-    /// Minutes: fit to publish.
-    #[default]
-    Standard,
-    /// As long as it takes.
-    Reference,
-}
 
 /// How light is computed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
@@ -405,50 +394,40 @@ impl BakeSettings {
     /// `Invalid` for values out of range; the message names the option.
     pub fn with_engine(o: &BakeOptions, engine: Engine) -> Result<Self> {
         let preset = o.preset.unwrap_or_default();
-        // photons, samples per point, shadow, gather, cache shadow, wall texels, wall isovalues, wall shadow
-        let (photons, density, shadow, gather, cache, wall, isovalues, wall_shadow) = match preset {
-            Preset::Preview => (1 << 19, 0.25, 64, 32, 4, 32, 16, 16),
-            Preset::Standard => (1 << 22, 1.0, 256, 64, 4, 64, 32, 32),
-            Preset::Reference => (1 << 24, 4.0, 1024, 256, 16, 128, 64, 128),
-        };
-        let (directions, light_points) = match preset {
-            Preset::Preview => (64, 16),
-            Preset::Standard => (256, 64),
-            Preset::Reference => (512, 128),
-        };
+        let usual = preset.values();
         let estimator = o.estimator.unwrap_or_default();
-        let gather_rays = o.gather_rays.unwrap_or(gather);
+        let gather_rays = o.gather_rays.unwrap_or(usual.gather_rays);
         // What no gather averages needs more photons; bins make them cheap.
         let per_estimate = if gather_rays == 0 && estimator == Estimator::Splat { 1000 } else { 64 };
         let interpolation = o.interpolation.unwrap_or_default();
         let settings = Self {
             preset,
             engine,
-            directions: o.directions.unwrap_or(directions),
-            light_points: o.light_points.unwrap_or(light_points),
-            photons: o.photons.unwrap_or(photons),
+            directions: o.directions.unwrap_or(usual.directions),
+            light_points: o.light_points.unwrap_or(usual.light_points),
+            photons: o.photons.unwrap_or(usual.photons),
             bounces: o.bounces.unwrap_or(u16::MAX),
             estimator,
             photons_per_estimate: o.photons_per_estimate.unwrap_or(per_estimate),
             tau: o.tau.unwrap_or(EstimateSettings::default().tau),
             samples: o.samples,
-            samples_per_point: density,
+            samples_per_point: usual.samples_per_point,
             // A number of samples asks for scattered ones.
             strategy: o.strategy.unwrap_or(if o.samples.is_some() {
                 StrategyName::Uniform
             } else {
                 StrategyName::Nodes
             }),
-            shadow_rays: o.shadow_rays.unwrap_or(shadow),
+            shadow_rays: o.shadow_rays.unwrap_or(usual.shadow_rays),
             gather_rays,
-            cache_shadow_rays: cache,
+            cache_shadow_rays: usual.cache_shadow_rays,
             smoothing: o.smoothing.unwrap_or(true),
             neighbours: o.neighbours.unwrap_or(if interpolation == Interpolation::Irradiance { 16 } else { 8 }),
             interpolation,
             grid: o.grid.unwrap_or(GridSize::OWN),
-            wall_resolution: o.wall_resolution.unwrap_or(wall),
-            wall_isovalues: isovalues,
-            wall_shadow_rays: wall_shadow,
+            wall_resolution: o.wall_resolution.unwrap_or(usual.wall_resolution),
+            wall_isovalues: usual.wall_isovalues,
+            wall_shadow_rays: usual.wall_shadow_rays,
             split: o.split.unwrap_or(false),
             normalisation: Normalisation::Accepted,
             seed: o.seed.unwrap_or(1),
@@ -524,6 +503,12 @@ impl BakeSettings {
             axis,
             seed: self.seed,
         }
+    }
+
+    /// How its photons are traced.
+    pub(super) fn emission(&self, axis: IsovalueAxis) -> PhotonSettings {
+        let (count, max_bounces, seed) = (self.photons, self.bounces, self.seed);
+        PhotonSettings { count, max_bounces, seed, axis, fixed_isovalue: None }
     }
 
     pub(super) fn estimate(&self) -> EstimateSettings {

@@ -15,7 +15,6 @@ use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, local_position};
 use crate::neighbourhood::neighbourhood;
 use crate::node_set::NodeSet;
-use crate::polygon::Polygon;
 use crate::progress::{Clock, Progress};
 use crate::radiance::{Indirect, Sampler, sample_places};
 use crate::radiance_cache::RadianceCache;
@@ -135,11 +134,10 @@ fn outgoing(scene: &Scene, lit: &[bool], mut white: Vec<[f32; 3]>) -> Vec<[f32; 
 fn beside_luminaires(scene: &Scene, masks: &[Mask]) -> Vec<usize> {
     let lattice = scene.lattice();
     let reach = NEAR * lattice.spacing().max_element();
-    let lights: Vec<&Polygon> = scene.luminaires().iter().map(|&l| &scene.polygons()[l as usize]).collect();
     let near = |&o: &usize| {
         masks[o] == Mask::Valid && {
             let x = lattice.to_world(local_position(&scene.field, lattice, o));
-            lights.iter().any(|light| light.is_nearer(x, reach))
+            scene.luminaires().iter().any(|light| light.is_nearer(x, reach))
         }
     };
     (0..masks.len()).into_par_iter().with_min_len(1 << 12).filter(near).collect()

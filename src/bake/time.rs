@@ -6,7 +6,6 @@ use crate::direct::{Receiver, direct_irradiance};
 use crate::embree::{Device, GraphTracer, pyramids};
 use crate::error::Result;
 use crate::flat;
-use crate::flattened::Departure;
 use crate::illumination_grid::GridSize;
 use crate::isovalue_axis::IsovalueAxis;
 use crate::mask::{Mask, masks};
@@ -109,13 +108,7 @@ impl TimeEstimate {
         let pyramids = pyramids(scene);
         let tracer = GraphTracer::with_pyramids(device, scene, &pyramids)?;
         let count = settings.photons.min(PHOTONS);
-        let pilot = PhotonSettings {
-            count,
-            max_bounces: settings.bounces,
-            seed: settings.seed,
-            axis: IsovalueAxis::EVEN,
-            fixed_isovalue: None,
-        };
+        let pilot = PhotonSettings { count, ..settings.emission(IsovalueAxis::EVEN) };
         let begun = Instant::now();
         let photons = trace_photons(scene, &tracer, &pilot, &|_| true);
         let all = begun.elapsed().as_secs_f64() * settings.photons as f64 / count.max(1) as f64;
@@ -291,8 +284,7 @@ fn field_seconds(
     at.par_iter().enumerate().with_min_len(64).for_each_init(Neighbours::default, |scratch, (i, &position)| {
         let p = position.as_dvec3();
         let isovalue = scene.field.value(p) as f32;
-        let Some(normal) = scene.normal(p, side) else { return };
-        let receiver = Receiver { position, normal, isovalue, departure: Departure::Surface(side) };
+        let Some(receiver) = Receiver::on_level_set(scene, p, isovalue, side) else { return };
         black_box(map.irradiance(&receiver, scratch));
         let key = Stage::Cache.key(settings.seed, i as u64);
         black_box(direct_irradiance(scene, tracer, &receiver, settings.cache_shadow_rays, key));

@@ -7,7 +7,7 @@ use crate::atomic::AtomicFile;
 use crate::embree::Device;
 use crate::error::Result;
 use crate::export::picture::Picture;
-use crate::flattened::{FlattenedRay, Side, Target};
+use crate::flattened::{FlattenedRay, Target};
 use crate::progress::{interrupted, unless_interrupted};
 use crate::rng::{Sobol, Stage};
 use crate::tracer::Tracer;
@@ -129,7 +129,7 @@ impl<'a> View<'a> {
         let [lo, hi] = world.scene.field.bounds();
         let (size, height) = (hi - lo, world.scene.height);
         let unit = size.max_element();
-        let up = if world.scene.outside == Side::Lower { 1.0 } else { -1.0 };
+        let up = world.scene.outside.facing(1.0);
         let middle = if up > 0.0 { 0.25 } else { 0.75 };
         let target = (lo + size * DVec2::new(0.5, 0.5)).extend(middle * height);
         let eye = target + DVec3::new(0.0, 1.35, 1.85 * up) * unit;

@@ -136,7 +136,7 @@ impl World {
                 ((-g * self.scene.height).extend(1.0).normalize(), z)
             }
         };
-        let normal = if side == Side::Lower { falling } else { -falling };
+        let normal = side.facing(falling);
         Some(Receiver {
             position: p.extend(z as f32),
             isovalue: isovalue as f32,

@@ -71,7 +71,7 @@ impl<'a> PhotonPoints<'a> {
                 (0..FOOTPRINT_POINTS as u32).map(|i| warp::ball(set.point2(i, 0), set.coordinate(i, 2))).collect()
             })
             .collect();
-        let diagonal = (lattice.axes() * lattice.far()).length();
+        let diagonal = lattice.diagonal();
         let mut radius = settings.max_radius * diagonal;
         if settings.estimator == Estimator::Radius {
             // As many photons on average over the part of Ω that the sweep's level sets fill.

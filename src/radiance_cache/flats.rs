@@ -2,10 +2,11 @@
 //! of it that light reaches.
 
 use super::CacheSettings;
+use super::binned::{Binned, GATHERED, SHOWN, Width};
 use super::openings::{Hidden, Open, Solid, is_open};
 use crate::brdf::reflected;
 use crate::direct::{Estimate, Receiver, direct_irradiance};
-use crate::flat::{self, FlatLight, FlatTexture, Texel, Within};
+use crate::flat::{self, Flat, FlatLight, FlatTexture, Texel, Within};
 use crate::neighbourhood::neighbourhood;
 use crate::photon::FlatPhoton;
 use crate::rng::Stage;
@@ -42,95 +43,181 @@ pub(super) fn fill_flat<T: Tracer>(
 ) -> Filled {
     let Some(flat) = flat::flat(scene, number).filter(|f| !f.albedo.black()) else { return Filled::default() };
     let dims = flat.resolution(settings.flat_resolution, settings.isovalue_resolution);
-    let black = FlatTexture { axis: settings.axis, ..FlatTexture::black(dims) };
-    let isovalues = settings.axis.centres(dims[2]);
-    let lattice = scene.lattice();
     let mut parts = flat.texels(dims);
     let hidden = Hidden::new(scene, number, &flat);
     hidden.take_off(dims, &mut parts);
+    // What lights the hidden part is no light of what is left of a texel.
+    let photons = photons.filter(|p| !hidden.holds([p.uvc[0], p.uvc[1]].map(f64::from)));
     let solid = Solid::new(scene, number, &flat);
     let open = solid.as_ref().and_then(|s| Open::new(s, dims, &settings.axis));
     // Where no solid stands, none holds photons.
     let solid = solid.filter(|_| open.is_some());
-    // What lights the hidden part is no light of what is left of a texel.
-    let photons = photons.filter(|p| !hidden.holds([p.uvc[0], p.uvc[1]].map(f64::from)));
-    let Landings { powers, counts } = Landings::new(&black, &parts, photons, solid.as_ref());
-    let outer = |i: usize| open.as_ref().is_none_or(|o| o.outer[i]);
-    let estimate = |i: usize, at: [f64; 2], shadow_rays: u32| {
-        let c = isovalues[i / parts.len()];
+    let isovalues = settings.axis.centres(dims[2]);
+    let raster = Raster { scene, tracer, number, flat: &flat, settings, rays, dims, isovalues, parts, open };
+    let binned = raster.binned(photons, solid.as_ref(), areas);
+    let known = raster.direct();
+    let within = raster.within(&known);
+    let direct = widened(&known, dims, &|i| raster.outer(i));
+    let shown = raster.light(&direct, within.as_ref(), &binned, &SHOWN, DVec3::ZERO);
+    // A texture to be averaged is not clamped at 0: that would brighten what few photons reach.
+    let gathered = raster.light(&direct, within.as_ref(), &binned, &GATHERED, DVec3::NEG_INFINITY);
+    Filled { gathered: Some(gathered), shown: Some(shown) }
+}
+
+/// A flat's texels: dims[0] × dims[1] parts of it at each of dims[2] isovalues. Texel i is part i mod their number.
+struct Raster<'a, T> {
+    scene: &'a Scene,
+    tracer: &'a T,
+    number: usize,
+    flat: &'a Flat,
+    settings: &'a CacheSettings,
+    rays: &'a AtomicU64,
+    dims: [usize; 3],
+    isovalues: Vec<f64>,
+    parts: Vec<Texel>,
+    /// Where solids leave it open; `None`: everywhere.
+    open: Option<Open>,
+}
+
+/// What walls hold within solids that stand on them.
+struct WithinSolids {
+    /// Direct irradiance.
+    direct: Vec<DVec3>,
+    /// Whether a texel, or one beside it, is so in part.
+    beside: Vec<bool>,
+}
+
+impl<T: Tracer> Raster<'_, T> {
+    fn part(&self, i: usize) -> Texel {
+        self.parts[i % self.parts.len()]
+    }
+
+    fn isovalue(&self, i: usize) -> f64 {
+        self.isovalues[i / self.parts.len()]
+    }
+
+    /// Texels outside of solids, at least in part, and those beside.
+    fn outer(&self, i: usize) -> bool {
+        self.open.as_ref().is_none_or(|o| o.outer[i])
+    }
+
+    /// The share of a texel that is outside of solids.
+    fn share(&self, i: usize) -> f64 {
+        self.open.as_ref().map_or(1.0, |o| o.shares[i])
+    }
+
+    /// The texel that stands for one.
+    fn source(&self, i: usize) -> usize {
+        i - i % self.parts.len() + self.part(i).source
+    }
+
+    /// Direct irradiance of texel `i` at `at`, by at most `shadow_rays` a luminaire.
+    fn estimate(&self, i: usize, at: [f64; 2], shadow_rays: u32) -> Estimate {
         #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
         let receiver = Receiver {
-            position: lattice.to_index(flat.at(at)).as_vec3(),
-            normal: flat.normal,
-            isovalue: c as f32,
-            departure: flat.departure,
+            position: self.scene.lattice().to_index(self.flat.at(at)).as_vec3(),
+            normal: self.flat.normal,
+            isovalue: self.isovalue(i) as f32,
+            departure: self.flat.departure,
         };
-        let key = Stage::Cache.key(settings.seed, !(((number as u64) << 40) | i as u64));
-        let direct = direct_irradiance(scene, tracer, &receiver, shadow_rays, key);
-        rays.fetch_add(direct.rays, Ordering::Relaxed);
+        let key = Stage::Cache.key(self.settings.seed, !(((self.number as u64) << 40) | i as u64));
+        let direct = direct_irradiance(self.scene, self.tracer, &receiver, shadow_rays, key);
+        self.rays.fetch_add(direct.rays, Ordering::Relaxed);
         direct
-    };
-    let [few, many] = [settings.flat_shadow_rays, PENUMBRA * settings.flat_shadow_rays.max(LEAST_FEW)];
-    let place = |i: usize| {
-        let part = parts[i % parts.len()];
-        match &open {
-            _ if part.covered == 0.0 => None,
+    }
+
+    /// Shadow rays of most texels, and of those that see a luminaire in part or stand beside such.
+    fn shadow_rays(&self) -> [u32; 2] {
+        let few = self.settings.flat_shadow_rays;
+        [few, PENUMBRA * few.max(LEAST_FEW)]
+    }
+
+    /// Direct irradiance of each texel, outside of solids where it is so in part; `None` where there is no place.
+    fn direct(&self) -> Vec<Option<DVec3>> {
+        let place = |i: usize| match &self.open {
+            _ if self.part(i).covered == 0.0 => None,
             Some(open) if open.outer[i] => open.place(i, true),
-            _ => Some(part.at),
-        }
-    };
-    let lit = direct_light(dims, |i, rays| Some(estimate(i, place(i)?, rays)), [few, many]);
-    let direct = widened(&lit, dims, &outer);
-    let texel = areas * flat.area() / (dims[0] * dims[1]) as f64;
-    let sizes: Vec<f64> = settings.axis.edges(dims[2]).windows(2).map(|c| texel * (c[1] - c[0])).collect();
-    let density = |(i, p): (usize, DVec3)| p / sizes[i / parts.len()];
-    let densities = powers.map(|power| power.into_iter().enumerate().map(density).collect::<Vec<DVec3>>());
-    // Of each texel, the outer part and that within solids.
-    let share = |i: usize| open.as_ref().map_or(1.0, |o| o.shares[i]);
-    let covered = |i: usize| parts[i % parts.len()].covered;
-    let outside: Vec<f64> = (0..direct.len()).map(|i| covered(i) * share(i)).collect();
-    let within: Vec<f64> = (0..direct.len()).map(|i| covered(i) * (1.0 - share(i))).collect();
-    let shares = [outside, within];
-    let indirect = |n: usize, kernel: &Kernel| {
-        let per_texel = counts[n] as f64 / shares[n].iter().sum::<f64>().max(1.0);
-        smooth_twice(&densities[n], &shares[n], dims, kernel.passes(per_texel))
-    };
-    // The texel that stands for one.
-    let source = |n: usize| n - n % parts.len() + parts[n % parts.len()].source;
-    let texture = |reflects: &dyn Fn(usize) -> DVec3| {
-        let texels = (0..direct.len()).map(|n| reflected(flat.albedo.at(isovalues[n / parts.len()]), reflects(n)));
-        FlatTexture { dims, axis: settings.axis, texels: texels.map(|l| l.as_vec3().to_array()).collect() }
-    };
-    // Direct light within solids that stand on walls, and whether texels show it.
-    let own = open.as_ref().filter(|_| number < scene.polygons().len()).map(|open| {
-        let solid = |i: usize| parts[i % parts.len()].covered > 0.0 && open.shares[i] < 1.0;
-        let own = (0..lit.len()).into_par_iter().with_min_len(256).map(|i| match solid(i) {
-            true if outer(i) => open.place(i, false).map(|at| {
-                let roughly = estimate(i, at, few);
-                if roughly.variance > 0.0 { estimate(i, at, many) } else { roughly }.mean
+            _ => Some(self.part(i).at),
+        };
+        direct_light(self.dims, |i, rays| Some(self.estimate(i, place(i)?, rays)), self.shadow_rays())
+    }
+
+    /// The same within the solids that stand on a wall; `None` if there are none.
+    fn within(&self, known: &[Option<DVec3>]) -> Option<WithinSolids> {
+        let open = self.open.as_ref().filter(|_| self.number < self.scene.polygons().len())?;
+        let [few, many] = self.shadow_rays();
+        let solid = |i: usize| self.part(i).covered > 0.0 && open.shares[i] < 1.0;
+        let own = (0..known.len()).into_par_iter().with_min_len(256).map(|i| match solid(i) {
+            true if self.outer(i) => open.place(i, false).map(|at| {
+                let roughly = self.estimate(i, at, few);
+                if roughly.variance > 0.0 { self.estimate(i, at, many) } else { roughly }.mean
             }),
-            true => lit[i],
+            true => known[i],
             false => None,
         });
-        let beside = |n: usize| neighbourhood(dims, source(n)).any(|mut run| run.any(solid));
-        let beside: Vec<bool> = (0..lit.len()).into_par_iter().with_min_len(256).map(beside).collect();
-        (widened(&own.collect::<Vec<_>>(), dims, &solid), beside)
-    });
-    let light = |kernel: &Kernel, least: DVec3| {
-        // Outside solids and within.
-        let smoothed = [Some(indirect(0, kernel)), (counts[1] > 0).then(|| indirect(1, kernel))];
-        let indirect =
-            |n: usize, within: bool| smoothed[usize::from(within)].as_ref().map_or(DVec3::ZERO, |i| i[source(n)]);
-        let outside = |n: usize| (direct[source(n)] + indirect(n, !outer(n))).max(least);
-        let within = own.as_ref().map_or(Within::Same, |(own, beside)| {
-            let light = |n: usize| (own[source(n)] + indirect(n, true)).max(least);
-            Within::Own(texture(&|n| if beside[n] { light(n) } else { outside(n) }))
+        let beside = |n: usize| neighbourhood(self.dims, self.source(n)).any(|mut run| run.any(solid));
+        let beside: Vec<bool> = (0..known.len()).into_par_iter().with_min_len(256).map(beside).collect();
+        Some(WithinSolids { direct: widened(&own.collect::<Vec<_>>(), self.dims, &solid), beside })
+    }
+
+    /// Later landings by texel, those outside of solids and those within, as irradiance on the part of it that is so.
+    fn binned(&self, photons: impl Iterator<Item = FlatPhoton>, solid: Option<&Solid>, areas: f64) -> [Binned; 2] {
+        let texels = self.isovalues.len() * self.parts.len();
+        let bins = FlatTexture { axis: self.settings.axis, ..FlatTexture::black(self.dims) };
+        let mut powers = [(); 2].map(|()| vec![DVec3::ZERO; texels]);
+        let mut counts = [0u64; 2];
+        for p in photons.filter(|p| p.bounces > 0) {
+            let [u, v, c] = p.uvc.map(f64::from);
+            let n = usize::from(solid.is_some_and(|s| !is_open(s.opening([u, v]), c)));
+            powers[n][self.source(bins.texel(p.uvc))] += p.power.as_dvec3();
+            counts[n] += 1;
+        }
+        let texel = areas * self.flat.area() / self.parts.len() as f64;
+        let edges = self.settings.axis.edges(self.dims[2]);
+        let sizes: Vec<f64> = edges.windows(2).map(|c| texel * (c[1] - c[0])).collect();
+        let mut within = [false, true].into_iter();
+        powers.map(|powers| {
+            let within = within.next().expect("two of them");
+            let density = |(i, p): (usize, DVec3)| p / sizes[i / self.parts.len()];
+            let share = |i: usize| if within { 1.0 - self.share(i) } else { self.share(i) };
+            Binned {
+                densities: powers.into_iter().enumerate().map(density).collect(),
+                shares: (0..texels).map(|i| self.part(i).covered * share(i)).collect(),
+                count: counts[usize::from(within)],
+            }
+        })
+    }
+
+    /// Radiance of all texels, at `least` in each channel before it is reflected.
+    fn light(
+        &self,
+        direct: &[DVec3],
+        own: Option<&WithinSolids>,
+        [outside, within]: &[Binned; 2],
+        width: &Width,
+        least: DVec3,
+    ) -> FlatLight {
+        let outside = outside.smoothed(self.dims, width);
+        let within = (within.count > 0).then(|| within.smoothed(self.dims, width));
+        let of_solids = |i: usize| within.as_ref().map_or(DVec3::ZERO, |w| w[self.source(i)]);
+        let shown = |i: usize| {
+            let indirect = if self.outer(i) { outside[self.source(i)] } else { of_solids(i) };
+            (direct[self.source(i)] + indirect).max(least)
+        };
+        let within = own.map_or(Within::Same, |own| {
+            let light = |i: usize| (own.direct[self.source(i)] + of_solids(i)).max(least);
+            Within::Own(self.texture(&|i| if own.beside[i] { light(i) } else { shown(i) }))
         });
-        Some(FlatLight { outside: texture(&outside), within })
-    };
-    let shown = light(&SHOWN, DVec3::ZERO);
-    // A texture to be averaged is not clamped at 0: that would brighten what few photons reach.
-    Filled { gathered: light(&GATHERED, DVec3::NEG_INFINITY), shown }
+        FlatLight { outside: self.texture(&shown), within }
+    }
+
+    /// What texels reflect of an irradiance.
+    fn texture(&self, irradiance: &dyn Fn(usize) -> DVec3) -> FlatTexture {
+        let all = 0..self.isovalues.len() * self.parts.len();
+        let texels = all.map(|i| reflected(self.flat.albedo.at(self.isovalue(i)), irradiance(i)));
+        let texels = texels.map(|l| l.as_vec3().to_array()).collect();
+        FlatTexture { dims: self.dims, axis: self.settings.axis, texels }
+    }
 }
 
 /// Direct irradiance of the texels that `estimate` knows, by `few` shadow rays, and by `many` beside those that see a
@@ -183,71 +270,6 @@ impl<'a> ByFlat<'a> {
     }
 }
 
-/// Photons on a flat that were reflected before: those outside solids, and those within.
-struct Landings {
-    /// Power per texel.
-    powers: [Vec<DVec3>; 2],
-    /// How many they are.
-    counts: [u64; 2],
-}
-
-impl Landings {
-    fn new(
-        bins: &FlatTexture,
-        parts: &[Texel],
-        photons: impl Iterator<Item = FlatPhoton>,
-        solid: Option<&Solid>,
-    ) -> Self {
-        let mut all = Self { powers: [(); 2].map(|()| vec![DVec3::ZERO; bins.texels.len()]), counts: [0; 2] };
-        for p in photons.filter(|p| p.bounces > 0) {
-            let texel = bins.texel(p.uvc);
-            let isovalue = texel / parts.len();
-            let [u, v, c] = p.uvc.map(f64::from);
-            let n = usize::from(solid.is_some_and(|s| !is_open(s.opening([u, v]), c)));
-            all.powers[n][isovalue * parts.len() + parts[texel % parts.len()].source] += p.power.as_dvec3();
-            all.counts[n] += 1;
-        }
-        all
-    }
-}
-
-/// How far photons on a flat are smoothed: a kernel that shrinks as they grow in number.
-struct Kernel {
-    /// Photons that it should hold.
-    photons: f64,
-    /// Most passes of ¼ ½ ¼ along u and v; c gets half of them, since there are fewer texels along it.
-    most: f64,
-}
-
-const GATHERED: Kernel = Kernel { photons: 300.0, most: 2.0 };
-const SHOWN: Kernel = Kernel { photons: 2000.0, most: 16.0 };
-
-impl Kernel {
-    /// Passes of ¼ ½ ¼ along u, v and c for so many photons per texel: the kernel is (2√π σ)³ texels worth, with σ² of
-    /// half the passes.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
-    fn passes(&self, photons_per_texel: f64) -> [usize; 3] {
-        let texels = self.photons / photons_per_texel.max(1e-9);
-        let sigma = (texels * 2f64.sqrt()).cbrt() / (2.0 * std::f64::consts::PI.sqrt());
-        let along = (2.0 * sigma * sigma).clamp(1.0, self.most);
-        let n = |x: f64| x.round().max(1.0) as usize;
-        [n(along), n(along), n(0.5 * along)]
-    }
-}
-
-/// What `image` holds per `share`, smoothed by a 2D kernel × a 1D kernel in c that keep flux, twice: what the first
-/// smoothing took away is smoothed and put back, so that the bias left is of fourth order in their width \[Tukey77\].
-/// Texels of which there is little are so spoken for by those around them.
-fn smooth_twice(image: &[DVec3], shares: &[f64], dims: [usize; 3], passes: [usize; 3]) -> Vec<DVec3> {
-    let area = smooth(shares.iter().map(|&s| DVec3::splat(s)).collect(), dims, passes);
-    let mean = |image: Vec<DVec3>| -> Vec<DVec3> {
-        smooth(image, dims, passes).iter().zip(&area).map(|(i, a)| *i / a.x.max(1e-9)).collect()
-    };
-    let once = mean(image.to_vec());
-    let lost = mean((0..image.len()).map(|n| image[n] - once[n] * shares[n]).collect());
-    once.iter().zip(&lost).map(|(s, l)| *s + *l).collect()
-}
-
 /// Unknown texels become the mean of the `outer` ones around them that are known, or black.
 fn widened(image: &[Option<DVec3>], dims: [usize; 3], outer: &(dyn Fn(usize) -> bool + Sync)) -> Vec<DVec3> {
     let mean = |i: usize| {
@@ -258,31 +280,6 @@ fn widened(image: &[Option<DVec3>], dims: [usize; 3], outer: &(dyn Fn(usize) -> 
         if count > 0.0 { sum / count } else { DVec3::ZERO }
     };
     (0..image.len()).into_par_iter().with_min_len(1024).map(|i| image[i].unwrap_or_else(|| mean(i))).collect()
-}
-
-/// Passes of ¼ ½ ¼ along each axis, to and fro between two images: where they are large, new memory for each takes as
-/// long as the pass.
-fn smooth(mut image: Vec<DVec3>, dims: [usize; 3], passes: [usize; 3]) -> Vec<DVec3> {
-    let mut next = vec![DVec3::ZERO; image.len()];
-    for (axis, &count) in passes.iter().enumerate() {
-        for _ in 0..count {
-            smooth_along(&image, &mut next, dims, axis);
-            std::mem::swap(&mut image, &mut next);
-        }
-    }
-    image
-}
-
-/// ¼ ½ ¼ along one axis into `out`, the missing quarter folded back at the ends (flux is kept).
-fn smooth_along(image: &[DVec3], out: &mut [DVec3], dims: [usize; 3], axis: usize) {
-    let stride = [1, dims[0], dims[0] * dims[1]][axis];
-    let n = dims[axis];
-    out.par_iter_mut().enumerate().with_min_len(4096).for_each(|(i, out)| {
-        let at = i / stride % n;
-        let before = if at > 0 { image[i - stride] } else { image[i] };
-        let after = if at + 1 < n { image[i + stride] } else { image[i] };
-        *out = 0.25 * before + 0.5 * image[i] + 0.25 * after;
-    });
 }
 
 #[cfg(test)]

@@ -57,8 +57,7 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
         let scene = self.scene;
         let x = scene.lattice().to_world(receiver.position.as_dvec3());
         let mut total = DVec3::ZERO;
-        for (n, &l) in scene.luminaires().iter().enumerate() {
-            let light = &scene.polygons()[l as usize];
+        for (l, light) in (0..).zip(scene.luminaires()) {
             if light.is_left(l, receiver.departure) {
                 continue;
             }
@@ -66,7 +65,7 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
             if open == 0.0 {
                 continue;
             }
-            let index = key.index * scene.luminaires().len() as u64 + n as u64;
+            let index = key.index * scene.luminaires().len() as u64 + u64::from(l);
             let set = |index| Stage::Direct.key(key.seed, index).set();
             let aim = Aim::new(light, x, receiver.normal);
             let mut shares = |set: Sobol, count: u32| -> (f64, f64) {

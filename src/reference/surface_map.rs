@@ -98,7 +98,7 @@ impl MappedSurface {
             let [na, nb, nc] = t.map(|v| mesh.normals[v as usize]);
             #[allow(clippy::cast_possible_truncation, reason = "areas are f32")]
             let area = ((b - a).cross(c - a).length() / (2 * CUTS * CUTS) as f64) as f32;
-            let outside = if scene.surface.outside == Side::Lower { 1.0 } else { -1.0 };
+            let outside = scene.surface.outside.facing(1.0);
             for i in 0..CUTS {
                 for j in 0..CUTS - i {
                     let mut push = |u: f64, v: f64| {
@@ -151,7 +151,7 @@ impl SurfaceMap {
         let set = Sobol::set(0, Stage::Footprint, 1 << 20);
         #[allow(clippy::cast_possible_truncation, reason = "64 points")]
         let disk = (0..DISK as u32).map(|i| warp::disk(set.point2(i, 0))).collect();
-        let diagonal = (lattice.axes() * lattice.far()).length();
+        let diagonal = lattice.diagonal();
         #[allow(clippy::cast_possible_truncation, reason = "distances are f32")]
         let radius = (settings.max_radius * diagonal) as f32;
         Self { settings, isovalue, origin, radius, surfaces, walls, disk }
@@ -278,6 +278,5 @@ impl SurfaceMap {
 
 /// The normal towards the lower side at a receiver on `side`.
 fn lower_normal(at: &Receiver, side: Side) -> Vec3 {
-    let n = at.normal.as_vec3();
-    if side == Side::Lower { n } else { -n }
+    side.facing(at.normal.as_vec3())
 }

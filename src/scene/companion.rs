@@ -80,7 +80,7 @@ impl Companion {
     #[inline]
     pub fn normal(&self, p: DVec3, side: Side) -> Option<DVec3> {
         let n = self.member.field.falling_normal(self.to_index(p))?;
-        Some(if side == Side::Lower { n } else { -n })
+        Some(side.facing(n))
     }
 
     /// The ray in its index space, as its own scene would trace it.
@@ -126,13 +126,8 @@ impl Companion {
 
     /// The corners of its Ω in the scene's local frame.
     pub fn corners(&self) -> [DVec3; 8] {
-        corners(self.member.field.lattice()).map(|p| self.to_local(p))
+        self.member.field.lattice().corners().map(|p| self.to_local(p))
     }
-}
-
-/// The corners of Ω in index space.
-fn corners(lattice: &Lattice) -> [DVec3; 8] {
-    std::array::from_fn(|n| lattice.far() * DVec3::new((n & 1) as f64, (n >> 1 & 1) as f64, (n >> 2) as f64))
 }
 
 /// The map from index space of `own` to that of `other`. What is an integer but for rounding becomes one, so that

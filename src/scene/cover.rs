@@ -38,15 +38,13 @@ impl Scene {
 
     /// The luminaires that cover a part of polygon `wall`.
     pub fn covering(&self, wall: u32) -> impl Iterator<Item = &Polygon> {
-        let covers = move |l: &&u32| self.covered_wall(**l) == Some(wall);
-        self.luminaires().iter().filter(covers).map(|&l| &self.polygons()[l as usize])
+        (0..).zip(self.luminaires()).filter(move |(l, _)| self.covered_wall(*l) == Some(wall)).map(|(_, light)| light)
     }
 
     /// Whether world point `x` lies between a luminaire and the wall that it covers, where no light gets.
     #[inline]
     pub fn covers(&self, x: DVec3) -> bool {
-        self.luminaires().iter().any(|&l| {
-            let light = &self.polygons()[l as usize];
+        (0..).zip(self.luminaires()).any(|(l, light)| {
             let depth = (light.vertices()[0] - x).dot(light.normal());
             // Most places are far in front of every luminaire.
             depth >= 0.0

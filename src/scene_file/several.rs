@@ -255,8 +255,7 @@ pub(super) fn load(
 fn enclosing(first: &Lattice, all: &[Lattice]) -> Result<Lattice> {
     let (mut lo, mut hi) = (DVec3::ZERO, first.far());
     for lattice in all {
-        for n in 0..8 {
-            let corner = DVec3::new((n & 1) as f64, (n >> 1 & 1) as f64, (n >> 2) as f64) * lattice.far();
+        for corner in lattice.corners() {
             let p = first.to_index(lattice.to_world(corner));
             (lo, hi) = (lo.min(p), hi.max(p));
         }

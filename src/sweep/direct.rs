@@ -48,17 +48,15 @@ pub(super) fn direct(
     let unit = lattice.unit();
     let mut planes: Vec<Planes> = sides.iter().map(|_| spare.black(geometry.places())).collect();
     let [nx, ny, _] = geometry.dims;
-    let corners: Vec<DVec3> = (0..8)
-        .map(|c| lattice.to_world(lattice.far() * DVec3::from_array([c & 1, c >> 1 & 1, c >> 2].map(f64::from))))
-        .collect();
+    let corners = lattice.corners().map(|p| lattice.to_world(p));
     // 0 gives no light to a side that nobody asks for.
     let wanted: [f32; 2] = [Side::Lower, Side::Higher].map(|s| match s {
         s if !sides.contains(&s) => 0.0,
         _ => 1.0,
     });
-    let shares: Vec<OpenShare> = scene.luminaires().iter().map(|&number| part.open_share(scene, number)).collect();
-    for (&number, open) in scene.luminaires().iter().zip(&shares) {
-        let light = &scene.polygons()[number as usize];
+    let shares: Vec<OpenShare> =
+        (0..).zip(scene.luminaires()).map(|(number, _)| part.open_share(scene, number)).collect();
+    for ((number, light), open) in (0..).zip(scene.luminaires()).zip(&shares) {
         let points = part.on(light, number);
         let blockers = Blockers::new(scene, number, &corners);
         // Σ V g and Σ g of every side at every place of planes, whatever factor all g of one have.
@@ -128,7 +126,7 @@ pub(super) fn direct(
                     let [seen, all] = sums[(run.start + place) * per + s];
                     if seen > 0.0 {
                         let normal = geometry.normal(at).expect("only nodes with a normal were lit");
-                        let normal = if *side == Side::Lower { normal } else { -normal };
+                        let normal = side.facing(normal);
                         let e = unoccluded(light, lattice.to_world(DVec3::new(i as f64, y, z)), normal);
                         let e = (light.emission * (e * f64::from((seen / all).min(1.0)))).as_vec3();
                         (r[place], g[place], b[place]) = (r[place] + e.x, g[place] + e.y, b[place] + e.z);
@@ -137,7 +135,7 @@ pub(super) fn direct(
             });
         }
     }
-    for (&number, open) in scene.luminaires().iter().zip(&shares) {
+    for (number, open) in (0..).zip(&shares) {
         walls((scene, geometry, clearance, isa), flats, sides, number, (part, open));
     }
     (planes, true)

@@ -55,7 +55,7 @@ pub(super) fn look(
             let (h, place) = (geometry.h[at], (i - first) * per);
             for (s, &side) in sides.iter().enumerate() {
                 looks.sums[place + s] = [0.0; 2];
-                let normal = if side == Side::Lower { normal } else { -normal };
+                let normal = side.facing(normal);
                 let open = unoccluded(light, world, normal);
                 let Some(aim) = (if open > 0.0 { Aim::best(light, world, normal, open) } else { None }) else {
                     continue;

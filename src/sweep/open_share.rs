@@ -64,8 +64,7 @@ pub(super) fn open_over_sweep(scene: &Scene, side: Side) -> f64 {
     let count = u32::try_from(scene.luminaires().len()).unwrap_or(u32::MAX);
     let each = (16 * ROUGHLY / count.max(1)).clamp(8, ROUGHLY);
     let (mut all, mut closed) = (0.0, 0.0);
-    for &number in scene.luminaires() {
-        let light = &scene.polygons()[number as usize];
+    for light in scene.luminaires() {
         let flux = light.area() * luminance(light.emission);
         all += flux;
         let corners = || light.vertices().iter().map(|&x| scene.lattice().to_index(x));

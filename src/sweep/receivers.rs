@@ -314,7 +314,7 @@ mod tests {
         let both = [Side::Lower, Side::Higher];
         let mut fans = Fans::default();
         fans.march((&geometry, Isa::PLAIN, &both), DVec3::new(21.3, 12.7, 6.2), [f32::NEG_INFINITY, f32::INFINITY]);
-        let blockers = Blockers::new(&scene, scene.luminaires()[0], &[]);
+        let blockers = Blockers::new(&scene, 0, &[]);
         assert!(blockers.none());
         let receive = |isa: Isa, wanted: [f32; 2], place: [usize; 2]| {
             let per = 1 + place[1];
@@ -322,7 +322,7 @@ mod tests {
             let mut sums = vec![[0.5f32; 2]; per * lit.len()];
             let emitter = Emitter {
                 fans: &fans,
-                number: scene.luminaires()[0],
+                number: 0,
                 blockers: &blockers,
                 facing: [0.1, -0.9, 0.2],
                 step: [0.2, 0.01, 0.0],

@@ -19,8 +19,7 @@ impl Slits {
         let stands = |inside| Standing { place: place(inside), covers: None };
         let mut standing: Vec<Standing> = ends::inside(scene).into_iter().map(stands).collect();
         let mut hidden = Vec::new();
-        for &number in scene.luminaires() {
-            let standing = &mut standing[number as usize];
+        for ((number, standing), _) in (0..).zip(&mut standing).zip(scene.luminaires()) {
             let nodes = hidden_by(scene, number);
             standing.covers = scene.covered_wall(number);
             if standing.place == Place::Inside && !nodes.is_empty() {
@@ -88,7 +87,7 @@ mod tests {
             let volume = Volume::new("x", lattice.clone(), samples).unwrap();
             let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
             let scene = Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap();
-            let hidden = hidden_by(&scene, scene.luminaires()[0]);
+            let hidden = hidden_by(&scene, 0);
             assert!((15 * 15..=17 * 17).contains(&hidden.len()), "{}", hidden.len());
             for (node, front) in hidden {
                 let ([i, j, k], [x, y, z]) = (lattice.ijk(node), lattice.ijk(front));

@@ -10,7 +10,7 @@ use isolume::gather::{KnownLight, gathered_irradiance};
 use isolume::landing::MOST_LANDINGS;
 use isolume::mask::Mask;
 use isolume::polygon::Polygon;
-use isolume::reference::{PathTracer, receiver};
+use isolume::reference::PathTracer;
 use isolume::rng::{Rng, Stage};
 use isolume::scene::{Scene, Surface};
 use std::f64::consts::PI;
@@ -57,7 +57,8 @@ fn nothing_passes_through_a_luminaire_that_reflects() {
                 };
                 see(0, grid.radiance[o].map(f64::from));
                 if by_paths {
-                    let receiver = receiver(&scene, scene.lattice().to_index(x), scene.field.samples()[o], *side);
+                    let receiver =
+                        Receiver::on_level_set(&scene, scene.lattice().to_index(x), scene.field.samples()[o], *side);
                     let paths =
                         PathTracer::new(&scene, &tracer).outgoing(&receiver.unwrap(), 16, Stage::Path.key(1, o as u64));
                     see(1, paths.to_array());
@@ -157,7 +158,7 @@ fn paths_among_white_surfaces_end() {
     let scene = scene(cavity, white, Vec::new());
     let device = Device::new(0).unwrap();
     let tracer = GraphTracer::new(&device, &scene).unwrap();
-    let receiver = receiver(
+    let receiver = Receiver::on_level_set(
         &scene,
         DVec3::new(20.0, 12.0, 12.0),
         scene.field.value(DVec3::new(20.0, 12.0, 12.0)) as f32,

@@ -2,6 +2,7 @@
 
 use glam::{DVec3, Vec3};
 use isolume::bake::{Bake, BakeOptions, BakeSettings, Engine, StrategyName, bake};
+use isolume::direct::Receiver;
 use isolume::embree::{Device, GraphTracer};
 use isolume::field::{Field, Sweep};
 use isolume::flattened::Side;
@@ -10,7 +11,7 @@ use isolume::mask::Mask;
 use isolume::photon::{PhotonSettings, Photons, trace_photons};
 use isolume::polygon::Polygon;
 use isolume::progress::Progress;
-use isolume::reference::{PathTracer, receiver};
+use isolume::reference::PathTracer;
 use isolume::rng::Stage;
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
 use isolume::stats::{Moments, normal_quantile, sidak};
@@ -194,7 +195,7 @@ pub(crate) fn against_paths(scene: &Scene, side: Side, radiance: &[[f32; 3]], po
         .par_iter()
         .map(|&o| {
             let place = DVec3::from_array(scene.lattice().ijk(o).map(|i| i as f64));
-            let receiver = receiver(scene, place, scene.field.samples()[o], side).unwrap();
+            let receiver = Receiver::on_level_set(scene, place, scene.field.samples()[o], side).unwrap();
             let exact = PathTracer::new(scene, &tracer).outgoing(&receiver, 512, Stage::Path.key(5, o as u64));
             [f64::from(radiance[o][1]), exact.y]
         })

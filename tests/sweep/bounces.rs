@@ -2,11 +2,12 @@
 
 use super::{bumps, emissive_box, nodes, rms, run};
 use glam::DVec3;
+use isolume::direct::Receiver;
 use isolume::embree::{Device, GraphTracer};
 use isolume::field::{Field, Sweep};
 use isolume::flattened::Side;
 use isolume::polygon::Polygon;
-use isolume::reference::{PathTracer, receiver};
+use isolume::reference::PathTracer;
 use isolume::rng::{Rng, Stage};
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
 use isolume::sweep::SweepSettings;
@@ -107,7 +108,7 @@ fn bright_rooms_are_as_bright_as_they_should_be() {
     let some: Vec<usize> = nodes(&scene, 2).into_iter().step_by(31).collect();
     let paths = |o: usize| {
         let place = DVec3::from_array(scene.lattice().ijk(o).map(|x| x as f64));
-        let receiver = receiver(&scene, place, scene.field.samples()[o], Side::Lower).unwrap();
+        let receiver = Receiver::on_level_set(&scene, place, scene.field.samples()[o], Side::Lower).unwrap();
         PathTracer::new(&scene, &tracer).outgoing(&receiver, 1024, Stage::Path.key(5, o as u64)).y
     };
     let exact: f64 = some.par_iter().map(|&o| paths(o)).collect::<Vec<_>>().iter().sum();
