@@ -3,9 +3,10 @@
 
 use crate::flattened::{Departure, Side};
 use crate::isovalue_axis::IsovalueAxis;
+use crate::polygon::clip;
 use crate::reflectance::Reflectance;
 use crate::scene::{Boundary, Scene};
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
 /// A flat's place and material in the world.
@@ -128,9 +129,9 @@ impl Flat {
                 let centre = [(i + 0.5) / nu as f64, (j + 0.5) / nv as f64];
                 let Some(outline) = &self.outline else { return Texel { covered: 1.0, at: centre, source } };
                 // In units of texels, from this one's corner.
-                let part = outline.iter().map(|&[u, v]| [u * nu as f64 - i, v * nv as f64 - j]).collect();
-                let (covered, [x, y]) = area_and_centroid(&clipped(part));
-                Texel { covered, at: [(i + x) / nu as f64, (j + y) / nv as f64], source }
+                let part = outline.iter().map(|&[u, v]| DVec2::new(u * nu as f64 - i, v * nv as f64 - j)).collect();
+                let (covered, middle) = area_and_centroid(&clipped(part));
+                Texel { covered, at: [(i + middle.x) / nu as f64, (j + middle.y) / nv as f64], source }
             })
             .collect();
         // Slivers see too little to speak for themselves.
@@ -152,22 +153,11 @@ fn longest(edges: [DVec3; 2]) -> f64 {
     edges[0].length().max(edges[1].length())
 }
 
-/// The part of a convex polygon in the unit square. \[Sutherland74\]
-fn clipped(mut points: Vec<[f64; 2]>) -> Vec<[f64; 2]> {
+/// The part of a convex polygon in the unit square.
+fn clipped(mut points: Vec<DVec2>) -> Vec<DVec2> {
     for (a, sign, edge) in [(0, 1.0, 0.0), (0, -1.0, -1.0), (1, 1.0, 0.0), (1, -1.0, -1.0)] {
-        let height = |p: [f64; 2]| sign * p[a] - edge;
         let mut kept = Vec::with_capacity(points.len() + 1);
-        for (n, &p) in points.iter().enumerate() {
-            let q = points[(n + 1) % points.len()];
-            let (hp, hq) = (height(p), height(q));
-            if hp >= 0.0 {
-                kept.push(p);
-            }
-            if (hp >= 0.0) != (hq >= 0.0) {
-                let t = hp / (hp - hq);
-                kept.push([p[0] + t * (q[0] - p[0]), p[1] + t * (q[1] - p[1])]);
-            }
-        }
+        clip(points.len(), |n| points[n], |p| sign * p[a] - edge, |p| kept.push(p));
         points = kept;
     }
     points
@@ -217,15 +207,15 @@ fn nearest(counting: &[bool], nu: usize) -> Vec<Option<usize>> {
 }
 
 /// Area and centroid of a convex polygon; the middle of the unit square if it has none.
-fn area_and_centroid(points: &[[f64; 2]]) -> (f64, [f64; 2]) {
-    let (mut area, mut sum) = (0.0, [0.0; 2]);
+fn area_and_centroid(points: &[DVec2]) -> (f64, DVec2) {
+    let (mut area, mut sum) = (0.0, DVec2::ZERO);
     for w in points.windows(2).skip(1) {
         let [o, p, q] = [points[0], w[0], w[1]];
-        let a = 0.5 * ((p[0] - o[0]) * (q[1] - o[1]) - (p[1] - o[1]) * (q[0] - o[0])).abs();
+        let a = 0.5 * (p - o).perp_dot(q - o).abs();
         area += a;
-        (0..2).for_each(|x| sum[x] += a * (o[x] + p[x] + q[x]) / 3.0);
+        sum += a * (o + p + q) / 3.0;
     }
-    if area > 0.0 { (area, sum.map(|x| x / area)) } else { (0.0, [0.5; 2]) }
+    if area > 0.0 { (area, sum / area) } else { (0.0, DVec2::splat(0.5)) }
 }
 
 /// The number of the flat that is a cap on this face of Ω ([`crate::flattened::face_of`]).

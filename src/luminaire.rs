@@ -4,7 +4,7 @@ mod solid_angle;
 
 pub use solid_angle::Aim;
 
-use crate::polygon::Polygon;
+use crate::polygon::{Polygon, clip};
 use glam::DVec3;
 
 /// Irradiance per unit radiance at `x` with unit normal `n` from a polygon that faces x: Lambert's formula
@@ -14,27 +14,18 @@ pub fn unoccluded(polygon: &Polygon, x: DVec3, n: DVec3) -> f64 {
     if (x - polygon.vertices()[0]).dot(polygon.normal()) <= 0.0 {
         return 0.0;
     }
-    // Sutherland–Hodgman against the horizon, edges summed as the clipped vertices come.
+    // Edges are summed as the clipped vertices come.
     let v = polygon.vertices();
     let mut sum = 0.0;
     let (mut first, mut last): (Option<DVec3>, Option<DVec3>) = (None, None);
-    let mut take = |p: DVec3| {
+    let take = |p: DVec3| {
         if let Some(a) = last {
             sum += edge_term(a, p, n);
         }
         first = first.or(Some(p));
         last = Some(p);
     };
-    for (i, &p) in v.iter().enumerate() {
-        let (a, b) = (p - x, v[(i + 1) % v.len()] - x);
-        let (ha, hb) = (a.dot(n), b.dot(n));
-        if ha >= 0.0 {
-            take(a);
-        }
-        if (ha >= 0.0) != (hb >= 0.0) {
-            take(a + (b - a) * (ha / (ha - hb)));
-        }
-    }
+    clip(v.len(), |i| v[i] - x, |p| p.dot(n), take);
     if let (Some(a), Some(b)) = (last, first) {
         sum += edge_term(a, b, n);
     }
@@ -51,16 +42,7 @@ fn above_horizon(polygon: &Polygon, x: DVec3, n: DVec3) -> Option<Vec<DVec3>> {
         return None;
     }
     let mut part = Vec::with_capacity(v.len() + 1);
-    for (i, &a) in v.iter().enumerate() {
-        let b = v[(i + 1) % v.len()];
-        let (ha, hb) = (height(a), height(b));
-        if ha >= 0.0 {
-            part.push(a);
-        }
-        if (ha >= 0.0) != (hb >= 0.0) {
-            part.push(a + (b - a) * (ha / (ha - hb)));
-        }
-    }
+    clip(v.len(), |i| v[i], height, |p| part.push(p));
     Some(part)
 }
 

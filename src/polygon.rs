@@ -6,6 +6,7 @@ use crate::error::{Error, Result};
 use crate::flattened::{Departure, Ends, FlattenedRay};
 use crate::volume::Lattice;
 use glam::{DVec2, DVec3};
+use std::ops::{Add, Mul, Sub};
 
 /// A planar convex polygon in world coordinates, counter-clockwise seen from its front.
 ///
@@ -267,6 +268,25 @@ pub struct LocalPolygon {
     other_face: i32,
 }
 
+/// The corners, in order, of the part of a convex polygon of `count` corners where `height`, which is linear, is not
+/// negative. \[Sutherland74\]
+#[inline]
+pub(crate) fn clip<P>(count: usize, corner: impl Fn(usize) -> P, height: impl Fn(P) -> f64, mut take: impl FnMut(P))
+where
+    P: Copy + Add<Output = P> + Sub<Output = P> + Mul<f64, Output = P>,
+{
+    for i in 0..count {
+        let (a, b) = (corner(i), corner((i + 1) % count));
+        let (ha, hb) = (height(a), height(b));
+        if ha >= 0.0 {
+            take(a);
+        }
+        if (ha >= 0.0) != (hb >= 0.0) {
+            take(a + (b - a) * (ha / (ha - hb)));
+        }
+    }
+}
+
 /// Whether `departure` is polygon `id`, or its other face.
 #[inline]
 fn departs(departure: Departure, id: u32, other_face: i32) -> bool {
@@ -461,7 +481,7 @@ mod tests {
         assert_eq!(wall.meet(0, &behind), None, "seen from the front only");
         let light = FlattenedRay { with_light: true, ..behind };
         let t = wall.meet(0, &light).expect("light from behind is stopped");
-        assert!((2.0..2.0001).contains(&t), "after a front in the same plane: {t}");
+        assert!(t > 2.0 && t < 2.0001, "after a front in the same plane: {t}");
         let on = FlattenedRay { origin: local(1.5, 0.5, 3.0), ..light };
         assert_eq!(wall.meet(0, &on), None, "what begins on a wall is before it");
         let faces = square().both_faces().map(|p| LocalPolygon::new(&p, &lattice));
