@@ -80,7 +80,8 @@ pub struct FlattenedRay {
     /// The polygon the ray ends on, which must not block it.
     pub target: Option<u32>,
     /// Whether light runs along it, as from a luminaire, instead of against it, as to an eye. What has one face only
-    /// stops light that comes from behind, which whoever sees that face does not see.
+    /// stops light that comes from behind, which whoever sees that face does not see. (In three dimensions: flatland's
+    /// walls stand around all.)
     pub with_light: bool,
 }
 

@@ -265,6 +265,8 @@ pub struct LocalPolygon {
     lo: DVec3,
     hi: DVec3,
     opaque_back: bool,
+    /// Whether it lies in a face of Ω with its front away from Ω.
+    looks_away: bool,
     other_face: i32,
 }
 
@@ -322,7 +324,12 @@ impl LocalPolygon {
         let reach = lo.abs().max(hi.abs()).max_element().max(1.0);
         let slack = 8.0 * f64::from(f32::EPSILON) * reach;
         let Polygon { opaque_back, other_face, .. } = *polygon;
-        Self { normal, offset: normal.dot(v[0]), stretch, slack, edges, lo, hi, opaque_back, other_face }
+        let far = lattice.far();
+        let looks_away = (0..3).any(|a| {
+            let lies_in = |plane: f64| lo[a].min(hi[a]) >= plane - slack && lo[a].max(hi[a]) <= plane + slack;
+            (lies_in(0.0) && normal[a] < 0.0) || (lies_in(far[a]) && normal[a] > 0.0)
+        });
+        Self { normal, offset: normal.dot(v[0]), stretch, slack, edges, lo, hi, opaque_back, looks_away, other_face }
     }
 
     /// Bounds in the local frame.
@@ -333,11 +340,13 @@ impl LocalPolygon {
     /// t at which `ray` meets polygon number `id` (this one) with 0 ≤ t ≤ `reach`. Fronts only, unless the back is
     /// opaque, or stops light that comes from well behind it. A ray that departs from it or its other face, or ends on
     /// it, does not meet it; one that starts on the plane (within the rounding of f32 coordinates) and goes into it
-    /// meets it at 0.
+    /// meets it at 0, unless it lies in a face of Ω and looks away from Ω, where all is that starts there.
     #[inline]
     pub fn intersect(&self, id: u32, ends: Ends, o: DVec3, d: DVec3, reach: f64) -> Option<f64> {
         let slope = self.normal.dot(d);
         let dark_back = slope > 0.0 && !self.opaque_back;
+        // How far before it a ray starts at least.
+        let least = if dark_back || (slope < 0.0 && self.looks_away) { self.slack } else { -self.slack };
         if slope == 0.0 || (dark_back && !(ends.with_light && self.other_face == 0)) || ends.target == Some(id) {
             return None;
         }
@@ -346,19 +355,14 @@ impl LocalPolygon {
         }
         let height = self.normal.dot(o) - self.offset;
         let before = if slope < 0.0 { height } else { -height };
-        if before < if dark_back { self.slack } else { -self.slack } {
+        if before < least {
             return None;
         }
-        let mut t = (before / slope.abs()).max(0.0);
-        if dark_back {
-            // A front in the same plane counts first.
-            t += (self.slack / slope).max(1e-6 * t);
-        }
-        if !(t <= reach) {
-            return None;
-        }
+        let t = (before / slope.abs()).max(0.0);
         let p = o + t * d;
-        self.edges.iter().all(|&(e, offset)| e.dot(p) >= offset).then_some(t)
+        // A front in the same plane as a back counts first.
+        let t = if dark_back { t + (self.slack / slope).max(1e-6 * t) } else { t };
+        (t <= reach && self.edges.iter().all(|&(e, offset)| e.dot(p) >= offset)).then_some(t)
     }
 
     /// If a ray from `o` along `d` that meets this polygon starts on its plane, within the rounding of f32 coordinates:
@@ -453,7 +457,7 @@ mod tests {
 
     #[test]
     fn two_faces_see_both_sides_and_not_each_other() {
-        let lattice = Lattice::aligned([4, 4, 4], DVec3::ZERO, DVec3::ONE).unwrap();
+        let lattice = Lattice::aligned([4, 4, 8], DVec3::ZERO, DVec3::ONE).unwrap();
         let faces = square().both_faces();
         assert_eq!(faces[1].normal(), -DVec3::Z);
         let local = faces.each_ref().map(|p| LocalPolygon::new(p, &lattice));

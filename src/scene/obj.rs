@@ -7,7 +7,7 @@ use crate::files;
 use crate::polygon::Polygon;
 use glam::{DQuat, DVec3, EulerRot};
 use std::cell::RefCell;
-use std::io::{BufRead, BufReader};
+use std::io::Read;
 use std::path::Path;
 
 /// Reads all faces as polygons, in file order; vertices counter-clockwise from the visible side. A face without a
@@ -113,7 +113,7 @@ fn faces(path: &Path, must_exist: bool) -> Result<Vec<Face>> {
             Err(tobj::LoadError::MaterialParseError)
         }
     };
-    let loaded = tobj::load_obj_buf(&mut BufReader::new(files::open(path)?), &options, library);
+    let loaded = tobj::load_obj_buf(&mut text(path)?.as_bytes(), &options, library);
     if let Some(e) = fault.into_inner() {
         return Err(e);
     }
@@ -148,19 +148,40 @@ fn faces(path: &Path, must_exist: bool) -> Result<Vec<Face>> {
     Ok(faces)
 }
 
+/// The text of an OBJ file as tobj takes it: statements of materials and their libraries without indentation, with one
+/// space, and libraries first, since tobj knows none that comes after its use.
+fn text(path: &Path) -> Result<String> {
+    let mut bytes = Vec::new();
+    files::open(path)?.read_to_end(&mut bytes).map_err(|e| Error::io(path, e))?;
+    let source = String::from_utf8_lossy(&bytes);
+    let [mut libraries, mut rest] = [String::new(), String::with_capacity(source.len())];
+    for line in source.lines() {
+        match (statement("mtllib", line), statement("usemtl", line)) {
+            (Some(name), _) => libraries.extend(["mtllib ", name, "\n"]),
+            (_, Some(name)) => rest.extend(["usemtl ", name, "\n"]),
+            (None, None) => rest.extend([line, "\n"]),
+        }
+    }
+    Ok(libraries + &rest)
+}
+
+/// What follows `key` in a line that is such a statement.
+fn statement<'a>(key: &str, line: &'a str) -> Option<&'a str> {
+    line.trim().strip_prefix(key).filter(|rest| rest.starts_with(char::is_whitespace)).map(str::trim)
+}
+
 /// Whether every material that faces use is among `known`: tobj takes others for none at all, which would make a white
 /// wall of a luminaire.
 fn check_materials(path: &Path, known: &[&str]) -> Result<()> {
-    for (n, line) in BufReader::new(files::open(path)?).lines().enumerate() {
-        let line = line.map_err(|e| Error::io(path, e))?;
-        let Some(name) = line.trim().strip_prefix("usemtl").filter(|rest| rest.starts_with(char::is_whitespace)) else {
-            continue;
-        };
-        let name = name.trim();
-        if !known.contains(&name) {
-            let known =
-                if known.is_empty() { "none; name their library by mtllib".to_owned() } else { known.join(", ") };
-            let place = format!("{}:{}", path.display(), n + 1);
+    let source = std::fs::read(path).map_err(|e| Error::io(path, e))?;
+    let mut wrong = None;
+    for (n, line) in String::from_utf8_lossy(&source).lines().enumerate() {
+        if let Some(name) = statement("usemtl", line) {
+            wrong = (!known.contains(&name)).then(|| (n + 1, name.to_owned()));
+        }
+        if let Some((n, name)) = wrong.as_ref().filter(|_| statement("f", line).is_some()) {
+            let known = if known.is_empty() { "none; name their library by mtllib".into() } else { known.join(", ") };
+            let place = format!("{}:{n}", path.display());
             return Err(Error::invalid(place, format!("usemtl {name}: there is no such material; known: {known}")));
         }
     }
@@ -186,8 +207,15 @@ mod tests {
                 Some("box.obj:5: usemtl My lamp: there is no such material; known: my lamp"),
             ),
             ("", "my lamp", Some("box.obj:4: usemtl my lamp: there is no such material; known: none; ")),
+            ("mtllib\tbox.mtl\r\n", "\tmy lamp\r", None),
+            ("# M\u{f6}bel\n\tmtllib box.mtl\nusemtl no face\n", "my lamp", None),
         ] {
-            std::fs::write(&obj, format!("{head}{triangle}usemtl {name}\nf 1 2 3\n")).unwrap();
+            let latin: Vec<u8> = head.chars().map(|c| u8::try_from(u32::from(c)).unwrap()).collect();
+            let rest = format!("{triangle}  usemtl {name}\nf 1 2 3\nusemtl no face\n");
+            std::fs::write(&obj, [latin, rest.into_bytes()].concat()).unwrap();
+            if found.is_none() {
+                assert_eq!(read_obj(&obj).unwrap()[0].emission, DVec3::new(2.0, 3.0, 4.0), "{head}usemtl {name}");
+            }
             let context = |albedo| read_context(&obj, &Placement { albedo, ..Placement::default() });
             for error in [read_obj(&obj).err(), context(None).err()] {
                 match (found, error) {
@@ -198,6 +226,9 @@ mod tests {
             }
             assert!(context(Some(DVec3::splat(0.5))).is_ok());
         }
+        // A library that comes after its use.
+        std::fs::write(&obj, format!("{triangle}usemtl my lamp\nf 1 2 3\nmtllib box.mtl\n")).unwrap();
+        assert_eq!(read_obj(&obj).unwrap()[0].emission, DVec3::new(2.0, 3.0, 4.0));
     }
 
     #[test]

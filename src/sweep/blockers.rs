@@ -12,15 +12,15 @@ pub(super) struct Blockers {
 
 impl Blockers {
     /// Polygons that can hide luminaire `light` from a point of `receivers`: all but those that everything is in front
-    /// of.
+    /// of, and those with one face that everything is behind.
     pub(super) fn new(scene: &Scene, light: u32, receivers: &[DVec3]) -> Self {
         let source = &scene.polygons()[light as usize];
         let polygons = scene.polygons().iter().enumerate().filter_map(|(i, p)| {
             let i = u32::try_from(i).expect("scenes hold fewer than 2¹⁶ polygons");
             let slack = 1e-6 * p.area().sqrt();
-            let ahead = |x: &DVec3| (*x - p.vertices()[0]).dot(p.normal()) >= -slack;
-            let all = source.vertices().iter().chain(receivers).all(ahead);
-            (i != light && !all).then(|| (i, LocalPolygon::new(p, scene.lattice())))
+            let heights = || source.vertices().iter().chain(receivers).map(|x| (*x - p.vertices()[0]).dot(p.normal()));
+            let idle = heights().all(|h| h >= -slack) || (!p.opaque_back && heights().all(|h| h <= slack));
+            (i != light && !idle).then(|| (i, LocalPolygon::new(p, scene.lattice())))
         });
         Self { polygons: polygons.collect() }
     }

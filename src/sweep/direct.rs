@@ -54,8 +54,7 @@ pub(super) fn direct(
         s if !sides.contains(&s) => 0.0,
         _ => 1.0,
     });
-    let shares: Vec<OpenShare> =
-        (0..).zip(scene.luminaires()).map(|(number, _)| part.open_share(scene, number)).collect();
+    let shares: Vec<OpenShare> = (0..).zip(scene.luminaires()).map(|light| part.open_share(scene, light)).collect();
     for ((number, light), open) in (0..).zip(scene.luminaires()).zip(&shares) {
         let points = part.on(light, number);
         let blockers = Blockers::new(scene, number, &corners);

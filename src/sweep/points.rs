@@ -35,9 +35,8 @@ impl Points {
         range.map(|i| light.sample(set.point2(i as u32, 0))).collect()
     }
 
-    /// How they misjudge the open share of luminaire `number`.
-    pub(super) fn open_share(&self, scene: &Scene, number: u32) -> OpenShare {
-        let light = &scene.polygons()[number as usize];
+    /// How they misjudge the open share of luminaire `number`, which is `light`.
+    pub(super) fn open_share(&self, scene: &Scene, (number, light): (u32, &Polygon)) -> OpenShare {
         let set = Sobol::set(self.seed, Stage::Sweep, 1 << 33 | u64::from(number));
         OpenShare::new(&scene.field, light, &self.all(light, number), &set)
     }

@@ -40,7 +40,7 @@ const STEADY: f64 = 0.05;
 /// What changes in one way only: |Σ(y − x)| as a share of Σ|y − x|.
 const ONE_SIGN: f64 = 0.9;
 /// Changes below [`ROUNDING`] that two passes leave this much of do not shrink any more.
-const STANDS: f64 = 0.8;
+const STANDS: f64 = 0.95;
 /// The greatest r that ω is for: few directions make noise, too, whose eigenvalues are not all real.
 const RELAXED: f64 = 0.95;
 /// Changes this much greater than the least tell that ω or sharpening drives light apart.
@@ -141,12 +141,13 @@ impl Settling {
             let slow = if one_sign { lambda } else { 0.0 };
             let before = std::mem::replace(&mut self.slow[c], slow);
             // Light that grows is no level.
-            let steady = slow > RELAXED && (slow - before).abs() < STEADY * (1.0 - slow);
+            let [level, last] = [slow, before].map(|s| if s < 1.0 { s.min(LEVEL) } else { 0.0 });
+            let steady = level > RELAXED && (level - last).abs() < STEADY * (1.0 - level);
             if steady && self.radius[c] >= MOST {
-                self.radius[c] = slow.clamp(MOST, LEVEL);
+                self.radius[c] = level.max(MOST);
             }
             // What is left is rounding. Its sum counts still.
-            if new < ROUNDING * sums.light[c] && new > STANDS * old {
+            if old > 0.0 && new < ROUNDING * sums.light[c] && new > STANDS * old {
                 self.share[c] = 0.0;
             }
             self.least[c] = if new < APART * self.least[c] { self.least[c].min(new) } else { 0.0 };
@@ -328,6 +329,12 @@ mod tests {
         }
         assert!(settling.slowest() >= MOST, "{}", settling.slowest());
         assert!(settling.missing(0).unwrap() < 2e-3, "{:?}", settling.missing(0));
+        // Of changes that begin anew nobody knows yet whether they shrink.
+        settling.again();
+        for change in [2.0, 1.9] {
+            settling.push(Sums { light: [12_518.0; 3], change: [change; 3], drift: [0.0; 3] });
+            assert!(settling.missing(0).unwrap() > 5e-3, "{:?}", settling.missing(0));
+        }
     }
 
     /// Changes that grow twice, all of one sign, as the first bounces of such surfaces may.

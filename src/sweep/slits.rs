@@ -19,7 +19,8 @@ impl Slits {
         let stands = |inside| Standing { place: place(inside), covers: None };
         let mut standing: Vec<Standing> = ends::inside(scene).into_iter().map(stands).collect();
         let mut hidden = Vec::new();
-        for ((number, standing), _) in (0..).zip(&mut standing).zip(scene.luminaires()) {
+        // Luminaires come first.
+        for (number, standing) in (0..).zip(&mut standing[..scene.luminaires().len()]) {
             let nodes = hidden_by(scene, number);
             standing.covers = scene.covered_wall(number);
             if standing.place == Place::Inside && !nodes.is_empty() {

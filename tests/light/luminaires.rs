@@ -141,6 +141,36 @@ fn a_wall_hides_what_is_behind_from_those_before_it() {
     }
 }
 
+/// A black floor in the plane of Ω's lowest grid points, with two faces or with one that looks down: whatever the f32
+/// of these points says, they are above it, and lit as without it.
+#[test]
+fn a_floor_in_the_volumes_face_is_below_its_points() {
+    let planes = field(lattice([9; 3], DVec3::new(0.1, 0.2, 0.7), DVec3::new(1.1, 1.2, 1.7)), 0.65, 1.65, |x| x.z);
+    let at = |name: &str, z: f64, up: bool, emission: DVec3| {
+        let p = square(name, 1.0, z, up, 0.0, emission);
+        Polygon::new(name, p.vertices().iter().map(|x| *x + DVec3::new(0.1, 0.2, 0.0)).collect(), DVec3::ZERO, emission)
+    };
+    let lamp = at("lamp", 2.5, false, DVec3::ONE).unwrap();
+    let floor = at("floor", 0.7, true, DVec3::ZERO).unwrap();
+    let below = at("floor", 0.7, false, DVec3::ZERO).unwrap();
+    for engine in [Engine::Photon, Engine::Sweep] {
+        let lit = |floor: &[Polygon]| {
+            let scene = scene(planes.clone(), grey(0.5, Side::Higher), [&[lamp.clone()], floor].concat());
+            let bake = run(&scene, &BakeSettings { engine, photons: 1 << 12, gather_rays: 16, ..at_nodes(1) });
+            valid(&bake, &scene).into_iter().map(|v| (v.1, v.3)).collect::<Vec<_>>()
+        };
+        let alone = lit(&[]);
+        let lowest = alone.iter().filter(|(x, _)| x.z < 0.701).count();
+        for floor in [&floor.clone().both_faces()[..], &[below.clone()]] {
+            let found = lit(floor);
+            assert!(found.len() == alone.len() && lowest == 81, "{} {lowest}", found.len());
+            for (&(x, expected), (_, light)) in alone.iter().zip(found) {
+                assert!(expected > 0.1 && (light / expected - 1.0).abs() < 1e-5, "{engine:?} {x}: {light} {expected}");
+            }
+        }
+    }
+}
+
 /// Knows nothing.
 struct Unknown;
 
