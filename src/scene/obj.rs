@@ -154,6 +154,8 @@ fn text(path: &Path) -> Result<String> {
     let mut bytes = Vec::new();
     files::open(path)?.read_to_end(&mut bytes).map_err(|e| Error::io(path, e))?;
     let source = String::from_utf8_lossy(&bytes);
+    // Windows' editors begin files with a mark.
+    let source = source.trim_start_matches('\u{feff}');
     let [mut libraries, mut rest] = [String::new(), String::with_capacity(source.len())];
     for line in source.lines() {
         match (statement("mtllib", line), statement("usemtl", line)) {
@@ -208,6 +210,7 @@ mod tests {
             ),
             ("", "my lamp", Some("box.obj:4: usemtl my lamp: there is no such material; known: none; ")),
             ("mtllib\tbox.mtl\r\n", "\tmy lamp\r", None),
+            ("\u{ef}\u{bb}\u{bf}mtllib box.mtl\n", "my lamp", None),
             ("# M\u{f6}bel\n\tmtllib box.mtl\nusemtl no face\n", "my lamp", None),
         ] {
             let latin: Vec<u8> = head.chars().map(|c| u8::try_from(u32::from(c)).unwrap()).collect();
