@@ -155,13 +155,13 @@ fn a_floor_in_the_volumes_face_is_below_its_points() {
     let below = at("floor", 0.7, false, DVec3::ZERO).unwrap();
     for engine in [Engine::Photon, Engine::Sweep] {
         let lit = |floor: &[Polygon]| {
-            let scene = scene(planes.clone(), grey(0.5, Side::Higher), [&[lamp.clone()], floor].concat());
+            let scene = scene(planes.clone(), grey(0.5, Side::Higher), [std::slice::from_ref(&lamp), floor].concat());
             let bake = run(&scene, &BakeSettings { engine, photons: 1 << 12, gather_rays: 16, ..at_nodes(1) });
             valid(&bake, &scene).into_iter().map(|v| (v.1, v.3)).collect::<Vec<_>>()
         };
         let alone = lit(&[]);
         let lowest = alone.iter().filter(|(x, _)| x.z < 0.701).count();
-        for floor in [&floor.clone().both_faces()[..], &[below.clone()]] {
+        for floor in [&floor.clone().both_faces()[..], std::slice::from_ref(&below)] {
             let found = lit(floor);
             assert!(found.len() == alone.len() && lowest == 81, "{} {lowest}", found.len());
             for (&(x, expected), (_, light)) in alone.iter().zip(found) {
