@@ -86,8 +86,7 @@ impl Compare {
         if baked.scene.fields() > 1 {
             return Err(Error::not_supported(&self.bake, "holds several volumes; name the .vti of one of them"));
         }
-        // Also on a finer grid; other grids hold other samples.
-        let exact = baked.source().is_ok_and(|own| own.is_some());
+        let exact = baked.holds_samples();
         for ((reference, file), path) in references.iter().zip(&files).zip(&self.references) {
             let origin = Origin::from_comments(&file.comments);
             belongs(&reference.positions, origin.isovalue, &baked.scene.field, exact).map_err(|e| e.in_file(path))?;

@@ -486,6 +486,11 @@ impl BakedVolume {
         Self::seen_from(fields, own)
     }
 
+    /// Whether its grid has all points of the volume, and so its samples.
+    pub fn holds_samples(&self) -> bool {
+        matches!(grid_size(&self.report), Some(GridSize::Factors(_)))
+    }
+
     /// The grid's lattice.
     pub fn lattice(&self) -> &Lattice {
         self.scene.lattice()

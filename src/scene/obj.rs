@@ -113,14 +113,19 @@ fn faces(path: &Path, must_exist: bool) -> Result<Vec<Face>> {
             Err(tobj::LoadError::MaterialParseError)
         }
     };
-    let loaded = tobj::load_obj_buf(&mut text(path)?.as_bytes(), &options, library);
+    let mut bytes = Vec::new();
+    files::open(path)?.read_to_end(&mut bytes).map_err(|e| Error::io(path, e))?;
+    let source = String::from_utf8_lossy(&bytes);
+    // Windows' editors begin files with a mark.
+    let source = source.trim_start_matches('\u{feff}');
+    let loaded = tobj::load_obj_buf(&mut normalised(source).as_bytes(), &options, library);
     if let Some(e) = fault.into_inner() {
         return Err(e);
     }
     let (models, materials) = loaded.map_err(|e| Error::invalid(path, e))?;
     let materials = materials.map_err(|e| Error::invalid(path, format!("its material library: {e}")))?;
     if must_exist {
-        check_materials(path, &materials.iter().map(|m| m.name.as_str()).collect::<Vec<_>>())?;
+        check_materials(path, source, &materials.iter().map(|m| m.name.as_str()).collect::<Vec<_>>())?;
     }
     let mut faces = Vec::new();
     for model in &models {
@@ -150,12 +155,7 @@ fn faces(path: &Path, must_exist: bool) -> Result<Vec<Face>> {
 
 /// The text of an OBJ file as tobj takes it: statements of materials and their libraries without indentation, with one
 /// space, and libraries first, since tobj knows none that comes after its use.
-fn text(path: &Path) -> Result<String> {
-    let mut bytes = Vec::new();
-    files::open(path)?.read_to_end(&mut bytes).map_err(|e| Error::io(path, e))?;
-    let source = String::from_utf8_lossy(&bytes);
-    // Windows' editors begin files with a mark.
-    let source = source.trim_start_matches('\u{feff}');
+fn normalised(source: &str) -> String {
     let [mut libraries, mut rest] = [String::new(), String::with_capacity(source.len())];
     for line in source.lines() {
         match (statement("mtllib", line), statement("usemtl", line)) {
@@ -164,7 +164,7 @@ fn text(path: &Path) -> Result<String> {
             (None, None) => rest.extend([line, "\n"]),
         }
     }
-    Ok(libraries + &rest)
+    libraries + &rest
 }
 
 /// What follows `key` in a line that is such a statement.
@@ -174,14 +174,13 @@ fn statement<'a>(key: &str, line: &'a str) -> Option<&'a str> {
 
 /// Whether every material that faces use is among `known`: tobj takes others for none at all, which would make a white
 /// wall of a luminaire.
-fn check_materials(path: &Path, known: &[&str]) -> Result<()> {
-    let source = std::fs::read(path).map_err(|e| Error::io(path, e))?;
+fn check_materials(path: &Path, source: &str, known: &[&str]) -> Result<()> {
     let mut wrong = None;
-    for (n, line) in String::from_utf8_lossy(&source).lines().enumerate() {
+    for (n, line) in source.lines().enumerate() {
         if let Some(name) = statement("usemtl", line) {
-            wrong = (!known.contains(&name)).then(|| (n + 1, name.to_owned()));
+            wrong = (!known.contains(&name)).then_some((n + 1, name));
         }
-        if let Some((n, name)) = wrong.as_ref().filter(|_| statement("f", line).is_some()) {
+        if let Some((n, name)) = wrong.filter(|_| statement("f", line).is_some()) {
             let known = if known.is_empty() { "none; name their library by mtllib".into() } else { known.join(", ") };
             let place = format!("{}:{n}", path.display());
             return Err(Error::invalid(place, format!("usemtl {name}: there is no such material; known: {known}")));
