@@ -129,7 +129,7 @@ fn main() {
         if open == 0.0 {
             return 0.0;
         }
-        let aim = Aim::new(light, x, r.normal);
+        let Some(aim) = Aim::new(light, x, r.normal) else { return 0.0 };
         let (mut seen, mut all) = (0.0, 0.0);
         for n in 0..rays {
             let (y, g) = aim.sample(set.point2(n, 0));

@@ -86,8 +86,8 @@ fn budget(scene: &Scene, open: f64, shadow_rays: u32) -> u32 {
 }
 
 /// Irradiance from all luminaires: for each, Lambert's closed form × Σ V_i g_i / Σ g_i over at most `shadow_rays`
-/// low-discrepancy points y_i of its part above the horizon, with g = cos θ cos θ′/r²; next to a rectangle uniform over
-/// its solid angle, with g = cos θ, since of points spread over the area hardly any lies where a receiver there looks.
+/// low-discrepancy points y_i of its part above the horizon, with g = cos θ cos θ′/r²; next to the luminaire uniform
+/// over its solid angle, with g = cos θ, since of points spread over the area hardly any lies where a receiver looks.
 /// Exact where all or none are visible: there a quarter of the points, but at least 64, settles it; the rest is spent
 /// in penumbras. Receivers that could get less than half of E₀ ([`Scene::reference_irradiance`]) get fewer rays, in
 /// proportion down to an eighth. The ratio's bias falls with 1/shadow_rays; of more than 64 rays, light or shadow below
@@ -111,7 +111,7 @@ pub fn direct_irradiance<T: Tracer>(
         if open == 0.0 {
             continue;
         }
-        let Some(aim) = Aim::best(light, x, receiver.normal, open) else { continue };
+        let Some(aim) = Aim::best(light, x, receiver.normal) else { continue };
         let budget = budget(scene, luminance(light.emission) * open, shadow_rays);
         let pilot = (budget / 4).max(LEAST_UNANIMOUS);
         let index = key.index.wrapping_mul(scene.luminaires().len() as u64).wrapping_add(u64::from(l));
@@ -150,7 +150,8 @@ pub fn direct_once<T: Tracer>(scene: &Scene, tracer: &T, receiver: &Receiver, rn
     let x = scene.lattice().to_world(receiver.position.as_dvec3());
     let mut total = DVec3::ZERO;
     for (l, light) in (0..).zip(scene.luminaires()) {
-        let (y, g) = Aim::new(light, x, receiver.normal).sample(rng.unit2());
+        let u = rng.unit2();
+        let (y, g) = Aim::new(light, x, receiver.normal).map_or((x, 0.0), |aim| aim.sample(u));
         if g > 0.0 && !light.is_left(l, receiver.departure) {
             *rays += 1;
             if !tracer.occluded(&receiver.shadow_ray(scene, y, l)) {

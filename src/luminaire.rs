@@ -1,6 +1,8 @@
 //! Light from polygons: closed-form irradiance, and points to aim shadow rays at.
 
 mod solid_angle;
+mod spherical_fan;
+mod spherical_rectangle;
 
 pub use solid_angle::Aim;
 

@@ -28,7 +28,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Counts changes of what references hold: those that a study keeps are made anew by another version.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 
 /// How outgoing radiance is found.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]

@@ -1,6 +1,8 @@
 //! Points of a luminaire, uniform over the solid angle under which a receiver sees it: what they give is bounded,
 //! however near the luminaire is. Points uniform over the area give cos θ cos θ′/r², which is not.
 
+use super::spherical_fan::SphericalFan;
+use super::spherical_rectangle::SphericalRectangle;
 use super::{above_horizon, point_term};
 use crate::polygon::{Polygon, convex_area, sample_convex};
 use glam::DVec3;
@@ -16,109 +18,99 @@ pub struct Aim<'a> {
     polygon: &'a Polygon,
     x: DVec3,
     n: DVec3,
-    /// Sampled by solid angle.
-    rectangle: Option<SphericalRectangle>,
-    /// What is sampled by area, if that is not all of it.
-    part: Option<Vec<DVec3>>,
-    area: f64,
+    spread: Spread,
+}
+
+/// What points are uniform over.
+enum Spread {
+    /// The solid angle of all of a rectangle.
+    Rectangle(SphericalRectangle),
+    /// The solid angle of the part above the horizon.
+    Fan(SphericalFan),
+    /// The area of the part above the horizon, or, without one, of the whole.
+    Area { part: Option<Vec<DVec3>>, area: f64 },
+}
+
+impl Spread {
+    /// By solid angle; `part` of the polygon, or all of it.
+    fn over_solid_angle(polygon: &Polygon, part: Option<&[DVec3]>, x: DVec3) -> Self {
+        match part.map_or_else(|| SphericalRectangle::new(polygon, x), |_| None) {
+            Some(rectangle) => Self::Rectangle(rectangle),
+            None => Self::Fan(SphericalFan::new(part.unwrap_or(polygon.vertices()), polygon.normal(), x)),
+        }
+    }
+
+    fn solid_angle(&self) -> f64 {
+        match self {
+            Self::Rectangle(rectangle) => rectangle.solid_angle,
+            Self::Fan(fan) => fan.solid_angle,
+            Self::Area { .. } => 0.0,
+        }
+    }
 }
 
 impl<'a> Aim<'a> {
-    /// `polygon` from `x` with unit normal `n`. Rectangles are sampled by solid angle, other polygons by area.
-    pub fn new(polygon: &'a Polygon, x: DVec3, n: DVec3) -> Self {
-        let in_front = (x - polygon.vertices()[0]).dot(polygon.normal()) > 0.0;
-        let rectangle = if in_front { SphericalRectangle::new(polygon, x) } else { None };
-        let rectangle = rectangle.filter(|r| r.solid_angle > LEAST);
-        Self { polygon, x, n, rectangle, part: None, area: polygon.area() }
+    /// Points uniform over the solid angle of rectangles, and of other polygons that are near: all are worth less than
+    /// 2π. Of what is near only the part above the horizon of `x` with unit normal `n` is taken. `None` behind the
+    /// polygon, and if nothing near is above the horizon.
+    pub fn new(polygon: &'a Polygon, x: DVec3, n: DVec3) -> Option<Self> {
+        if !is_before(polygon, x) {
+            return None;
+        }
+        if may_be_near(polygon, x) {
+            return Self::above(polygon, x, n, Some(LEAST));
+        }
+        let rectangle = SphericalRectangle::new(polygon, x).filter(|r| r.solid_angle > LEAST);
+        let area = || Spread::Area { part: None, area: polygon.area() };
+        Some(Self { polygon, x, n, spread: rectangle.map_or_else(area, Spread::Rectangle) })
     }
 
-    /// The points that tell most of what `x` sees, where the whole luminaire gives `open` > 0: by solid angle of a
-    /// rectangle that fills 1 sr and more, and gives an eighth of that, so that an eighth of the points and more lie
-    /// above the horizon; there points spread over the area would hardly ever fall on what a receiver sees. Otherwise
-    /// over the area of the part above the horizon. `None` if that has no area.
-    pub fn best(polygon: &'a Polygon, x: DVec3, n: DVec3, open: f64) -> Option<Self> {
-        let mut aim = Self::new(polygon, x, n);
-        let fills = aim.rectangle.as_ref().map_or(0.0, |r| r.solid_angle);
-        if fills > NEAR && open > 0.125 * fills {
-            return Some(aim);
+    /// The points that tell most of what `x` sees: by solid angle of a luminaire that fills 1 sr and more, since hardly
+    /// any point uniform over the area falls on what a receiver there looks at, otherwise over the area; in either case
+    /// of the part above the horizon. `None` as for [`Aim::new`].
+    pub fn best(polygon: &'a Polygon, x: DVec3, n: DVec3) -> Option<Self> {
+        if !is_before(polygon, x) {
+            return None;
         }
-        aim.rectangle = None;
-        aim.part = above_horizon(polygon, x, n);
-        if let Some(part) = &aim.part {
-            aim.area = convex_area(part);
+        Self::above(polygon, x, n, may_be_near(polygon, x).then_some(NEAR))
+    }
+
+    /// The part above the horizon: by solid angle if that exceeds `least`.
+    fn above(polygon: &'a Polygon, x: DVec3, n: DVec3, least: Option<f64>) -> Option<Self> {
+        let part = above_horizon(polygon, x, n);
+        if let Some(least) = least {
+            let spread = Spread::over_solid_angle(polygon, part.as_deref(), x);
+            if spread.solid_angle() > least {
+                return Some(Self { polygon, x, n, spread });
+            }
         }
-        (aim.area > 0.0).then_some(aim)
+        let area = part.as_ref().map_or(polygon.area(), |part| convex_area(part));
+        (area > 0.0).then_some(Self { polygon, x, n, spread: Spread::Area { part, area } })
     }
 
     /// A point of the luminaire from two uniforms, and the irradiance per unit radiance that it gives: the mean of
     /// these is what the whole luminaire gives.
     #[inline]
     pub fn sample(&self, u: [f64; 2]) -> (DVec3, f64) {
-        if let Some(r) = &self.rectangle {
-            let to = r.sample(u);
-            return (self.x + to, r.solid_angle * (to.normalize().dot(self.n)).max(0.0));
-        }
-        let y = self.part.as_ref().map_or_else(|| self.polygon.sample(u), |part| sample_convex(part, u));
-        (y, self.area * point_term(self.x, self.n, y, self.polygon.normal()))
+        let to = match &self.spread {
+            Spread::Rectangle(rectangle) => rectangle.sample(u),
+            Spread::Fan(fan) => fan.sample(u),
+            Spread::Area { part, area } => {
+                let y = part.as_ref().map_or_else(|| self.polygon.sample(u), |part| sample_convex(part, u));
+                return (y, area * point_term(self.x, self.n, y, self.polygon.normal()));
+            }
+        };
+        (self.x + to, self.spread.solid_angle() * (to.normalize().dot(self.n)).max(0.0))
     }
 }
 
-/// A rectangle projected onto the unit sphere. \[Urena13\]
-struct SphericalRectangle {
-    /// Along its edges, and across it towards the other side of the receiver.
-    axes: [DVec3; 3],
-    /// The rectangle in these axes: ends along both edges, and the plane's coordinate, below 0.
-    x: [f64; 2],
-    y: [f64; 2],
-    z: f64,
-    /// The normals' z at the edges along x.
-    b: [f64; 2],
-    k: f64,
-    solid_angle: f64,
+fn is_before(polygon: &Polygon, x: DVec3) -> bool {
+    (x - polygon.vertices()[0]).dot(polygon.normal()) > 0.0
 }
 
-impl SphericalRectangle {
-    /// `None` if the polygon is no rectangle.
-    fn new(polygon: &Polygon, o: DVec3) -> Option<Self> {
-        let [e, f] = polygon.texture_edges();
-        let lengths = [e.length(), f.length()];
-        if !polygon.is_parallelogram() || e.dot(f).abs() > 1e-12 * lengths[0] * lengths[1] {
-            return None;
-        }
-        let (ex, ey) = (e / lengths[0], f / lengths[1]);
-        let d = polygon.at([0.0, 0.0]) - o;
-        let across = ex.cross(ey);
-        let ez = if d.dot(across) > 0.0 { -across } else { across };
-        let (x0, y0, z) = (d.dot(ex), d.dot(ey), d.dot(ez));
-        let (x, y) = ([x0, x0 + lengths[0]], [y0, y0 + lengths[1]]);
-        let corner = |i: usize, j: usize| DVec3::new(x[i], y[j], z);
-        let normal = |a: DVec3, b: DVec3| a.cross(b).normalize_or_zero();
-        let n = [
-            normal(corner(0, 0), corner(1, 0)),
-            normal(corner(1, 0), corner(1, 1)),
-            normal(corner(1, 1), corner(0, 1)),
-            normal(corner(0, 1), corner(0, 0)),
-        ];
-        let angle = |i: usize| (-n[i].dot(n[(i + 1) % 4])).clamp(-1.0, 1.0).acos();
-        let k = std::f64::consts::TAU - angle(2) - angle(3);
-        let solid_angle = angle(0) + angle(1) - k;
-        Some(Self { axes: [ex, ey, ez], x, y, z, b: [n[0].z, n[2].z], k, solid_angle })
-    }
-
-    /// A point of the rectangle, from the receiver.
-    #[inline]
-    fn sample(&self, [u, v]: [f64; 2]) -> DVec3 {
-        let (sine, cosine) = (u * self.solid_angle + self.k).sin_cos();
-        let f = (cosine * self.b[0] - self.b[1]) / sine;
-        let c = (1.0 / (f * f + self.b[0] * self.b[0]).sqrt()).copysign(f).clamp(-1.0, 1.0);
-        let x = (-c * self.z / (1.0 - c * c).sqrt().max(1e-12)).clamp(self.x[0], self.x[1]);
-        let d2 = x * x + self.z * self.z;
-        let [h0, h1] = self.y.map(|y| y / (d2 + y * y).sqrt());
-        let h = h0 + v * (h1 - h0);
-        let y = (h * (d2 / (1.0 - h * h).max(1e-24)).sqrt()).clamp(self.y[0], self.y[1]);
-        let [ex, ey, ez] = self.axes;
-        x * ex + y * ey + self.z * ez
-    }
+/// Whether the polygon may fill more than [`NEAR`]: from its nearest point r away it fills area / r² at most.
+fn may_be_near(polygon: &Polygon, x: DVec3) -> bool {
+    polygon.is_nearer(x, (polygon.area() / NEAR).sqrt())
 }
 
 #[cfg(test)]
@@ -126,48 +118,89 @@ mod tests {
     use super::*;
     use crate::luminaire::unoccluded;
     use crate::rng::{Sobol, Stage};
+    use crate::stats::Moments;
 
-    fn rectangle(x: [f64; 2], y: [f64; 2]) -> Polygon {
-        let v = [(x[0], y[0]), (x[0], y[1]), (x[1], y[1]), (x[1], y[0])];
-        Polygon::new("light", v.map(|(x, y)| DVec3::new(x, y, 1.0)).to_vec(), DVec3::ZERO, DVec3::ONE).unwrap()
+    fn flat(corners: &[(f64, f64)]) -> Polygon {
+        let v = corners.iter().map(|&(x, y)| DVec3::new(x, y, 1.0)).collect();
+        Polygon::new("light", v, DVec3::ZERO, DVec3::ONE).unwrap()
     }
 
-    /// Means over the light and over one part of it against the closed form, near and far, below the horizon in part.
+    fn rectangle(x: [f64; 2], y: [f64; 2]) -> Polygon {
+        flat(&[(x[0], y[0]), (x[0], y[1]), (x[1], y[1]), (x[1], y[0])])
+    }
+
+    /// Of polygons of three, four and six corners, the first of which is a rectangle, and a part of each.
+    fn luminaires() -> [(Polygon, Polygon); 4] {
+        let hexagon = flat(&[(-0.3, 0.0), (-0.1, 0.3), (0.2, 0.3), (0.3, 0.1), (0.2, -0.1), (-0.1, -0.1)]);
+        let triangle = flat(&[(-0.25, -0.1), (-0.2, 0.3), (0.5, 0.1)]);
+        let skewed = flat(&[(-0.3, -0.1), (-0.2, 0.3), (0.4, 0.3), (0.3, -0.1)]);
+        let part = || rectangle([-0.2, 0.05], [-0.05, 0.1]);
+        [
+            (rectangle([-0.25, 0.25], [-0.1, 0.3]), part()),
+            (triangle, rectangle([-0.2, 0.05], [0.1, 0.15])),
+            (skewed, part()),
+            (hexagon, part()),
+        ]
+    }
+
+    const RECEIVERS: [(DVec3, DVec3); 8] = [
+        (DVec3::new(0.2, 0.3, 0.1), DVec3::Z),
+        (DVec3::new(0.1, 0.1, 0.9), DVec3::new(0.3, 0.2, 1.0)),
+        (DVec3::new(-0.8, 0.2, 0.3), DVec3::new(1.0, 0.0, -0.35)),
+        (DVec3::new(0.1, 0.0, 0.999), DVec3::new(1.0, -0.5, 0.1)),
+        (DVec3::new(0.3, 0.0, 0.9999), DVec3::new(-1.0, -0.5, 0.1)),
+        (DVec3::new(0.0, 0.1, 1.0 - 1e-6), DVec3::Z),
+        (DVec3::new(-0.05, 0.15, 1.0 - 1e-6), DVec3::new(0.0, 1.0, 1e-3)),
+        (DVec3::new(0.0, 0.1, -40.0), DVec3::new(0.1, 0.0, 1.0)),
+    ];
+
+    /// Means over luminaires and over a part of each against the closed form, near and far, below the horizon in part.
     #[test]
     fn means_are_the_closed_form() {
-        let light = rectangle([-0.25, 0.25], [-0.1, 0.3]);
-        let part = rectangle([-0.25, 0.05], [-0.1, 0.1]);
-        for (i, (x, n)) in [
-            (DVec3::new(0.2, 0.3, 0.1), DVec3::Z),
-            (DVec3::new(0.1, 0.1, 0.9), DVec3::new(0.3, 0.2, 1.0)),
-            (DVec3::new(-0.8, 0.2, 0.3), DVec3::new(1.0, 0.0, -0.35)),
-            (DVec3::new(0.1, 0.0, 0.999), DVec3::new(1.0, -0.5, 0.1)),
-            (DVec3::new(0.3, 0.0, 0.9999), DVec3::new(-1.0, -0.5, 0.1)),
-            (DVec3::new(0.0, 0.1, 1.0 - 1e-6), DVec3::Z),
-        ]
-        .into_iter()
-        .enumerate()
-        {
-            let n = n.normalize();
-            let aim = Aim::new(&light, x, n);
-            assert!(aim.rectangle.is_some());
-            let set = Sobol::set(3, Stage::Test, i as u64);
-            let open = unoccluded(&light, x, n);
-            if let Some(best) = Aim::best(&light, x, n, open) {
-                let mean = (0..1 << 16).map(|k| best.sample(set.point2(k, 0)).1).sum::<f64>() / f64::from(1 << 16);
-                assert!(open > 0.0 && (mean - open).abs() < 2e-3 * open.max(1e-2), "receiver {i}: {mean} {open}");
+        let mut fans = 0;
+        for (l, (light, part)) in luminaires().iter().enumerate() {
+            for (i, (x, n)) in RECEIVERS.into_iter().enumerate() {
+                let n = n.normalize();
+                let open = unoccluded(light, x, n);
+                let aim = Aim::new(light, x, n).unwrap();
+                assert!(l == 0 || !matches!(aim.spread, Spread::Rectangle(_)));
+                fans += usize::from(matches!(aim.spread, Spread::Fan(_)));
+                let set = Sobol::set(3, Stage::Test, i as u64);
+                let count = 1 << 17;
+                if let Some(best) = Aim::best(light, x, n) {
+                    let mean = (0..count).map(|k| best.sample(set.point2(k, 0)).1).sum::<f64>() / f64::from(count);
+                    assert!((mean - open).abs() < 2e-3 * open.max(1e-2), "{l}, receiver {i}: {mean} {open}");
+                }
+                let (mut whole, mut inside) = (0.0, 0.0);
+                for k in 0..count {
+                    let (y, w) = aim.sample(set.point2(k, 0));
+                    assert!(light.contains(y) || light.contains(y + 1e-9 * (DVec3::new(0.0, 0.1, 1.0) - y)), "{y}");
+                    assert!((0.0..=std::f64::consts::TAU).contains(&w), "bounded: {w}");
+                    whole += w / f64::from(count);
+                    inside += if part.contains(y) { w / f64::from(count) } else { 0.0 };
+                }
+                for (mean, polygon, least) in [(whole, light, 0.0), (inside, part, 1e-2)] {
+                    let exact = unoccluded(polygon, x, n);
+                    assert!((mean - exact).abs() < 2e-3 * exact.max(least), "{l}, receiver {i}: {mean} {exact}");
+                }
             }
-            let (mut whole, mut inside, count) = (0.0, 0.0, 1 << 16);
-            for k in 0..count {
-                let (y, w) = aim.sample(set.point2(k, 0));
-                assert!(light.contains(y) || light.vertices().iter().any(|v| v.distance(y) < 1e-9), "{y}");
-                assert!((0.0..=std::f64::consts::TAU).contains(&w), "bounded: {w}");
-                whole += w / f64::from(count);
-                inside += if part.contains(y) { w / f64::from(count) } else { 0.0 };
-            }
-            for (mean, polygon) in [(whole, &light), (inside, &part)] {
-                let exact = unoccluded(polygon, x, n);
-                assert!((mean - exact).abs() < 2e-3 * exact.max(1e-2), "receiver {i}: {mean} {exact}");
+        }
+        assert_eq!(fans, 19, "what is near, and no rectangle or cut by the horizon");
+    }
+
+    /// Beside luminaires of any shape, and where they are half below the horizon, no point is worth many times the
+    /// mean, as some of those uniform over the area are.
+    #[test]
+    fn no_point_outweighs_the_others() {
+        for (l, (light, _)) in luminaires().iter().enumerate() {
+            for (i, (x, n)) in RECEIVERS.into_iter().enumerate() {
+                let n = n.normalize();
+                let (mut worths, set) = (Moments::default(), Sobol::set(7, Stage::Test, i as u64));
+                let aim = Aim::new(light, x, n).unwrap();
+                let most = (0..4096).map(|k| aim.sample(set.point2(k, 0)).1).inspect(|&w| worths.push(w));
+                let most = most.fold(0.0, f64::max);
+                let relative = 64.0 * worths.std_error() / worths.mean();
+                assert!(most < 4.0 * worths.mean() && relative < 1.0, "{l}, receiver {i}: {most} {relative}");
             }
         }
     }
@@ -176,29 +209,31 @@ mod tests {
     /// points over the area one in 80 000 would fall there.
     #[test]
     fn a_few_points_find_what_is_seen_of_a_near_luminaire() {
-        let light = rectangle([-0.5, 0.5], [-0.5, 0.5]);
-        let (x, h, r) = (DVec3::new(0.1, -0.2, 0.999), 0.001, 0.002);
-        let aim = Aim::best(&light, x, DVec3::Z, unoccluded(&light, x, DVec3::Z)).unwrap();
-        let set = Sobol::set(5, Stage::Test, 0);
-        let (mut seen, mut all) = (0.0, 0.0);
-        for k in 0..128 {
-            let (y, g) = aim.sample(set.point2(k, 0));
-            all += g;
-            seen += if (y - x).truncate().length() < r { g } else { 0.0 };
+        let half = flat(&[(-0.5, -0.5), (-0.5, 0.5), (0.5, 0.5)]);
+        for light in [rectangle([-0.5, 0.5], [-0.5, 0.5]), half] {
+            let (x, h, r) = (DVec3::new(-0.2, 0.1, 0.999), 0.001, 0.002);
+            let aim = Aim::best(&light, x, DVec3::Z).unwrap();
+            let set = Sobol::set(5, Stage::Test, 0);
+            let (mut seen, mut all) = (0.0, 0.0);
+            for k in 0..128 {
+                let (y, g) = aim.sample(set.point2(k, 0));
+                all += g;
+                seen += if (y - x).truncate().length() < r { g } else { 0.0 };
+            }
+            assert!((seen / all - r * r / (r * r + h * h)).abs() < 0.05, "{}", seen / all);
+            let far = Aim::best(&light, DVec3::ZERO, DVec3::Z).unwrap();
+            assert!(matches!(far.spread, Spread::Area { .. }), "not near");
+            assert!(Aim::best(&light, x, -DVec3::Z).is_none(), "looks away");
+            assert!(Aim::new(&light, DVec3::new(0.0, 0.0, 1.1), -DVec3::Z).is_none(), "behind");
         }
-        assert!((seen / all - r * r / (r * r + h * h)).abs() < 0.05, "{}", seen / all);
-        let far = Aim::best(&light, DVec3::ZERO, DVec3::Z, 0.5).unwrap();
-        assert!(far.rectangle.is_none(), "not near");
-        assert!(Aim::best(&light, x, -DVec3::Z, 0.0).is_none(), "looks away");
     }
 
     #[test]
-    fn what_is_no_rectangle_or_far_is_sampled_by_area() {
-        let v = [(0.0, 0.0), (0.1, 0.5), (0.6, 0.5), (0.5, 0.0)].map(|(x, y)| DVec3::new(x, y, 1.0));
-        let skewed = Polygon::new("light", v.to_vec(), DVec3::ZERO, DVec3::ONE).unwrap();
-        for (light, x) in [(&skewed, DVec3::ZERO), (&rectangle([0.0, 0.5], [0.0, 0.5]), DVec3::new(0.0, 0.0, -500.0))] {
-            let aim = Aim::new(light, x, DVec3::Z);
-            assert!(aim.rectangle.is_none());
+    fn what_is_far_is_sampled_by_area() {
+        for (light, _) in &luminaires() {
+            let x = DVec3::new(0.0, 0.0, -500.0);
+            let aim = Aim::new(light, x, DVec3::Z).unwrap();
+            assert!(matches!(aim.spread, Spread::Area { .. }));
             let set = Sobol::set(4, Stage::Test, 0);
             let mean = (0..1 << 14).map(|k| aim.sample(set.point2(k, 0)).1).sum::<f64>() / f64::from(1 << 14);
             assert!((mean / unoccluded(light, x, DVec3::Z) - 1.0).abs() < 1e-3);

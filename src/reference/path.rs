@@ -49,7 +49,7 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
         reflected(scene.surface.albedo.at(f64::from(receiver.isovalue)), direct + indirect) + scene.surface.emission
     }
 
-    /// Direct irradiance by `samples` points uniform over the solid angle of each luminaire, each worth g:
+    /// Direct irradiance by `samples` points of each luminaire (see [`Aim::new`]), each worth g:
     /// β E₀ + 1/n Σ g (V − β) with E₀ the closed form without blockers. Unbiased for every β; β is the visible share
     /// seen by a pilot of its own, so that what is fully lit or fully dark has no variance. `key` says seed and
     /// index; the stage is its own.
@@ -67,7 +67,7 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
             }
             let index = key.index * scene.luminaires().len() as u64 + u64::from(l);
             let set = |index| Stage::Direct.key(key.seed, index).set();
-            let aim = Aim::new(light, x, receiver.normal);
+            let Some(aim) = Aim::new(light, x, receiver.normal) else { continue };
             let mut shares = |set: Sobol, count: u32| -> (f64, f64) {
                 let (mut all, mut seen) = (0.0, 0.0);
                 for i in 0..count {

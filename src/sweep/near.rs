@@ -11,7 +11,7 @@ use super::segments::Segments;
 use crate::field::Field;
 use crate::flattened::Side;
 use crate::isa::Isa;
-use crate::luminaire::{Aim, unoccluded};
+use crate::luminaire::Aim;
 use crate::polygon::LocalPolygon;
 use crate::rng::{Sobol, Stage};
 use crate::scene::Scene;
@@ -56,10 +56,7 @@ pub(super) fn look(
             for (s, &side) in sides.iter().enumerate() {
                 looks.sums[place + s] = [0.0; 2];
                 let normal = side.facing(normal);
-                let open = unoccluded(light, world, normal);
-                let Some(aim) = (if open > 0.0 { Aim::best(light, world, normal, open) } else { None }) else {
-                    continue;
-                };
+                let Some(aim) = Aim::best(light, world, normal) else { continue };
                 let key = 1 << 62 | u64::from(number) << 40 | (at * per + s) as u64;
                 let set = Sobol::set(seed, Stage::Sweep, key);
                 for n in replicate * count..(replicate + 1) * count {
