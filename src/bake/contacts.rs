@@ -13,6 +13,7 @@ use crate::flattened::{Departure, Side, SurfacePoint, Target};
 use crate::gather::gathered_irradiance;
 use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, local_position};
+use crate::polygon::Polygon;
 use crate::radiance_cache::RadianceCache;
 use crate::rng::Stage;
 use crate::scene::{Boundary, ON, Scene};
@@ -56,6 +57,12 @@ impl<'a, T> Wedge<'a, T> {
     }
 }
 
+/// Whether a wall comes within a voxel of Ω's faces, or is outside.
+fn is_by_a_face(wall: &Polygon, lattice: &Lattice) -> bool {
+    let beside = |x: DVec3| x.cmplt(DVec3::ONE).any() || x.cmpgt(lattice.far() - 1.0).any();
+    wall.vertices().iter().any(|&x| beside(lattice.to_index(x)))
+}
+
 impl<'a> Contacts<'a> {
     /// The points of `lattice` that `holds` picks and that lie on walls. None if Ω's faces are capped.
     #[allow(clippy::cast_possible_truncation, reason = "fewer than 2¹⁶ polygons")]
@@ -66,7 +73,7 @@ impl<'a> Contacts<'a> {
         let walls: Vec<u32> = (0..scene.polygons().len() as u32)
             .filter(|&w| {
                 let wall = &scene.polygons()[w as usize];
-                wall.albedo != DVec3::ZERO && scene.boundary == Boundary::Open
+                wall.albedo != DVec3::ZERO && scene.boundary == Boundary::Open && is_by_a_face(wall, lattice)
             })
             .collect();
         let touching = |o: usize| {

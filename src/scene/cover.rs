@@ -24,21 +24,23 @@ impl Scene {
     #[allow(clippy::cast_possible_truncation, reason = "fewer than 2¹⁶ polygons")]
     pub fn covered_wall(&self, number: u32) -> Option<u32> {
         let light = &self.polygons()[number as usize];
-        if !light.opaque_back {
-            return None;
-        }
-        let (_, voxel) = voxel_along(self.lattice(), light);
-        let behind = |wall: &Polygon| {
-            let depth = |x: &DVec3| (*x - wall.vertices()[0]).dot(wall.normal());
-            light.normal().dot(wall.normal()) > 0.0
-                && light.vertices().iter().all(|x| depth(x) > 0.0 && depth(x) < SLIT * voxel && wall.contains(*x))
-        };
-        self.polygons().iter().position(behind).map(|wall| wall as u32)
+        self.polygons().iter().position(|wall| self.hangs_before(light, wall)).map(|wall| wall as u32)
+    }
+
+    fn hangs_before(&self, light: &Polygon, wall: &Polygon) -> bool {
+        let depth = |x: &DVec3| (*x - wall.vertices()[0]).dot(wall.normal());
+        let reach = || SLIT * voxel_along(self.lattice(), light).1;
+        light.opaque_back
+            && light.normal().dot(wall.normal()) > 0.0
+            && light.vertices().iter().all(|x| depth(x) > 0.0 && depth(x) < reach() && wall.contains(*x))
     }
 
     /// The luminaires that cover a part of polygon `wall`.
     pub fn covering(&self, wall: u32) -> impl Iterator<Item = &Polygon> {
-        (0..).zip(self.luminaires()).filter(move |(l, _)| self.covered_wall(*l) == Some(wall)).map(|(_, light)| light)
+        let covers = move |&(l, light): &(u32, &Polygon)| {
+            self.hangs_before(light, &self.polygons()[wall as usize]) && self.covered_wall(l) == Some(wall)
+        };
+        (0..).zip(self.luminaires()).filter(covers).map(|(_, light)| light)
     }
 
     /// Whether world point `x` lies between a luminaire and the wall that it covers, where no light gets.
