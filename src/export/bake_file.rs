@@ -14,10 +14,7 @@ use crate::field::{Field, FieldRows, Sweep};
 use crate::flat::{self, FlatLight, Within};
 use crate::flattened::Side;
 use crate::illumination_grid::{GridSize, IlluminationGrid};
-use crate::mask::Mask;
-use crate::polygon::Polygon;
 use crate::scene::{Boundary, Member, Policy, Scene, Surface};
-use crate::split::Split;
 use crate::volume::vti::{self, VtiFile, VtiWriter};
 use crate::volume::{Lattice, Samples, Volume};
 use arrays::Arrays;
@@ -121,10 +118,11 @@ pub fn field_file(path: &Path, name: &str) -> PathBuf {
 
 /// Writes a bake. Point data: `value` (source units, active scalars; in f64 where f32 is too coarse for the sweep, or
 /// does not hold all samples), `radiance` (linear RGB), `rgb` (exposed, clamped, sRGB-encoded), `std_error` (of
-/// luminance), `mask` ([`Mask`]), of a split bake `indirect` and `visible` ([`Split`]); with both sides also
-/// `radiance_inside` and so on. Field data: `wall_<name>` radiance over (u, v, isovalue), `wall_<name>_inside` where
-/// something else is known to be seen from within solids, `context` the same of all context geometry (each wall's one
-/// or two after each other), exposure, every number of the report, and all of it as JSON.
+/// luminance), `mask` ([`Mask`](crate::mask::Mask)), of a split bake `indirect` and `visible`
+/// ([`Split`](crate::split::Split)); with both sides also `radiance_inside` and so on. Field data: `wall_<name>`
+/// radiance over (u, v, isovalue), `wall_<name>_inside` where something else is known to be seen from within solids,
+/// `context` the same of all context geometry (each wall's one or two after each other), exposure, every number of the
+/// report, and all of it as JSON.
 ///
 /// # Errors
 /// `Io` if the file cannot be written.
@@ -309,6 +307,30 @@ pub struct BakedVolume {
     among_others: bool,
 }
 
+/// The light of each of `count` flats, where `textures` tell of it.
+fn flats(textures: &[TextureDescription], count: usize, arrays: &Arrays) -> Result<Vec<Option<FlatLight>>> {
+    let mut flats: Vec<Option<FlatLight>> = vec![None; count];
+    let mut read: Option<(&str, Vec<[f32; 3]>)> = None;
+    for t in textures {
+        let slot = flats.get_mut(t.flat).ok_or_else(|| t.wrong(format!("there are {count} flats")))?;
+        let texels = match &read {
+            Some((name, texels)) if *name == t.array => texels,
+            _ => &read.insert((&t.array, arrays.colours(&t.array)?)).1,
+        };
+        let texture = t.of(texels)?;
+        match slot {
+            None if !t.inside => {
+                let within = if t.outside_only { Within::Unknown } else { Within::Same };
+                *slot = Some(FlatLight { outside: texture, within });
+            }
+            Some(light) if t.inside && light.own().is_none() => light.within = Within::Own(texture),
+            None => return Err(t.wrong("none before it is of the flat's outside")),
+            Some(_) => return Err(t.wrong("another one is of the same flat")),
+        }
+    }
+    Ok(flats)
+}
+
 impl BakedVolume {
     /// A bake as if it were read.
     pub fn new(scene: Scene, bake: Bake) -> Self {
@@ -365,43 +387,11 @@ impl BakedVolume {
     }
 
     fn from_parts(path: &Path, file: VtiFile, d: Description) -> Result<Self> {
-        let points = file.lattice.len();
-        let (point_data, field_data) = (Arrays(&file.point_data), Arrays(&file.field_data));
+        let (points, arrays) = (file.lattice.len(), Arrays(&file.point_data));
         let surface = Surface { albedo: d.albedo, emission: d.emission, outside: d.outside, both_sides: d.both_sides };
-        let mut sides = Vec::new();
-        for (i, side) in surface.stored_sides().into_iter().enumerate() {
-            let s = suffix(i);
-            let mask = match point_data.samples(&format!("mask{s}"))? {
-                Samples::U8(v) if v.len() == points => v,
-                _ => return Err(Error::Invalid(format!("the array 'mask{s}' does not hold a byte per point"))),
-            };
-            let split = match point_data.holds(&format!("visible{s}")) {
-                true => Some(Split {
-                    indirect: point_data.colours_of(&format!("indirect{s}"), points)?,
-                    visible: point_data.colours_of(&format!("visible{s}"), points)?,
-                }),
-                false => None,
-            };
-            let grid = IlluminationGrid {
-                split,
-                radiance: point_data.colours_of(&format!("radiance{s}"), points)?,
-                std_error: point_data.floats_of(&format!("std_error{s}"), points)?,
-                mask: mask
-                    .iter()
-                    .map(|m| match m {
-                        1 => Mask::Valid,
-                        2 => Mask::Filled,
-                        _ => Mask::Empty,
-                    })
-                    .collect(),
-            };
-            sides.push((side, grid));
-        }
-        let values = match point_data.samples("value")? {
-            values @ Samples::F64(_) if values.len() == points => values.clone(),
-            _ => Samples::F32(point_data.floats_of("value", points)?),
-        };
-        let volume = Volume::new(path.display().to_string(), file.lattice, values)?;
+        let sides = surface.stored_sides().into_iter().enumerate();
+        let sides = sides.map(|(i, side)| Ok((side, arrays.grid(suffix(i), points)?))).collect::<Result<Vec<_>>>()?;
+        let volume = Volume::new(path.display().to_string(), file.lattice, arrays.values(points)?)?;
         let mut field = Field::new(&volume, Sweep::new(d.isovalues[0], d.isovalues[1])?)?;
         // Light is for the normals of the volume that was baked.
         if let Some(GridSize::Factors(factors)) = grid_size(&d.report).filter(|size| *size != GridSize::OWN)
@@ -409,51 +399,20 @@ impl BakedVolume {
         {
             field = field.with_normals_of(coarse);
         }
-        let polygons = d
-            .polygons
-            .into_iter()
-            .map(|p| {
-                let mut polygon = Polygon::new(&p.name, p.vertices, p.albedo, p.emission)?;
-                polygon.opaque_back &= p.other_face == 0;
-                polygon.other_face = p.other_face;
-                Ok(polygon)
-            })
-            .collect::<Result<Vec<_>>>()?;
         let boundary = if d.capped { Boundary::Capped } else { Boundary::Open };
         let member = Member { name: d.volume, field: field.into(), surface, boundary };
+        let polygons = d.polygons.into_iter().map(PolygonDescription::polygon).collect::<Result<Vec<_>>>()?;
         let scene = Scene::with_members(vec![member], Policy::Joint, polygons)?;
-        let mut flats: Vec<Option<FlatLight>> = vec![None; flat::count(&scene)];
-        let mut read: Option<(String, Vec<[f32; 3]>)> = None;
-        for t in d.textures {
-            let number = flats.len();
-            let slot = flats.get_mut(t.flat).ok_or_else(|| t.wrong(format!("there are {number} flats")))?;
-            let texels = match &read {
-                Some((name, texels)) if *name == t.array => texels,
-                _ => &read.insert((t.array.clone(), field_data.colours(&t.array)?)).1,
-            };
-            let texture = t.of(texels)?;
-            match slot {
-                None if !t.inside => {
-                    let within = if t.outside_only { Within::Unknown } else { Within::Same };
-                    *slot = Some(FlatLight { outside: texture, within });
-                }
-                Some(light) if t.inside && light.own().is_none() => light.within = Within::Own(texture),
-                None => return Err(t.wrong("none before it is of the flat's outside")),
-                Some(_) => return Err(t.wrong("another one is of the same flat")),
-            }
-        }
-        let (exposure, report) = (d.exposure, d.report);
-        // Such bakes hold the parameter that their fields share.
-        let among_others = !d.independent && point_data.holds("s");
         Ok(Self {
+            flats: flats(&d.textures, flat::count(&scene), &Arrays(&file.field_data))?,
             scene,
             sides,
-            flats,
-            exposure,
-            report,
+            exposure: d.exposure,
+            report: d.report,
             companions: Vec::new(),
             independent: d.independent,
-            among_others,
+            // Such bakes hold the parameter that their fields share.
+            among_others: !d.independent && arrays.holds("s"),
         })
     }
 

@@ -4,6 +4,7 @@ use crate::error::{Error, Result};
 use crate::flat::FlatTexture;
 use crate::flattened::Side;
 use crate::isovalue_axis::IsovalueAxis;
+use crate::polygon::Polygon;
 use crate::reflectance::Reflectance;
 use crate::volume::vti::VtiFile;
 use glam::DVec3;
@@ -92,6 +93,17 @@ pub(super) struct PolygonDescription {
     /// As [`Polygon::other_face`].
     #[serde(default)]
     pub other_face: i32,
+}
+
+impl PolygonDescription {
+    /// # Errors
+    /// `Invalid` if it is no planar convex polygon, or light does not fit it.
+    pub(super) fn polygon(self) -> Result<Polygon> {
+        let mut polygon = Polygon::new(&self.name, self.vertices, self.albedo, self.emission)?;
+        polygon.opaque_back &= self.other_face == 0;
+        polygon.other_face = self.other_face;
+        Ok(polygon)
+    }
 }
 
 impl Description {

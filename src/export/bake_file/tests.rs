@@ -1,4 +1,5 @@
 use super::*;
+use crate::polygon::Polygon;
 use serde_json::{Value, json};
 
 /// Reads a bake of 3³ points and one wall, whose description is `changed`.
@@ -17,6 +18,8 @@ fn read(changed: impl FnOnce(&mut Value)) -> Result<BakedVolume> {
         "report": {},
     });
     changed(&mut description);
+    let mut nan = [0.125f32; 24];
+    nan[20] = f32::NAN;
     let writer = VtiWriter::new(&lattice)
         .computed("value", 1, |o| (o % 3) as f32)
         .computed("radiance", 3, |_| 0.25)
@@ -26,6 +29,7 @@ fn read(changed: impl FnOnce(&mut Value)) -> Result<BakedVolume> {
         .field_data("twice", 3, &[0.125f32; 24][..])
         .field_data("twice", 3, &[0.25f32; 24][..])
         .field_data("broken", 1, &[0.125f32; 25][..])
+        .field_data("nan", 3, &nan[..])
         .field_string(DESCRIPTION, &description.to_string());
     writer.write(&path).unwrap();
     BakedVolume::read(&path)
@@ -50,6 +54,7 @@ fn descriptions_that_do_not_hold_are_refused() {
         ("array", json!("wall_b"), "wall_b"),
         ("array", json!("twice"), "twice"),
         ("array", json!("broken"), "broken"),
+        ("array", json!("nan"), "'nan' holds the colour [0.125, 0.125, NaN] at 6"),
     ] {
         let found = read(|d| d["textures"][0][key] = value.clone());
         let Err(error) = found else { panic!("{key} = {value} is accepted") };
