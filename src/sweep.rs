@@ -56,6 +56,7 @@ use crate::flattened::Side;
 use crate::isa::Isa;
 use crate::scene::{Boundary, Scene};
 pub(crate) use arrive::reports;
+pub(crate) use fans::seen;
 use flats::Flats;
 pub(crate) use flats::texels;
 use glam::DVec3;
@@ -189,10 +190,10 @@ pub fn supported(scene: &Scene) -> Result<()> {
             "{nx}×{ny}×{nz} points: sweeps number points in 31 bits; take a coarser grid or --engine photon"
         )));
     }
-    if scene.boundary == Boundary::Capped
-        && scene.surface.stored_sides().contains(&Side::Higher)
-        && lit_within_solids(scene)
-    {
+    // Stored, or seen through gaps.
+    let within = scene.surface.stored_sides().contains(&Side::Higher) && lit_within_solids(scene)
+        || scene.field.has_gaps() && glows(scene);
+    if scene.boundary == Boundary::Capped && within {
         return Err(Error::NotSupported(
             "boundary = \"capped\": sweeps take caps for black from within, where this scene has light; use --engine photon"
                 .into(),
@@ -213,7 +214,11 @@ pub fn supported(scene: &Scene) -> Result<()> {
 pub fn lit_within_solids(scene: &Scene) -> bool {
     let inside = ends::inside(scene);
     let lamp = inside.iter().zip(scene.luminaires()).any(|(inside, _)| *inside);
-    lamp || scene.surface.emission != DVec3::ZERO || scene.field.has_gaps()
+    lamp || glows(scene) || scene.field.has_gaps()
+}
+
+fn glows(scene: &Scene) -> bool {
+    scene.surface.emission != DVec3::ZERO
 }
 
 /// Numbers of a plane of light, on a lattice of `dims` whose lit nodes are these.
@@ -316,20 +321,23 @@ pub fn sweep_resumable(
     Ok(SweepResult { sides, lit, flats, bounces, residual, stopped, counts })
 }
 
-/// The sides that are swept: the stored ones, and the other one if light passes to it, or the luminaires mostly light
-/// it: walls are seen there.
+/// The sides that are swept: the stored ones, and the other one if light passes to it, if the luminaires mostly light
+/// it, or if the stored one lies within caps: walls and caps are seen there.
 pub(crate) fn swept_sides(scene: &Scene) -> Vec<Side> {
     // Only around the open rims of level sets: outside Ω, or beside samples that are not finite.
     let margin = {
         let [lo, hi] = gather::local_bounds(scene);
         lo.min(scene.lattice().far() - hi).min_element() < -1e-6
     };
-    let rims = (margin || scene.field.has_gaps()) && scene.boundary == Boundary::Open;
-    let coupled = rims && !scene.polygons().is_empty();
-    let walls = scene.boundary == Boundary::Open && scene.polygons().iter().any(|p| p.albedo != DVec3::ZERO);
+    let (open, lit) = (scene.boundary == Boundary::Open, !scene.polygons().is_empty());
+    // Surfaces that emit light what is beyond gaps without any luminaire.
+    let coupled = open && (lit && (margin || scene.field.has_gaps()) || glows(scene) && scene.field.has_gaps());
+    let walls = open && scene.polygons().iter().any(|p| p.albedo != DVec3::ZERO);
     let mut sides = scene.surface.stored_sides();
-    if sides.len() == 1 && (coupled || walls && lit_mostly_within(scene)) {
-        sides.push(sides[0].opposite());
+    if let [side] = sides[..]
+        && (coupled || walls && lit_mostly_within(scene) || !open && lit && side == Side::Higher)
+    {
+        sides.push(side.opposite());
     }
     sides
 }

@@ -394,11 +394,12 @@ fn walls_see_nothing_in_a_gap() {
     let scene = Scene::new(f, black, Boundary::Open, walls).unwrap();
     let got = run(&scene, SweepSettings { flat_resolution: (8, 20), ..ONE_BOUNCE });
     for (face, wall) in got.flats.iter().take(6).enumerate() {
-        let wall = &wall.as_ref().unwrap().outside;
-        let [nu, nv, nc] = wall.dims;
+        let wall = wall.as_ref().unwrap();
+        let [nu, nv, nc] = wall.outside.dims;
+        // Of what either side of the level sets sees.
         let mean = |t: usize| {
-            let texels = &wall.texels[t * nu * nv..(t + 1) * nu * nv];
-            texels.iter().map(|x| f64::from(x[1])).sum::<f64>() / texels.len() as f64
+            let texels = wall.textures().flat_map(|x| &x.texels[t * nu * nv..(t + 1) * nu * nv]);
+            texels.map(|x| f64::from(x[1])).sum::<f64>() / (nu * nv) as f64
         };
         let means: Vec<f64> = (0..nc).map(mean).collect();
         println!("face {face}: {means:.3?}");
@@ -406,6 +407,103 @@ fn walls_see_nothing_in_a_gap() {
             // The rims lie at 0.4 and 0.6.
             let there = ((t as f64 + 0.5) / nc as f64 - 0.5).abs() > 0.1;
             assert!(if there { *mean > 0.05 } else { *mean == 0.0 }, "face {face}, texel {t}: {mean}");
+        }
+    }
+}
+
+/// A sample that is missing far away changes nothing of what is dark in a ball that stands on a wall.
+#[test]
+fn walls_in_closed_solids_are_dark_if_a_sample_is_missing_elsewhere() {
+    let lit = |missing: bool| {
+        let f = field(cube(21, 0.0, 1.0), (0.2, 0.8), |x| {
+            if missing && x.min_element() > 0.99 {
+                f64::NAN
+            } else {
+                (1.3 - 3.0 * (x - DVec3::new(0.0, 0.5, 0.4)).length()).max(0.0)
+            }
+        });
+        let walls = cornell_box(f.lattice(), 0.0).unwrap();
+        let surface = Surface { outside: Side::Higher, ..Surface::default() };
+        run(&Scene::new(f, surface, Boundary::Open, walls).unwrap(), SweepSettings { max_bounces: 3, ..ONE_BOUNCE })
+    };
+    let [whole, holed] = [false, true].map(lit);
+    for got in [&whole, &holed] {
+        let most = got.sides[0].irradiance.iter().flatten().fold(0f32, |m, x| m.max(*x));
+        assert!(got.sides[0].side == Side::Higher && most < 1e-3, "{most} within the ball");
+    }
+    // The wall that it stands on, as the inside sees it and as the outside does.
+    let seen = |got: &SweepResult, inside: bool| {
+        let light = got.flats.iter().flatten().find(|light| light.own().is_some()).expect("a wall with two sides");
+        let texture = if inside { &light.outside } else { light.own().unwrap() };
+        texture.texels.as_flattened().iter().map(|x| f64::from(*x)).sum::<f64>() / texture.texels.len() as f64
+    };
+    for inside in [false, true] {
+        let [a, b] = [seen(&whole, inside), seen(&holed, inside)];
+        assert!((a - b).abs() < 0.02 * seen(&whole, false), "{inside}: {a} {b}");
+    }
+    assert!(seen(&whole, true) < 0.5 * seen(&whole, false));
+}
+
+/// What stands beyond gaps shines from behind, too, whether light of its inside is stored or not.
+#[test]
+fn surfaces_that_glow_are_seen_from_behind_through_gaps() {
+    let scene = |both_sides: bool| {
+        let f = field(cube(17, 0.0, 1.0), (-0.9, 0.9), |x| {
+            if (x.y - 0.5).abs() < 0.1 { f64::NAN } else { (5.0 * x.x + 1.0).sin() * (6.0 * x.y).sin() + 0.3 * x.z }
+        });
+        let surface = Surface { emission: DVec3::ONE, both_sides, ..Surface::default() };
+        Scene::new(f, surface, Boundary::Open, Vec::new()).unwrap()
+    };
+    let [one, both] = [false, true].map(|both| run(&scene(both), ONE_BOUNCE));
+    assert_eq!((one.sides.len(), both.sides.len()), (1, 2));
+    assert!(one.sides[0].irradiance.iter().flatten().any(|x| *x > 0.0));
+    assert_eq!(one.sides[0].irradiance, both.sides[0].irradiance);
+    let capped = Scene::new((*scene(false).field).clone(), scene(false).surface, Boundary::Capped, Vec::new()).unwrap();
+    assert!(sweep(&capped, &ONE_BOUNCE, &|_| true).is_err(), "caps are no black walls there");
+}
+
+/// The inside of capped solids is dark, but not the room around them.
+#[test]
+fn walls_and_caps_are_lit_if_the_inside_is_stored() {
+    let lit = |outside: Side| {
+        let f = field(cube(13, 0.0, 1.0), (0.2, 0.8), |x| x.x);
+        let walls = cornell_box(f.lattice(), 0.3).unwrap();
+        let surface = Surface { outside, ..Surface::default() };
+        run(&Scene::new(f, surface, Boundary::Capped, walls).unwrap(), SweepSettings { max_bounces: 3, ..ONE_BOUNCE })
+    };
+    let [lower, higher] = [Side::Lower, Side::Higher].map(lit);
+    assert_eq!(higher.sides[0].side, Side::Higher);
+    assert!(higher.sides[0].irradiance.iter().flatten().all(|x| *x == 0.0));
+    // Walls and caps.
+    let mean = |got: &SweepResult| -> Vec<f64> {
+        let textures = got.flats.iter().flatten().map(|light| light.outside.texels.as_flattened());
+        textures.map(|x| x.iter().map(|x| f64::from(*x)).sum::<f64>() / x.len() as f64).collect()
+    };
+    let [lower, higher] = [mean(&lower), mean(&higher)];
+    println!("{lower:.4?} {higher:.4?}");
+    // Five walls and five caps: the ramp is 0 in the sixth face.
+    assert!(lower.len() == higher.len() && lower.iter().filter(|x| **x > 1e-5).count() >= 9);
+    for (a, b) in lower.iter().zip(&higher) {
+        assert!((a - b).abs() <= 0.02 * a, "{a} {b}");
+    }
+}
+
+/// Light of a luminaire comes as from infinity, however far away it is: its fourth power need not be a number.
+#[test]
+fn luminaires_may_be_very_far_away() {
+    let lit = |far: f64| {
+        let f = field(cube(13, 0.0, 1.0), (0.2, 0.8), |x| x.z + 0.1 * (5.0 * x.x).sin());
+        let corners = [[-0.1, -0.1], [-0.1, 0.1], [0.1, 0.1], [0.1, -0.1]];
+        let corners = corners.map(|[x, y]| far * DVec3::new(x, y, 1.0)).to_vec();
+        let light = Polygon::new("far", corners, DVec3::ZERO, DVec3::ONE).unwrap();
+        let surface = Surface { outside: Side::Higher, ..Surface::default() };
+        run(&Scene::new(f, surface, Boundary::Open, vec![light]).unwrap(), ONE_BOUNCE)
+    };
+    let near = lit(1e5);
+    assert!(near.sides[0].irradiance.iter().flatten().any(|x| *x > 0.02));
+    for far in [1e8, 1e9, 1e12] {
+        for (a, b) in near.sides[0].irradiance.iter().flatten().zip(lit(far).sides[0].irradiance.iter().flatten()) {
+            assert!((a - b).abs() < 1e-3, "{far}: {a} {b}");
         }
     }
 }

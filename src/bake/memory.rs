@@ -63,11 +63,12 @@ const SWEPT_SIDE: u64 = 8;
 const SETTLING_SIDE: u64 = 8;
 /// Bytes per place of its planes (normals, one plane of a pass turned over), per place and swept side (direct light,
 /// what a pass gathers; and sums over replicates), and per place and stored side (their spread, while it is written).
-/// Direct light takes less: planes of sums, and what its lines see.
 const PLACED: u64 = 8;
 const PLACED_SIDE: u64 = 18;
 const SUMMED_SIDE: u64 = 6;
 const SPREAD_SIDE: u64 = 3;
+/// Per place and swept side while luminaires' lines are followed, besides what these see.
+const DIRECT_SIDE: u64 = 8;
 /// Per place and swept side while light settles, before there are such sums: what lines read a pass before, in a
 /// checkpoint.
 const BEFORE_SIDE: u64 = 6;
@@ -241,7 +242,7 @@ impl Parts {
         // Of all fields; sides stored of any.
         let (mut voxels, mut points, mut filled, mut samples, mut side_points, mut stored) = (0, 0, 0, 0, 0, 0);
         let (mut halves, mut slices) = (0, 0);
-        let (mut shown, mut places, mut known) = (0, 0, 0);
+        let (mut shown, mut places, mut known, mut seen) = (0, 0, 0, 0);
         let smoothing = settings.smooths() && settings.strategy == StrategyName::Nodes;
         let mut all_masks = Vec::new();
         let members = scene.members();
@@ -262,6 +263,7 @@ impl Parts {
             if settings.engine == Engine::Sweep {
                 let share = sweep::places(member.field.lattice().dims(), &lit) as f64 / own_voxels as f64;
                 places += (share * own_points as f64) as u64;
+                seen = sweep::seen(scene, &lattice).max(seen);
                 known += if 2 * (own + own_filled) > own_points { own_points } else { own + own_filled };
             }
             shown += own + own_filled;
@@ -300,7 +302,8 @@ impl Parts {
         let swept = points * SWEPT
             + sides * points * SWEPT_SIDE
             + places * summed
-            + sides * (points * SETTLING_SIDE + places * settling).max(places * 2 * SUMMED_SIDE)
+            + (sides * (points * SETTLING_SIDE + places * settling).max(places * 2 * SUMMED_SIDE))
+                .max(sides * places * DIRECT_SIDE + seen)
             + sweep::reports(scene, across, settings.wall_isovalues) as u64;
         let ([landings, lower, higher], gather) = match settings.engine {
             Engine::Photon => (landings(scene, settings, device)?, settings.gather_rays > 0),

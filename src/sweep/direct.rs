@@ -18,8 +18,10 @@ use crate::flat;
 use crate::flattened::Side;
 use crate::isa::Isa;
 use crate::luminaire::{point_term, unoccluded};
+use crate::polygon::Polygon;
 use crate::rng::{Rng, Stage};
 use crate::scene::Scene;
+use crate::volume::Lattice;
 use glam::DVec3;
 use rayon::prelude::*;
 
@@ -33,6 +35,17 @@ pub(super) fn clearance(scene: &Scene, geometry: &Geometry, sides: &[Side]) -> O
     (!inside).then(|| Clearance::new(geometry))
 }
 
+/// The unit of length in which nodes see a luminaire: fourth powers of the world's lengths do not fit f32, nor those of
+/// distances of more than 10⁹ voxels.
+fn unit(lattice: &Lattice, light: &Polygon) -> f64 {
+    let centre = lattice.to_world(0.5 * lattice.far());
+    let farthest = light.vertices().iter().map(|v| v.distance(centre)).fold(0.0, f64::max);
+    lattice.unit().max(farthest / MOST_UNITS)
+}
+
+/// Luminaires are no farther away.
+const MOST_UNITS: f64 = 1e6;
+
 /// Direct irradiance of every node, one set of planes per side in `sides`; that of the flats is added to theirs at the
 /// end. `tick` is asked before every point; false stops.
 #[allow(clippy::cast_possible_truncation, reason = "irradiance is f32")]
@@ -45,7 +58,6 @@ pub(super) fn direct(
     tick: &mut dyn FnMut() -> bool,
 ) -> (Vec<Planes>, bool) {
     let (lit, lattice) = (geometry.lit_rows(), scene.lattice());
-    let unit = lattice.unit();
     let mut planes: Vec<Planes> = sides.iter().map(|_| spare.black(geometry.places())).collect();
     let [nx, ny, _] = geometry.dims;
     let corners = lattice.corners().map(|p| lattice.to_world(p));
@@ -57,6 +69,7 @@ pub(super) fn direct(
     let shares: Vec<OpenShare> = (0..).zip(scene.luminaires()).map(|light| part.open_share(scene, light)).collect();
     for ((number, light), open) in (0..).zip(scene.luminaires()).zip(&shares) {
         let points = part.on(light, number);
+        let unit = unit(lattice, light);
         let blockers = Blockers::new(scene, number, &corners);
         // Σ V g and Σ g of every side at every place of planes, whatever factor all g of one have.
         let per = sides.len();
@@ -77,7 +90,7 @@ pub(super) fn direct(
                 true => [f32::NEG_INFINITY, f32::INFINITY],
             };
             fans.march((geometry, isa, sides), y, start);
-            // Fourth powers of the world's lengths do not fit f32; the unit falls out.
+            // The unit falls out.
             let emitter = Emitter {
                 fans: &fans,
                 number,

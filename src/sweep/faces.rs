@@ -143,7 +143,7 @@ impl<'a> Touching<'a> {
     #[allow(clippy::cast_possible_truncation, reason = "texture coordinates")]
     pub(super) fn now(&self, geometry: &Geometry, flats: &Flats, side: Side) -> Touched<'_> {
         let (lattice, dims) = (self.scene.lattice(), geometry.dims);
-        let stands = Light { b: &[], flats: &flats.packed, isovalues: flats.isovalues, axis: &flats.axis };
+        let stands = Light { b: &[], flats: &flats.packed, isovalues: flats.isovalues, axis: &flats.axis, across: 0 };
         let radiance = std::array::from_fn(|face| {
             let shown = |(at, &number): (usize, &u16)| {
                 let Some(wall) = self.scene.polygons().get(usize::from(number)) else { return Half4::default() };

@@ -7,8 +7,12 @@ use super::gaps::Hidden;
 use super::grid::Geometry;
 use crate::flattened::Side;
 use crate::isa::Isa;
+use crate::polygon::Polygon;
+use crate::scene::Scene;
+use crate::volume::Lattice;
 use glam::DVec3;
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// A sample of a fan that lies in Ω; what it sees of its source on either side.
 pub(super) const SAMPLED: u8 = 1;
@@ -29,8 +33,36 @@ pub(super) struct Fan {
     /// First line and their number along u and v, numbered by where they meet the lattice's plane.
     pub first: [isize; 2],
     pub count: [usize; 2],
-    /// Where what they see begins.
-    pub begin: usize,
+    /// What is kept of each slice, and of each row of lines.
+    kept: Vec<Kept>,
+    rows: Vec<Row>,
+}
+
+/// The lines that meet Ω in a slice, and next to it: what they see is kept. In others, as all of a long volume's lines
+/// are but near the source, nobody asks.
+#[derive(Clone, Copy)]
+pub(super) struct Kept {
+    /// First line and their number along u and v.
+    pub first: [usize; 2],
+    pub count: [usize; 2],
+    /// Lines of one row in the slices before it, less the first; wraps around.
+    place: usize,
+}
+
+impl Kept {
+    /// Lines of one row in the slices before it.
+    fn before(&self) -> usize {
+        self.place.wrapping_add(self.first[0])
+    }
+}
+
+/// The slices that a row of lines is kept in.
+#[derive(Clone, Copy)]
+struct Row {
+    first: usize,
+    count: usize,
+    /// Where what it sees begins, less what [`Kept::place`] says of the first; wraps around.
+    begin: usize,
 }
 
 impl Fan {
@@ -61,12 +93,69 @@ impl Fan {
         let first = lines.map(|[low, _]| low.floor() as isize);
         // Two at least, to interpolate between.
         let count = [0, 1].map(|x| (lines[x][1].ceil() as isize - first[x]).max(1).unsigned_abs() + 1);
-        Some(Self { layout, source, depth, slices, first, count, begin: 0 })
+        let mut fan = Self { layout, source, depth, slices, first, count, kept: Vec::new(), rows: Vec::new() };
+        let mut place = 0usize;
+        for step in 0..slices.1 {
+            let [us, vs] = [0, 1].map(|axis| fan.lines(axis, step));
+            fan.kept.push(Kept { first: [us.0, vs.0], count: [us.1, vs.1], place: place.wrapping_sub(us.0) });
+            place += us.1;
+        }
+        Some(fan)
     }
 
-    /// Bytes of a row of lines.
-    pub(super) fn row(&self) -> usize {
-        self.count[0] * self.slices.1
+    /// First line along u (`axis` 0) or v and their number that meet Ω in the slice at `step`, with two more on either
+    /// side: two at least.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the fan")]
+    fn lines(&self, axis: usize, step: usize) -> (usize, usize) {
+        let (source, most) = (self.source[axis], self.count[axis]);
+        let inverse = self.depth / (self.slice(step) as f64 - self.source[2]);
+        let [low, high] = [0.0, self.layout.dims[axis] as f64 - 1.0]
+            .map(|u| source + (u - source) * inverse - self.first[axis] as f64);
+        let first = ((low.floor() - 2.0).max(0.0) as usize).min(most - 2);
+        let end = ((high.ceil() + 3.0).max(0.0) as usize).clamp(first + 2, most);
+        (first, end - first)
+    }
+
+    /// Finds a place for what is seen, from `begin` on; where the next fan's begins.
+    fn place(&mut self, mut begin: usize) -> usize {
+        // The slices in which a row meets Ω follow one another.
+        self.rows = vec![Row { first: usize::MAX, count: 0, begin: 0 }; self.count[1]];
+        let of = |step: usize| self.kept.get(step).map_or(0..0, |kept| kept.first[1]..kept.first[1] + kept.count[1]);
+        let mut before = 0..0;
+        for step in 0..=self.kept.len() {
+            let now = of(step);
+            without(&now, &before).for_each(|n| self.rows[n].first = self.rows[n].first.min(step));
+            without(&before, &now).for_each(|n| self.rows[n].count = step - self.rows[n].first);
+            before = now;
+        }
+        for n in 0..self.rows.len() {
+            if self.rows[n].count > 0 {
+                self.rows[n].begin = begin.wrapping_sub(self.kept[self.rows[n].first].before());
+                begin += self.length(n);
+            }
+        }
+        begin
+    }
+
+    /// Bytes of row `n` of lines.
+    fn length(&self, n: usize) -> usize {
+        let Row { first, count, .. } = self.rows[n];
+        let Some(last) = count.checked_sub(1) else { return 0 };
+        let last = &self.kept[first + last];
+        last.before() + last.count[0] - self.kept[first].before()
+    }
+
+    /// What is kept of the slice at `step`.
+    #[inline(always)]
+    pub(super) fn kept(&self, step: usize) -> &Kept {
+        &self.kept[step]
+    }
+
+    /// Where what row `n` sees in the slice at `step` begins, if that is kept, and it would there be line 0; wraps
+    /// around.
+    #[inline(always)]
+    pub(super) fn line_zero(&self, n: usize, step: usize) -> usize {
+        self.rows[n].begin.wrapping_add(self.kept[step].place)
     }
 
     #[inline]
@@ -96,7 +185,11 @@ impl Fan {
         least.resize(np, start[1]);
         hidden.iter_mut().for_each(|hidden| hidden.clear(np));
         let q = (self.first[1] + row as isize) as f64;
-        for (step, out) in out.chunks_exact_mut(np).enumerate() {
+        let Row { first, count, .. } = self.rows[row];
+        let mut rest = out;
+        for (step, kept) in (first..first + count).zip(&self.kept[first..]) {
+            let out;
+            (out, rest) = rest.split_at_mut(kept.count[0]);
             let k = self.slice(step);
             let ratio = (k as f64 - self.source[2]) / self.depth;
             let v = self.source[1] + (q - self.source[1]) * ratio;
@@ -126,9 +219,10 @@ impl Fan {
             self.enter(h, (step, q), (lo, hi), [most, least], mixed);
             mix(mixed, [&h[k * sa + j * sv..][i0..i1], &h[k * sa + (j + 1) * sv..][i0..i1]], fv);
             let place = [u0 + lo as f32 * du - i0 as f32, du];
-            isa.march(mixed, place, [&mut most[lo..hi], &mut least[lo..hi]], &mut out[lo..hi], turn);
+            let out = &mut out[lo - kept.first[0]..hi - kept.first[0]];
+            isa.march(mixed, place, [&mut most[lo..hi], &mut least[lo..hi]], out, turn);
             if let Some(hidden) = hidden {
-                hidden.look(mixed, place, lo, [&mut most[lo..hi], &mut least[lo..hi]], &mut out[lo..hi]);
+                hidden.look(mixed, place, lo, [&mut most[lo..hi], &mut least[lo..hi]], out);
             }
         }
     }
@@ -205,7 +299,7 @@ pub(super) struct Fans {
     /// What is seen of the source before anything of Ω is passed: lower, higher side.
     pub entering: [f32; 2],
     pub fans: [Option<Fan>; 6],
-    /// What their lines see, [fan][row][slice][line], and what is left of other points' fans.
+    /// What their lines see, [fan][row][slice][line], where that is [`Kept`], and what is left of other points' fans.
     pub seen: Vec<u8>,
     /// A multiple of [`TURN`].
     pub turn: u8,
@@ -228,20 +322,18 @@ impl Fans {
             self.turn = TURN;
         }
         let turn = self.turn;
-        let mut length = 0;
-        for fan in self.fans.iter_mut().flatten() {
-            fan.begin = length;
-            length += fan.count[1] * fan.row();
-        }
+        let length = self.fans.iter_mut().flatten().fold(0, |begin, fan| fan.place(begin));
         if self.seen.len() < length {
             self.seen = Vec::new();
             self.seen = vec![0; length];
         }
         let (mut rows, mut rest) = (Vec::new(), &mut self.seen[..]);
         for fan in self.fans.iter().flatten() {
-            let (seen, after) = rest.split_at_mut(fan.count[1] * fan.row());
-            rows.extend(seen.chunks_exact_mut(fan.row()).enumerate().map(|(row, out)| (fan, row, out)));
-            rest = after;
+            for row in 0..fan.rows.len() {
+                let out;
+                (out, rest) = rest.split_at_mut(fan.length(row));
+                rows.push((fan, row, out));
+            }
         }
         rows.into_par_iter().with_max_len(8).for_each_init(
             || (geometry.has_gaps().then(Hidden::default), [const { Vec::new() }; 3]),
@@ -252,6 +344,23 @@ impl Fans {
             },
         );
     }
+}
+
+/// Bytes of what the fans of a luminaire's middle see on `lattice`, of that luminaire where it is most.
+pub(crate) fn seen(scene: &Scene, lattice: &Lattice) -> u64 {
+    let of = |light: &Polygon| {
+        let v = light.vertices();
+        let y = lattice.to_index(v.iter().sum::<DVec3>() / v.len() as f64);
+        let fans = (0..6).filter_map(|f| Fan::new(lattice.dims(), y, f % 3, f >= 3));
+        fans.flat_map(|fan| fan.kept).map(|kept| kept.count[0] as u64 * kept.count[1] as u64).sum()
+    };
+    scene.luminaires().iter().map(of).max().unwrap_or(0)
+}
+
+/// What is in one range and not in another.
+fn without(range: &Range<usize>, other: &Range<usize>) -> impl Iterator<Item = usize> {
+    let (start, end) = (other.start.min(range.end), other.end.max(range.start));
+    (range.start..start).chain(end..range.end)
 }
 
 /// The row between two, `f` from the first.
@@ -316,6 +425,15 @@ pub(super) mod tests {
             .unwrap()
     }
 
+    impl Fan {
+        /// Where what line (p, q) sees in the slice at `step` is kept.
+        pub(in crate::sweep) fn at(&self, [p, q]: [usize; 2], step: usize) -> Option<usize> {
+            let kept = self.kept[step];
+            let within = |n: usize, x: usize| (kept.first[n]..kept.first[n] + kept.count[n]).contains(&x);
+            (within(0, p) && within(1, q)).then(|| self.line_zero(q, step).wrapping_add(p))
+        }
+    }
+
     /// What node x sees, beside others of its row.
     pub(in crate::sweep) fn visibility(fans: &Fans, [i, j, k]: [usize; 3]) -> Option<[f32; 2]> {
         let seen = fans.visibility([i / LANES * LANES, j, k], &[true; LANES]);
@@ -374,7 +492,7 @@ pub(super) mod tests {
                             entries += usize::from((within - k).abs() > 1e-6);
                         }
                         let h = field.value(at(k).clamp(DVec3::ZERO, far)) as f32;
-                        let seen = fans.seen[fan.begin + q * fan.row() + step * fan.count[0] + p];
+                        let seen = fans.seen[fan.at([p, q], step).expect("lines that meet Ω are kept")];
                         // What others hide below the sweep, or above, lines need not know.
                         if seen & !(TURN - 1) == fans.turn && seen & SAMPLED != 0 && in_sweep(h) {
                             for (n, (bit, margin)) in [(LOWER, h - most), (HIGHER, least - h)].into_iter().enumerate() {
@@ -423,6 +541,18 @@ pub(super) mod tests {
             }
         }
         assert!(known > 3000 && lit * 20 > known * 19, "{lit} of {known}");
+    }
+
+    /// Lines spread from a source in a long volume, most of which leave it after a few slices.
+    #[test]
+    fn fans_of_long_volumes_hold_what_meets_these() {
+        let field = noise([400, 5, 4], 400, None);
+        let (geometry, isa) = (Geometry::new(&field), Isa::current());
+        let mut fans = Fans::default();
+        fans.march((&geometry, isa, &[Side::Lower]), DVec3::new(13.3, 2.2, 1.7), [0.3; 2]);
+        assert!(fans.seen.len() < 400 * 400 * 40, "{} bytes", fans.seen.len());
+        let known = |&at: &usize| visibility(&fans, field.lattice().ijk(at)).is_some();
+        assert_eq!((0..geometry.h.len()).filter(known).count(), geometry.h.len());
     }
 
     /// From sources within the lattice and outside, one after the other and whole rounds of turns apart.

@@ -38,7 +38,7 @@ pub(super) struct Texture {
     /// While light settles again: what many directions brought more than few. Empty otherwise.
     pub defect: Vec<f32>,
     /// Where the texture starts in [`Flats::packed`].
-    start: usize,
+    pub start: usize,
     /// ∫cos dω as the pass has seen it, per texel and isovalue: π where no part of it is inside the solid.
     weight: Vec<f32>,
 }
@@ -127,11 +127,8 @@ impl Flats {
         let centres = axis.centres(isovalues);
         let shapes: Vec<_> = shapes(scene, across).collect();
         let solid = |(flat, dims): &(Flat, _)| solid(scene, flat, *dims, &axis, isovalues);
-        // Where samples are missing rays come to walls on the side that they did not leave.
         let solid: Vec<_> = match sides {
-            [_, _] if !capped(scene) && !scene.field.has_gaps() => {
-                shapes.iter().map(|shape| shape.as_ref().map(solid)).collect()
-            }
+            [_, _] if !capped(scene) => shapes.iter().map(|shape| shape.as_ref().map(solid)).collect(),
             _ => Vec::new(),
         };
         let apart = solid.iter().flatten().flatten().any(|n| *n != FREE);
@@ -171,6 +168,11 @@ impl Flats {
     pub(super) fn number(&self, flat: u32, side: Side) -> u32 {
         let apart = !self.solid.is_empty() && side == Side::Higher;
         flat + if apart { self.count as u32 } else { 0 }
+    }
+
+    /// How far in [`Flats::packed`] what the higher side sees lies behind what the lower one does.
+    pub(super) fn across(&self) -> usize {
+        if self.solid.is_empty() { 0 } else { (self.packed.len() - self.isovalues) / 2 }
     }
 
     /// Whether nothing reflects.

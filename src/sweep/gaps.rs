@@ -262,6 +262,7 @@ impl Pack {
             Met::Front(node) => colour(light.b[node as usize]),
             Met::Back(node) => colour(back.get(node as usize).copied().unwrap_or_default()),
             Met::End(place) => light.end(place, way.sign * value),
+            Met::Within(place) => light.other_end(place, way.sign * value),
             Met::Dark => [0.0; 3],
         }
     }
@@ -309,11 +310,14 @@ impl Pack {
     }
 
     /// What a ray of isovalue `value` meets that meets no level set, whether it came back from a gap (`returned`) or
-    /// not: what stands at the end of its line, or a cap from within the solid, which is black.
+    /// not: what stands at the end of its line; from within the solid a cap, which is black, or a wall as the other
+    /// side sees it.
     fn exit(&self, way: Way, (value, returned): (f32, bool), lane: usize, forward: bool) -> Met {
+        let end = self.lasts[usize::from(!forward)][lane] as usize;
         match self.border(lane, forward) {
             Some(h) if way.capped && returned && h >= value => Met::Dark,
-            _ => Met::End(self.lasts[usize::from(!forward)][lane] as usize),
+            Some(h) if returned && (h > value || !way.strict && h == value) => Met::Within(end),
+            _ => Met::End(end),
         }
     }
 
@@ -353,11 +357,13 @@ impl Pack {
 }
 
 /// What a ray meets beyond a gap: a level set from outside or from within the solid, by the node that stands for it, or
-/// what is at a place of the ends, or nothing that shines.
+/// what is at a place of the ends, as this side of the level sets sees it or as the other one does, or nothing that
+/// shines.
 enum Met {
     Front(u32),
     Back(u32),
     End(usize),
+    Within(usize),
     Dark,
 }
 
@@ -429,7 +435,7 @@ mod tests {
             pack.cuts = vec![Cut { row: 14, lane: 3, places: [12, 16] }, Cut { row: 27, lane: 3, places: [20, 24] }];
             pack.open_gaps();
             let way = Way { strict: seed % 2 == 1, sign: 1.0, capped: seed % 4 == 2 };
-            let light = Light { b: &front, flats: &flats, isovalues: 4, axis: &IsovalueAxis::EVEN };
+            let light = Light { b: &front, flats: &flats, isovalues: 4, axis: &IsovalueAxis::EVEN, across: 0 };
             let mut out = vec![vec![0f32; (ROWS - 2) * LANES]; 3];
             pack.scan(way, light, &mut out, (LANES, 0));
             let mut missing = [0; ROWS - 2];

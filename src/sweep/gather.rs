@@ -83,7 +83,14 @@ struct Family<'a> {
 
 impl Family<'_> {
     fn light(&self) -> Light<'_> {
-        Light { b: self.source.b, flats: &self.flats.packed, isovalues: self.flats.isovalues, axis: &self.flats.axis }
+        let across = self.flats.across().cast_signed();
+        Light {
+            b: self.source.b,
+            flats: &self.flats.packed,
+            isovalues: self.flats.isovalues,
+            axis: &self.flats.axis,
+            across: if self.way.strict { -across } else { across },
+        }
     }
 }
 

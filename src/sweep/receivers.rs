@@ -4,7 +4,7 @@
 #![allow(clippy::needless_range_loop, reason = "a lane indexes several arrays at once")]
 
 use super::blockers::Blockers;
-use super::fans::{Fan, Fans, HIGHER, LOWER, SAMPLED, TURN};
+use super::fans::{Fan, Fans, HIGHER, Kept, LOWER, SAMPLED, TURN};
 use super::normals::decode;
 use super::pack::LANES;
 use glam::DVec3;
@@ -133,15 +133,22 @@ impl Fan {
     fn look_across(&self, seen: &[u8], x: &[f64; LANES], row: [f64; 3], out: &mut Around) {
         let [_, v, a] = self.layout.axes.map(|axis| row[axis]);
         let inverse = self.depth / (a - self.source[2]);
+        let step = self.step(a);
+        let kept = *self.kept(step);
         let mut line = [0; LANES];
         for l in 0..LANES {
-            (line[l], out.f[l]) = self.line(0, x[l], inverse);
+            (line[l], out.f[l]) = self.line(0, x[l], inverse, &kept);
         }
-        let (j, g) = self.line(1, v, inverse);
+        let (j, g) = self.line(1, v, inverse, &kept);
         out.g = [g; LANES];
-        let [near, far] = [0, 1].map(|dj| &seen[self.row_of(j + dj, a)..][..self.count[0]]);
+        let first = kept.first[0];
+        let [near, far] = [0, 1].map(|dj| {
+            let begin = self.line_zero(j as usize + dj, step).wrapping_add(first);
+            &seen[begin..][..kept.count[0]]
+        });
         for l in 0..LANES {
-            (out.near[l], out.far[l]) = (pair(near, line[l]), pair(far, line[l]));
+            let at = line[l] as usize - first;
+            (out.near[l], out.far[l]) = (pair(near, at), pair(far, at));
         }
     }
 
@@ -149,16 +156,14 @@ impl Fan {
     #[inline(always)]
     fn look_along(&self, seen: &[u8], x: &[f64; LANES], row: [f64; 3], own: &[bool; LANES], out: &mut Around) {
         let [u, v, _] = self.layout.axes.map(|axis| row[axis]);
-        let (mut line, mut j) = ([0; LANES], [0; LANES]);
-        for l in 0..LANES {
-            let inverse = self.depth / (x[l] - self.source[2]);
-            let (f, g);
-            ((line[l], f), (j[l], g)) = (self.line(0, u, inverse), self.line(1, v, inverse));
-            (out.f[l], out.g[l]) = if own[l] { (f, g) } else { (out.f[l], out.g[l]) };
-        }
         for l in 0..LANES {
             if own[l] {
-                let at = |dj: i32| pair(&seen[self.row_of(j[l] + dj, x[l])..], line[l]);
+                let inverse = self.depth / (x[l] - self.source[2]);
+                let step = self.step(x[l]);
+                let kept = self.kept(step);
+                let ((line, f), (j, g)) = (self.line(0, u, inverse, kept), self.line(1, v, inverse, kept));
+                (out.f[l], out.g[l]) = (f, g);
+                let at = |dj: usize| pair(seen, self.line_zero(j as usize + dj, step).wrapping_add(line as usize));
                 (out.near[l], out.far[l]) = (at(0), at(1));
             }
         }
@@ -166,10 +171,10 @@ impl Fan {
 
     /// Of the lines along u (`axis` 0) or v the cell where a node at `x` of that axis lies, and where in it: around it,
     /// or next to it within Ω if it is the first or last. `inverse`: the depth of the lattice's plane, in that of the
-    /// node.
+    /// node, in whose slice some are `kept`.
     #[inline(always)]
     #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, reason = "clamped to the fan")]
-    fn line(&self, axis: usize, x: f64, inverse: f64) -> (i32, f32) {
+    fn line(&self, axis: usize, x: f64, inverse: f64, kept: &Kept) -> (i32, f32) {
         let p = self.source[axis] + (x - self.source[axis]) * inverse - self.first[axis] as f64;
         let line = if x == 0.0 {
             p.ceil()
@@ -178,25 +183,24 @@ impl Fan {
         } else {
             p
         };
-        let line = (line.max(0.0) as i32).min((self.count[axis] - 2) as i32);
+        let first = kept.first[axis] as i32;
+        let line = (line as i32).clamp(first, first + (kept.count[axis] - 2) as i32);
         (line, (p - f64::from(line)) as f32)
     }
 
-    /// Where what row `j` of lines sees in slice `k` begins.
+    /// Slices from the first to slice `k`.
     #[inline(always)]
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the fan")]
-    fn row_of(&self, j: i32, k: f64) -> usize {
+    fn step(&self, k: f64) -> usize {
         // A node as good as at the source lies before the first slice.
-        let step = (k as usize).abs_diff(self.slices.0).min(self.slices.1 - 1);
-        self.begin + (j as usize * self.slices.1 + step) * self.count[0]
+        (k as usize).abs_diff(self.slices.0).min(self.slices.1 - 1)
     }
 }
 
-/// What two lines of a row see.
+/// What line `at` of those that are `seen` and the next one see.
 #[inline(always)]
-#[allow(clippy::cast_sign_loss, reason = "clamped to the fan")]
-fn pair(row: &[u8], line: i32) -> u32 {
-    let pair = &row[line as usize..][..2];
+fn pair(seen: &[u8], at: usize) -> u32 {
+    let pair = &seen[at..][..2];
     u32::from(u16::from_le_bytes([pair[0], pair[1]]))
 }
 
@@ -255,7 +259,7 @@ mod tests {
         };
         let ((i, f), (j, g)) = (line(0, u), line(1, v));
         let sees = |di: usize, dj: usize| {
-            let seen = fans.seen[fan.begin + (j + dj) * fan.row() + step * fan.count[0] + i + di];
+            let seen = fans.seen[fan.at([i + di, j + dj], step).expect("lines around nodes are kept")];
             if seen & !(TURN - 1) == fans.turn { seen } else { 0 }
         };
         let lines = [sees(0, 0), sees(1, 0), sees(0, 1), sees(1, 1)];

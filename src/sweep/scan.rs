@@ -16,6 +16,8 @@ pub(super) struct Light<'a> {
     pub isovalues: usize,
     /// Where these stand.
     pub axis: &'a IsovalueAxis,
+    /// How far behind a place of the ends lies what the other side of the level sets sees there.
+    pub across: isize,
 }
 
 impl Light<'_> {
@@ -25,6 +27,11 @@ impl Light<'_> {
         let (i, f) = isovalue(self.axis, self.isovalues, c);
         let (a, b) = (self.flats[place + i], self.flats[place + i + 1]);
         std::array::from_fn(|c| (1.0 - f) * decode(a[c]) + f * decode(b[c]))
+    }
+
+    /// The same as the other side of the level sets sees it; black, which comes first, is black.
+    pub(super) fn other_end(&self, place: usize, c: f32) -> [f32; 3] {
+        self.end(if place == 0 { 0 } else { place.wrapping_add_signed(self.across) }, c)
     }
 }
 

@@ -30,10 +30,9 @@ mod tests {
     use crate::volume::{Lattice, Samples, Volume};
     use glam::DVec3;
 
-    /// Where level sets end on walls and both sides are swept; not off Ω, nor if rays come through missing samples to
-    /// walls on the side that they did not leave.
+    /// Where level sets end on walls and both sides are swept, samples missing or not; not off Ω.
     #[test]
-    fn sides_are_kept_apart_in_faces_of_whole_volumes() {
+    fn sides_are_kept_apart_in_the_volumes_faces() {
         let flats = |sides: &[Side], margin: f64, gap: bool| {
             let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::splat(0.125)).unwrap();
             let height = |o: usize| if gap && o == 364 { f32::NAN } else { lattice.ijk(o)[2] as f32 };
@@ -46,16 +45,26 @@ mod tests {
             (Flats::new(&scene, sides, 8, 8), left)
         };
         let both = [Side::Lower, Side::Higher];
-        let (apart, left) = flats(&both, 0.0, false);
-        assert_eq!((apart.textures.len(), apart.number(3, Side::Higher)), (2 * apart.count, 3 + apart.count as u32));
-        // Eight rows of texels, each a step higher.
-        let mut solid = apart.solid[left].clone().unwrap();
-        solid.sort_unstable();
-        solid.dedup();
-        assert!(solid.len() == 8 && solid.iter().all(|n| *n <= 8), "{solid:?}");
-        for (sides, margin, gap) in [(&both[..1], 0.0, false), (&both, 0.1, false), (&both, 0.0, true)] {
-            let (one, _) = flats(sides, margin, gap);
-            assert_eq!((one.textures.len(), one.number(3, Side::Higher)), (one.count, 3), "{sides:?} {margin} {gap}");
+        for gap in [false, true] {
+            let (apart, left) = flats(&both, 0.0, gap);
+            assert_eq!(
+                (apart.textures.len(), apart.number(3, Side::Higher)),
+                (2 * apart.count, 3 + apart.count as u32)
+            );
+            let starts = |number: usize| apart.textures[number].as_ref().map(|t| t.start);
+            for flat in (0..apart.count).filter(|&flat| starts(flat).is_some()) {
+                assert_eq!(starts(flat + apart.count), starts(flat).map(|start| start + apart.across()), "{flat}");
+            }
+            // Eight rows of texels, each a step higher.
+            let mut solid = apart.solid[left].clone().unwrap();
+            solid.sort_unstable();
+            solid.dedup();
+            assert!(solid.len() == 8 && solid.iter().all(|n| *n <= 8), "{solid:?}");
+        }
+        for (sides, margin) in [(&both[..1], 0.0), (&both, 0.1)] {
+            let (one, _) = flats(sides, margin, false);
+            assert_eq!((one.textures.len(), one.number(3, Side::Higher)), (one.count, 3), "{sides:?} {margin}");
+            assert_eq!(one.across(), 0);
         }
     }
 }

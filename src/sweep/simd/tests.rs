@@ -54,7 +54,7 @@ fn every_instruction_set_scans_to_the_same_bits() {
             let scan = |isa: Isa| {
                 let mut out = vec![vec![0f32; 48 * LANES]; 3];
                 let axis = IsovalueAxis::around([0.5, 0.02, 0.9][seed as usize % 3]);
-                let light = Light { b: &random(9), flats: &random(10), isovalues: 4, axis: &axis };
+                let light = Light { b: &random(9), flats: &random(10), isovalues: 4, axis: &axis, across: 0 };
                 isa.scan(&mut noise(seed), way, light, &mut out, (LANES, 0));
                 out.iter().flatten().map(|x| x.to_bits()).collect::<Vec<_>>()
             };
@@ -172,7 +172,7 @@ fn scans_find_the_next_greater_value() {
     let mut out = vec![vec![0f32; 48 * LANES]; 3];
     let b = random(9);
     let axis = IsovalueAxis::EVEN;
-    let light = Light { b: &b, flats: &random(10), isovalues: 4, axis: &axis };
+    let light = Light { b: &b, flats: &random(10), isovalues: 4, axis: &axis, across: 0 };
     Isa::current().scan(&mut pack, Way { strict: false, sign: 1.0, capped: false }, light, &mut out, (LANES, 0));
     let mut found = [0; 2];
     let h = |row: usize, lane: usize| reference.h[row][lane];
