@@ -26,7 +26,9 @@ use crate::volume::Volume;
 use crate::volume::statistics::VolumeStatistics;
 use crate::volume::vti::VtiFile;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 /// Global illumination for every isosurface of a volume at once.
 #[derive(Parser, Debug)]
@@ -121,6 +123,17 @@ struct Info {
 /// More are of no use to any machine, and take long to start.
 const MOST_THREADS: usize = 1024;
 
+/// Signals this close to each other are one.
+const TOGETHER: Duration = Duration::from_millis(500);
+
+/// `-.5` as `-0.5`, which clap knows for a number.
+fn spelt_out(argument: OsString) -> OsString {
+    match argument.to_str().and_then(|text| text.strip_prefix("-.")) {
+        Some(rest) if rest.starts_with(|c: char| c.is_ascii_digit()) => format!("-0.{rest}").into(),
+        _ => argument,
+    }
+}
+
 /// The command, whose options all take negative numbers: a value out of its range is better named than an unknown
 /// option.
 fn with_negative_numbers(command: clap::Command) -> clap::Command {
@@ -134,7 +147,7 @@ fn with_negative_numbers(command: clap::Command) -> clap::Command {
 impl Cli {
     /// From the arguments of the process, which ends here if they are wrong or ask for help.
     pub fn from_arguments() -> Self {
-        let matches = with_negative_numbers(Self::command()).get_matches();
+        let matches = with_negative_numbers(Self::command()).get_matches_from(std::env::args_os().map(spelt_out));
         Self::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())
     }
 
@@ -155,9 +168,11 @@ impl Cli {
         if let Some(name) = &self.isa {
             Isa::from_name(name)?.choose();
         }
-        // A second signal ends the process at once.
-        let _ = ctrlc::set_handler(|| {
-            if progress::interrupted() {
+        // Another signal ends the process at once; not one that came with the first, as `timeout` and shells send them
+        // to a process and to its group.
+        let mut first: Option<Instant> = None;
+        let _ = ctrlc::set_handler(move || {
+            if first.get_or_insert_with(Instant::now).elapsed() > TOGETHER {
                 std::process::exit(130);
             }
             progress::interrupt();

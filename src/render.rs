@@ -58,7 +58,9 @@ impl Camera {
     fn basis(&self) -> Result<[DVec3; 3]> {
         let fail = || Error::Invalid("camera: the eye, the target and up must span a plane".into());
         let forward = (self.target - self.eye).try_normalize().ok_or_else(fail)?;
-        let right = forward.cross(self.up).try_normalize().ok_or_else(fail)?;
+        // Any length will do: its cross product must neither overflow nor vanish.
+        let up = self.up / self.up.abs().max_element();
+        let right = forward.cross(up).try_normalize().ok_or_else(fail)?;
         let size = self.size.iter().all(|n| (1..=Self::MOST).contains(n));
         if !(size && self.fov > 0.0 && self.fov < 179.0) {
             return Err(Error::Invalid(format!(

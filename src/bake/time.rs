@@ -5,7 +5,7 @@ use crate::checkpoint;
 use crate::direct::{Receiver, direct_irradiance};
 use crate::embree::{Device, GraphTracer, pyramids};
 use crate::error::Result;
-use crate::flat;
+use crate::flat::{self, FlatLight, FlatTexture, Within};
 use crate::illumination_grid::GridSize;
 use crate::isovalue_axis::IsovalueAxis;
 use crate::mask::{Mask, masks};
@@ -13,20 +13,24 @@ use crate::nearest::Neighbours;
 use crate::node_set::NodeSet;
 use crate::photon::{PhotonSettings, Photons, trace_photons};
 use crate::photon_map::PhotonMap;
+use crate::progress::{interrupted, unless_interrupted};
 use crate::radiance::{Indirect, sample_radiance};
 use crate::radiance_cache::{CacheSettings, RadianceCache};
 use crate::rng::Stage;
 use crate::sampling::{Strategy, positions_at_hand};
 use crate::scene::Scene;
 use crate::sweep::{self, SweepSettings};
+use glam::DVec3;
 use rayon::prelude::*;
 use std::hint::black_box;
 use std::sync::Mutex;
 use std::time::Instant;
 
-/// Photons and samples tried: a second or so.
+/// Photons and samples tried: a second or so. So many samples at least, of more with about so many rays in all.
 const PHOTONS: u64 = 1 << 15;
 const SAMPLES: u64 = 1 << 12;
+const LEAST_SAMPLES: u64 = 1 << 6;
+const RAYS: u64 = 1 << 21;
 
 /// Directions and replicates that a sweep is tried with. The second one tells what a pass takes besides its directions,
 /// and what walls take when their memory is no longer new.
@@ -65,7 +69,7 @@ impl TimeEstimate {
     /// scattered samples, rays beside the ends of a sweep and export are left out.
     ///
     /// # Errors
-    /// `Invalid` if the grid has too many points; `NotSupported` as [`sweep::sweep`]; `Embree`.
+    /// `Invalid` if the grid has too many points; `NotSupported` as [`sweep::sweep`]; `Embree`; `Interrupted`.
     pub fn new(scene: &Scene, settings: &BakeSettings, device: &Device) -> Result<Self> {
         match settings.engine {
             Engine::Sweep => Self::of_sweeps(scene, settings),
@@ -110,13 +114,14 @@ impl TimeEstimate {
         let count = settings.photons.min(PHOTONS);
         let pilot = PhotonSettings { count, ..settings.emission(IsovalueAxis::EVEN) };
         let begun = Instant::now();
-        let photons = trace_photons(scene, &tracer, &pilot, &|_| true);
+        let photons = trace_photons(scene, &tracer, &pilot, &|_| !interrupted());
         let all = begun.elapsed().as_secs_f64() * settings.photons as f64 / count.max(1) as f64;
         let (mut cache, mut samples) = (walls_seconds(scene, &tracer, &photons, settings), 0.0);
         for number in 0..scene.fields() {
             let seen = scene.seen_from(number);
             let tracer = GraphTracer::with_pyramids(device, &seen, &pyramids)?;
             let [nodes, sampled] = field_seconds(&seen, &tracer, &photons, settings)?;
+            unless_interrupted()?;
             (cache, samples) = (cache + nodes, samples + sampled);
         }
         Ok(Self { stages: vec![("photons", all), ("cache", cache), ("samples", samples)] })
@@ -262,7 +267,7 @@ fn walls_seconds(scene: &Scene, tracer: &GraphTracer<'_>, photons: &Photons, set
     let tried = CacheSettings { flat_resolution: across, ..settings.cache(IsovalueAxis::EVEN) };
     let unsaved = [checkpoint::Stage::UNSAVED; 2];
     let begun = Instant::now();
-    RadianceCache::new(scene, tracer, photons, settings.estimate(), &tried, false, unsaved, &|_| true);
+    RadianceCache::new(scene, tracer, photons, settings.estimate(), &tried, false, unsaved, &|_| !interrupted());
     begun.elapsed().as_secs_f64() * all / texels(across).max(1.0)
 }
 
@@ -277,7 +282,9 @@ fn field_seconds(
     let own = scene.lattice();
     let needed = masks(&scene.field, own).iter().filter(|&&m| m != Mask::Empty).count() as f64;
     let side = scene.surface.outside;
-    let at = positions_at_hand(&scene.field, &Strategy::Uniform, SAMPLES, settings.seed)?;
+    let rays = u64::from(settings.gather_rays.saturating_add(settings.shadow_rays));
+    let count = (RAYS / rays.max(1)).clamp(LEAST_SAMPLES, SAMPLES);
+    let at = positions_at_hand(&scene.field, &Strategy::Uniform, count, settings.seed)?;
     let tried = at.len().max(1) as f64;
     let map = PhotonMap::new(scene, &photons.surface, side, |p| p.bounces > 0, settings.estimate());
     let begun = Instant::now();
@@ -296,14 +303,19 @@ fn field_seconds(
 
     let begun = Instant::now();
     let (nowhere, dims) = (NodeSet::new(0, |_| false), scene.lattice().dims());
-    let empty = RadianceCache::from_parts([None, None], nowhere, dims, vec![None; flat::count(scene)]);
+    // Where all that rays meet is black they end early.
+    let mut shining = scene.clone();
+    shining.surface.emission = DVec3::ONE;
+    let white = FlatTexture { texels: vec![[1.0; 3]], ..FlatTexture::black([1; 3]) };
+    let flats = vec![Some(FlatLight { outside: white, within: Within::Same }); flat::count(scene)];
+    let cache = RadianceCache::from_parts([None, None], nowhere, dims, flats);
     let indirect = match settings.gather_rays {
         0 => Indirect::Map(&map),
-        rays => Indirect::Gather(&empty, rays),
+        rays => Indirect::Gather(&cache, rays),
     };
     let unsaved = checkpoint::Stage::UNSAVED;
     let (shadow, seed) = (settings.shadow_rays, settings.seed);
-    sample_radiance(scene, tracer, &indirect, &at, side, shadow, seed, unsaved, &|_| true);
+    sample_radiance(&shining, tracer, &indirect, &at, side, shadow, seed, unsaved, &|_| !interrupted());
     let seconds = begun.elapsed().as_secs_f64();
     // A finer grid needs about the same share of its points, and its masks may need more memory than there is.
     let points = needed * settings.grid.lattice(own)?.len() as f64 / own.len() as f64;

@@ -3,6 +3,7 @@
 mod warnings;
 
 use super::{device, expect_extension, outputs};
+use crate::atomic;
 use crate::bake::{
     BakeOptions, BakeReport, BakeSettings, Engine, MemoryEstimate, TimeEstimate, bake_fields, digest, job, supported,
 };
@@ -308,7 +309,7 @@ impl Bake {
                  or leave --resume out to replace the series",
             ));
         }
-        self.take_up(&checkpoint)?;
+        self.take_up(&checkpoint, progress)?;
         let work = || -> Result<(Vec<crate::bake::Bake>, Clock)> {
             let mut bakes = bake_fields(&loaded.scene, &settings, &device, progress, Some(&checkpoint))?;
             let export = Clock::start();
@@ -380,9 +381,13 @@ impl Bake {
     }
 
     /// Takes up what an interrupted run left in the checkpoint, if that is wanted, or says that it is there.
-    fn take_up(&self, checkpoint: &Checkpoint) -> Result<()> {
+    fn take_up(&self, checkpoint: &Checkpoint, progress: Progress) -> Result<()> {
         let path = checkpoint.path();
-        let label = if self.resume { "resumed" } else { "note" };
+        let say = |label: &str, what: String| {
+            if progress == Progress::Shown {
+                say!("{label:>14}  {what}");
+            }
+        };
         if !self.resume {
             let held = match checkpoint.held()? {
                 Held::Nothing => None,
@@ -392,12 +397,16 @@ impl Bake {
                 Held::Damage => Some("nothing that can be resumed; this bake will replace it"),
             };
             if let Some(what) = held {
-                say!("{label:>14}  {} holds {what}", path.display());
+                say("note", format!("{} holds {what}", path.display()));
             }
-        } else if checkpoint.resume()? {
-            say!("{label:>14}  {} finished blocks from {}", checkpoint.blocks(), path.display());
+            return Ok(());
+        }
+        // A bake that was killed while it wrote leaves what may be large.
+        atomic::remove_orphans(&self.output);
+        if checkpoint.resume()? {
+            say("resumed", format!("{} finished blocks from {}", checkpoint.blocks(), path.display()));
         } else {
-            say!("{label:>14}  nothing: there is no {}; starting from the beginning", path.display());
+            say("resumed", format!("nothing: there is no {}; starting from the beginning", path.display()));
         }
         Ok(())
     }

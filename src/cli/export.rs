@@ -75,6 +75,12 @@ impl Export {
             "npy" => npy::write(path, lattice, *components, samples.into())?,
             "exr" => {
                 slices::write(path, lattice, *components, samples.into())?;
+                if slices::are_coarse(samples.into()) {
+                    say!(
+                        "warning: {}: EXR holds 32-bit floats, too coarse for `{name}`; write .nrrd, .npy or .vti",
+                        path.display()
+                    );
+                }
                 written = slices::ELEMENT;
             }
             _ => VtiWriter::new(lattice)

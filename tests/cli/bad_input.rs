@@ -39,6 +39,8 @@ fn bad_input_is_one_clear_line_and_leaves_nothing() {
     let with = |extra: &[&'static str]| [&ramp[..], extra].concat();
     refused(dir, &with(&["--isovalues", "600", "700"]), &["outside the data", "0 … 511"]);
     refused(dir, &with(&["--isovalues", "7", "7"]), &["isovalues"]);
+    // A number without a zero is one, too.
+    refused(dir, &with(&["--isovalues", "-.5", "-.25"]), &["outside the data", "-0.5 … -0.25"]);
     refused(dir, &with(&["--albedo", "1.5"]), &["albedo"]);
     refused(dir, &with(&["--boundary", "capped"]), &["margin"]);
     refused(dir, &with(&["--gather", "9999999"]), &["gather"]);
@@ -96,7 +98,11 @@ fn bad_input_is_one_clear_line_and_leaves_nothing() {
     refused(dir, &["export", "far.nrrd", "-o", "out.exr"], &["out.exr", "[3, 1, 0]", "-1e39", ".nrrd"]);
     far(3e38);
     let said = text(&ok(dir, &["export", "far.nrrd", "-o", "out.exr"]).stderr);
-    assert!(said.contains("57×2×2 × 1 f32"), "{said}");
+    assert!(said.contains("57×2×2 × 1 f32") && !said.contains("warning"), "{said}");
+    let offset = Samples::F64((0..228).map(|n| 1e9 + 1e-3 * f64::from(n)).collect());
+    Volume::new("offset", slice.clone(), offset).unwrap().write(dir.join("offset.nrrd")).unwrap();
+    let said = text(&ok(dir, &["export", "offset.nrrd", "-o", "out.exr"]).stderr);
+    assert!(said.contains("warning: out.exr") && said.contains("too coarse"), "{said}");
     fs::remove_file(dir.join("out.exr")).unwrap();
 
     refused(dir, &["generate", "bumps", "--size", "100000", "-o", "out.vti"], &["100000", "2048"]);

@@ -91,6 +91,13 @@ impl SamplesRef<'_> {
         each_type!(self, v => v[i] as f32)
     }
 
+    /// Value `i` as f64.
+    #[allow(clippy::cast_precision_loss, clippy::cast_lossless, reason = "64-bit integers are rounded")]
+    #[allow(clippy::unnecessary_cast, reason = "the macro's f64 arm casts to itself")]
+    pub(crate) fn get_f64(&self, i: usize) -> f64 {
+        each_type!(self, v => v[i] as f64)
+    }
+
     /// Whether there are `components` values per sample of a lattice; says so if not.
     pub(crate) fn check(&self, lattice: &Lattice, components: usize) -> Result<(), String> {
         let wanted = lattice.len().checked_mul(components);
