@@ -128,9 +128,9 @@ const TOGETHER: Duration = Duration::from_millis(500);
 
 /// `-.5` as `-0.5`, which clap knows for a number.
 fn spelt_out(argument: OsString) -> OsString {
-    match argument.to_str().and_then(|text| text.strip_prefix("-.")) {
-        Some(rest) if rest.starts_with(|c: char| c.is_ascii_digit()) => format!("-0.{rest}").into(),
-        _ => argument,
+    match argument.to_str().and_then(|text| text.strip_prefix("-.").filter(|_| text.parse::<f64>().is_ok())) {
+        Some(rest) => format!("-0.{rest}").into(),
+        None => argument,
     }
 }
 

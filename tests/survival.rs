@@ -161,9 +161,11 @@ fn an_interrupt_keeps_progress_and_the_old_result() {
             std::thread::sleep(Duration::from_millis(10));
         }
         std::thread::sleep(Duration::from_millis(100));
-        // Twice at once, as `timeout` sends it to a process and to its group.
-        let id = child.id().to_string();
-        assert!(Command::new("kill").args([signal, &id, &id]).status().unwrap().success());
+        // Twice within moments, as `timeout` sends it to a process and to its group.
+        for _ in 0..2 {
+            assert!(Command::new("kill").args([signal, &child.id().to_string()]).status().unwrap().success());
+            std::thread::sleep(Duration::from_millis(2));
+        }
         let (output, text) = finish(child);
         assert_eq!(output.status.code(), Some(130), "{text}");
         assert!(text.contains("--resume") && text.contains("interrupted"), "{text}");

@@ -310,6 +310,11 @@ impl Bake {
             ));
         }
         self.take_up(&checkpoint, progress)?;
+        if self.resume {
+            // A bake that was killed while it wrote leaves what may be large.
+            let fields = loaded.scene.members().into_iter().map(|m| bake_file::field_file(&self.output, &m.name));
+            fields.chain([self.output.clone()]).for_each(|path| atomic::remove_orphans(&path));
+        }
         let work = || -> Result<(Vec<crate::bake::Bake>, Clock)> {
             let mut bakes = bake_fields(&loaded.scene, &settings, &device, progress, Some(&checkpoint))?;
             let export = Clock::start();
@@ -401,8 +406,6 @@ impl Bake {
             }
             return Ok(());
         }
-        // A bake that was killed while it wrote leaves what may be large.
-        atomic::remove_orphans(&self.output);
         if checkpoint.resume()? {
             say("resumed", format!("{} finished blocks from {}", checkpoint.blocks(), path.display()));
         } else {

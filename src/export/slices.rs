@@ -72,8 +72,15 @@ pub fn write(path: &Path, lattice: &Lattice, components: usize, values: SamplesR
     });
     file.finish(written)
 }
-/// Whether [`ELEMENT`] is too coarse for what values differ by, as it is for small differences on a large offset.
+/// Whether [`ELEMENT`] is too coarse for what 64-bit values, or 32-bit integers, differ by, as it is for small
+/// differences on a large offset.
 pub fn are_coarse(values: SamplesRef<'_>) -> bool {
+    if !matches!(
+        values,
+        SamplesRef::F64(_) | SamplesRef::I64(_) | SamplesRef::U64(_) | SamplesRef::I32(_) | SamplesRef::U32(_)
+    ) {
+        return false;
+    }
     let finite = (0..values.len()).map(|i| values.get_f64(i)).filter(|x| x.is_finite());
     let [lo, hi] = finite.fold([f64::INFINITY, f64::NEG_INFINITY], |[lo, hi], x| [lo.min(x), hi.max(x)]);
     super::coarse_in_f32(lo.abs().max(hi.abs()), hi - lo)

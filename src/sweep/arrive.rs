@@ -245,7 +245,7 @@ impl<'a> Walls<'a> {
                 Some((pack, b, lane, span)) if self.meets(wall.tau, reach, span) => {
                     let way = (wall.tau, reach);
                     if pack.gapped >> lane & 1 == 1 {
-                        self.staircase_with_gaps((pack, b), lane, span, way, (pf, qf), values)
+                        self.staircase_with_gaps((pack, b), lane, span, way, ((pf, qf), next), values)
                     } else {
                         self.staircase((pack, b[0]), lane, span, way, (pf, qf), values)
                     }
@@ -329,11 +329,12 @@ impl<'a> Walls<'a> {
         lane: usize,
         span: [f64; 2],
         (from, to): (f64, f64),
-        pq: (f64, f64),
+        (pq, next): ((f64, f64), Option<Stop>),
         values: &mut [f32],
     ) -> (usize, usize) {
         let nc = self.flats.isovalues;
         let (forward, higher) = (to > from, self.plan.sign < 0.0);
+        let mut beyond = Vec::new();
         let (first_slice, last_slice) = (span[0].ceil() as usize, span[1].floor() as usize);
         let start = pack.h[if forward { first_slice } else { last_slice } + 1][lane];
         let entry = rows(pack, span, (from, to)).map(|row| pack.h[row][lane]).find(|h| *h != OUTSIDE);
@@ -364,6 +365,14 @@ impl<'a> Walls<'a> {
                 }
             } else if exit.is_some_and(|h| self.height(t) <= h) {
                 (0..3).for_each(|c| values[c * nc + self.ordinal(t)] = 0.0);
+            } else if ray.is_within() && !self.capped {
+                // What stands there as the other side sees it.
+                if beyond.is_empty() {
+                    beyond.resize(3 * nc, 0.0);
+                    let across = next.map(|n| Stop { flat: n.flat.map(|flat| self.flats.other(flat)), ..n });
+                    fill_column(self.flats, across, &mut beyond);
+                }
+                (0..3).map(|c| c * nc + self.ordinal(t)).for_each(|i| values[i] = beyond[i]);
             }
         }
         match (self.capped, higher) {

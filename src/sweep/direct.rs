@@ -35,6 +35,9 @@ pub(super) fn clearance(scene: &Scene, geometry: &Geometry, sides: &[Side]) -> O
     (!inside).then(|| Clearance::new(geometry))
 }
 
+/// Luminaires are no farther away in the unit of length that nodes see them in.
+const MOST_UNITS: f64 = 1e6;
+
 /// The unit of length in which nodes see a luminaire: fourth powers of the world's lengths do not fit f32, nor those of
 /// distances of more than 10⁹ voxels.
 fn unit(lattice: &Lattice, light: &Polygon) -> f64 {
@@ -42,9 +45,6 @@ fn unit(lattice: &Lattice, light: &Polygon) -> f64 {
     let farthest = light.vertices().iter().map(|v| v.distance(centre)).fold(0.0, f64::max);
     lattice.unit().max(farthest / MOST_UNITS)
 }
-
-/// Luminaires are no farther away.
-const MOST_UNITS: f64 = 1e6;
 
 /// Direct irradiance of every node, one set of planes per side in `sides`; that of the flats is added to theirs at the
 /// end. `tick` is asked before every point; false stops.

@@ -186,6 +186,9 @@ impl Fan {
         hidden.iter_mut().for_each(|hidden| hidden.clear(np));
         let q = (self.first[1] + row as isize) as f64;
         let Row { first, count, .. } = self.rows[row];
+        if count == 0 {
+            return;
+        }
         let mut rest = out;
         for (step, kept) in (first..first + count).zip(&self.kept[first..]) {
             let out;
@@ -205,8 +208,9 @@ impl Fan {
             };
             // Lines with u in Ω, over nodes that matter.
             let p = |u: f64| self.source[0] + (u - self.source[0]) / ratio - self.first[0] as f64;
-            let lo = p(n0 as f64).ceil().max(0.0) as usize;
-            let hi = (p((n1 - 1) as f64).floor().min(np as f64 - 1.0) + 1.0).max(0.0) as usize;
+            let within = |n: usize| n.clamp(kept.first[0], kept.first[0] + kept.count[0]);
+            let lo = within(p(n0 as f64).ceil().max(0.0) as usize);
+            let hi = within((p((n1 - 1) as f64).floor().min(np as f64 - 1.0) + 1.0).max(0.0) as usize);
             let u0 = (self.source[0] + (self.first[0] as f64 - self.source[0]) * ratio) as f32;
             let du = ratio as f32;
             if lo >= hi {
@@ -308,8 +312,7 @@ pub(super) struct Fans {
 impl Fans {
     /// Marches along all lines of the fans of local point `y`, where `start` is the greatest and least h so far, side
     /// by side: the rows of one fan alone are too few for threads to share well. They take the place of another
-    /// point's: most of the lines of the widest miss Ω, and memory that is new, or cleared, for every point would be
-    /// written as a whole.
+    /// point's: memory that is new, or cleared, for every point would be written as a whole.
     pub(super) fn march(&mut self, (geometry, isa, sides): (&Geometry, Isa, &[Side]), y: DVec3, start: [f32; 2]) {
         self.source = y;
         self.far = geometry.dims.map(|n| (n - 1) as f64);
@@ -346,15 +349,16 @@ impl Fans {
     }
 }
 
-/// Bytes of what the fans of a luminaire's middle see on `lattice`, of that luminaire where it is most.
+/// Bytes of what the fans of luminaires' middles and corners see on `lattice`, at most.
 pub(crate) fn seen(scene: &Scene, lattice: &Lattice) -> u64 {
-    let of = |light: &Polygon| {
-        let v = light.vertices();
-        let y = lattice.to_index(v.iter().sum::<DVec3>() / v.len() as f64);
+    let middle = |light: &Polygon| light.vertices().iter().sum::<DVec3>() / light.vertices().len() as f64;
+    let of = |x: DVec3| {
+        let y = lattice.to_index(x);
         let fans = (0..6).filter_map(|f| Fan::new(lattice.dims(), y, f % 3, f >= 3));
         fans.flat_map(|fan| fan.kept).map(|kept| kept.count[0] as u64 * kept.count[1] as u64).sum()
     };
-    scene.luminaires().iter().map(of).max().unwrap_or(0)
+    let points = scene.luminaires().iter().flat_map(|light| light.vertices().iter().copied().chain([middle(light)]));
+    points.map(of).max().unwrap_or(0)
 }
 
 /// What is in one range and not in another.

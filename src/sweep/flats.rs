@@ -170,6 +170,16 @@ impl Flats {
         flat + if apart { self.count as u32 } else { 0 }
     }
 
+    /// The number of the texture that the other side sees of the flat with texture `number`.
+    #[allow(clippy::cast_possible_truncation, reason = "fewer than 2¹⁶ flats")]
+    pub(super) fn other(&self, number: u32) -> u32 {
+        let count = self.count as u32;
+        match self.solid.is_empty() {
+            true => number,
+            false => (number + count) % (2 * count),
+        }
+    }
+
     /// How far in [`Flats::packed`] what the higher side sees lies behind what the lower one does.
     pub(super) fn across(&self) -> usize {
         if self.solid.is_empty() { 0 } else { (self.packed.len() - self.isovalues) / 2 }

@@ -168,6 +168,11 @@ impl Crossing {
             Some(_) => None,
         }
     }
+
+    /// Whether the last sample was one within the solid.
+    pub(super) fn is_within(&self) -> bool {
+        self.before.is_some() && self.inside
+    }
 }
 
 impl Pack {
@@ -342,7 +347,8 @@ impl Pack {
             let between = from.min(row)..from.max(row);
             let mut cuts = self.cuts.iter().filter(|c| c.lane == lane && between.contains(&c.row));
             if let Some(cut) = if forward { cuts.next() } else { cuts.next_back() } {
-                return Met::End(cut.places[d] as usize);
+                let place = cut.places[d] as usize;
+                return if crossing.is_within() { Met::Within(place) } else { Met::End(place) };
             }
             let h = self.h[row][lane];
             gone |= h == OUTSIDE;

@@ -6,7 +6,7 @@ use crate::isovalue_axis::IsovalueAxis;
 use crate::scene::Scene;
 use rayon::prelude::*;
 
-/// Off Ω there is one light for all.
+/// Off Ω, and where samples are missing, there is one light for all.
 pub(super) const FREE: u32 = u32::MAX;
 
 /// How many of `n` isovalues along `axis` lie in the solid at the centre of each texel of a flat, or [`FREE`].
@@ -15,7 +15,8 @@ pub(super) fn solid(scene: &Scene, flat: &Flat, [nu, nv]: [usize; 2], axis: &Iso
     let of = |texel: usize| {
         let uv = [((texel % nu) as f64 + 0.5) / nu as f64, ((texel / nu) as f64 + 0.5) / nv as f64];
         let p = scene.lattice().to_index(flat.at(uv));
-        if scene.lattice().holds(p) { below(axis, n, scene.field.value(p) as f32) as u32 } else { FREE }
+        let h = if scene.lattice().holds(p) { scene.field.value(p) as f32 } else { f32::NAN };
+        if h.is_nan() { FREE } else { below(axis, n, h) as u32 }
     };
     (0..nu * nv).into_par_iter().with_min_len(256).map(of).collect()
 }
@@ -35,7 +36,7 @@ mod tests {
     fn sides_are_kept_apart_in_the_volumes_faces() {
         let flats = |sides: &[Side], margin: f64, gap: bool| {
             let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::splat(0.125)).unwrap();
-            let height = |o: usize| if gap && o == 364 { f32::NAN } else { lattice.ijk(o)[2] as f32 };
+            let height = |o: usize| if gap && o == 360 { f32::NAN } else { lattice.ijk(o)[2] as f32 };
             let samples = Samples::F32((0..lattice.len()).map(height).collect());
             let volume = Volume::new("planes", lattice.clone(), samples).unwrap();
             let field = Field::new(&volume, Sweep::new(0.0, 8.0).unwrap()).unwrap();
@@ -59,7 +60,10 @@ mod tests {
             let mut solid = apart.solid[left].clone().unwrap();
             solid.sort_unstable();
             solid.dedup();
-            assert!(solid.len() == 8 && solid.iter().all(|n| *n <= 8), "{solid:?}");
+            // But for the cells around the sample that is missing.
+            let free = usize::from(gap);
+            assert!(solid.len() == 8 + free && solid[..8].iter().all(|n| *n <= 8), "{solid:?}");
+            assert!(solid[8..].iter().all(|n| *n == FREE));
         }
         for (sides, margin) in [(&both[..1], 0.0), (&both, 0.1)] {
             let (one, _) = flats(sides, margin, false);

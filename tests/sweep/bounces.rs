@@ -1,6 +1,6 @@
 //! How bounces end: what they leave out, and what replicates share.
 
-use super::{bumps, emissive_box, nodes, rms, run};
+use super::{ONE_BOUNCE, bumps, emissive_box, field, nodes, rms, run};
 use glam::DVec3;
 use isolume::direct::Receiver;
 use isolume::embree::{Device, GraphTracer};
@@ -14,6 +14,44 @@ use isolume::sweep::SweepSettings;
 use isolume::volume::{Lattice, Samples, Volume};
 use rayon::prelude::*;
 use std::f64::consts::PI;
+
+/// Planes in a furnace, but for those in a gap in the middle of Ω, where walls see each other through it: everything
+/// reflects as much as it emits, on either side.
+#[test]
+fn furnaces_with_a_gap_shine_alike() {
+    let lattice = Lattice::aligned([21; 3], DVec3::ZERO, DVec3::splat(0.05)).unwrap();
+    let walls = emissive_box(&lattice, 0.5, 1.0);
+    let f = field(lattice, (0.0, 1.0), |x| if (x.x - 0.5).abs() < 0.09 { f64::NAN } else { x.x });
+    let surface = Surface { albedo: DVec3::splat(0.5).into(), emission: DVec3::ONE, ..Surface::default() };
+    let scene = Scene::new(f, surface, Boundary::Open, walls).unwrap();
+    let got = run(&scene, SweepSettings { max_bounces: 40, target: 1e-4, flat_resolution: (8, 20), ..ONE_BOUNCE });
+    for (wall, polygon) in got.flats.iter().zip(scene.polygons()) {
+        let wall = wall.as_ref().unwrap();
+        let [nu, nv, nc] = wall.outside.dims;
+        let (mut errors, mut through) = (Vec::new(), Vec::new());
+        for (n, outside) in wall.outside.texels.iter().enumerate() {
+            let (texel, t) = (n % (nu * nv), n / (nu * nv));
+            let uv = [(texel % nu) as f64 / nu as f64, (texel / nu) as f64 / nv as f64].map(|x| x + 0.5 / nu as f64);
+            let c = (t as f64 + 0.5) / nc as f64;
+            // Beside level sets texels lie on both sides.
+            let beyond = polygon.at(uv).x - c;
+            let seen = wall.own().filter(|_| beyond > 0.0).map_or(*outside, |own| own.texels[n]);
+            if beyond.abs() > 0.1 {
+                errors.push(f64::from(seen[1]) - 1.0);
+                through.extend(errors.last().filter(|_| (c - 0.5).abs() < 0.08));
+            }
+        }
+        let [mean, between] = [&errors, &through].map(|e| e.iter().sum::<f64>() / e.len() as f64);
+        let rms = rms(errors.iter().copied());
+        println!(
+            "{}: {} texels, mean {mean:.4}, {between:.4} through the gap, RMS {rms:.4}",
+            polygon.name,
+            errors.len()
+        );
+        assert!(errors.len() > 500 && through.len() > 150 && rms < 0.05);
+        assert!(mean.abs() < 0.02 && between.abs() < 0.02, "{}: {mean} {between}", polygon.name);
+    }
+}
 
 /// What bounces leave out is known where they converged, replicates that start warm among them, and is not 0 where they
 /// were cut.

@@ -209,3 +209,24 @@ fn faces_below_a_near_luminaire_are_lit() {
     println!("worst {worst:.1e}");
     assert!(worst < 2e-3);
 }
+
+/// Light of a luminaire comes as from infinity, however far away it is: its fourth power need not be a number.
+#[test]
+fn luminaires_may_be_very_far_away() {
+    let lit = |far: f64| {
+        let lattice = Lattice::aligned([13; 3], DVec3::ZERO, DVec3::splat(1.0 / 12.0)).unwrap();
+        let f = field(lattice, (0.2, 0.8), |x| x.z + 0.1 * (5.0 * x.x).sin());
+        let corners = [[-0.1, -0.1], [-0.1, 0.1], [0.1, 0.1], [0.1, -0.1]];
+        let corners = corners.map(|[x, y]| far * DVec3::new(x, y, 1.0)).to_vec();
+        let light = Polygon::new("far", corners, DVec3::ZERO, DVec3::ONE).unwrap();
+        let surface = Surface { outside: Side::Higher, ..Surface::default() };
+        run(&Scene::new(f, surface, Boundary::Open, vec![light]).unwrap(), ONE_BOUNCE)
+    };
+    let near = lit(1e5);
+    assert!(near.sides[0].irradiance.iter().flatten().any(|x| *x > 0.02));
+    for far in [1e8, 1e9, 1e12] {
+        for (a, b) in near.sides[0].irradiance.iter().flatten().zip(lit(far).sides[0].irradiance.iter().flatten()) {
+            assert!((a - b).abs() < 1e-3, "{far}: {a} {b}");
+        }
+    }
+}
