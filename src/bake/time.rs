@@ -26,11 +26,12 @@ use std::hint::black_box;
 use std::sync::Mutex;
 use std::time::Instant;
 
-/// Photons and samples tried: a second or so. So many samples at least, of more with about so many rays in all.
+/// Photons and samples tried: a second or so. Where these take more than so many rays in all samples are fewer, but no
+/// fewer than the least.
 const PHOTONS: u64 = 1 << 15;
 const SAMPLES: u64 = 1 << 12;
-const LEAST_SAMPLES: u64 = 1 << 6;
 const RAYS: u64 = 1 << 21;
+const LEAST_SAMPLES: u64 = 1 << 6;
 
 /// Directions and replicates that a sweep is tried with. The second one tells what a pass takes besides its directions,
 /// and what walls take when their memory is no longer new.

@@ -151,7 +151,7 @@ impl Fan {
         &self.kept[step]
     }
 
-    /// Where what row `n` sees in the slice at `step` begins, if that is kept, and it would there be line 0; wraps
+    /// Where in [`Fans::seen`] line 0 of row `n` in the slice at `step` stands, or would stand were it kept; wraps
     /// around.
     #[inline(always)]
     pub(super) fn line_zero(&self, n: usize, step: usize) -> usize {
