@@ -28,6 +28,8 @@ pub enum Stage {
     Simulation = 10,
     /// Tests and self-tests.
     Test = 11,
+    /// Errors that are sent through a fit to see what becomes of them.
+    Noise = 12,
 }
 
 impl Stage {

@@ -6,7 +6,7 @@ use crate::brdf::reflected;
 use crate::checkpoint;
 use crate::direct::luminance;
 use crate::field::Field;
-use crate::fitted_grid::{PULL, Wish, fit};
+use crate::fitted_grid::{PULL, Wish, draws, fit, fitted_variance};
 use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, local_position, own_light, stand_ins};
@@ -446,30 +446,40 @@ impl<'a> Beside<'a> {
         mut grid: IlluminationGrid,
         light: &[BesideLight],
     ) -> IlluminationGrid {
-        let mut start = 0;
+        // Of the points that get light, its error where the fit starts: three draws of each place's own, and the variance
+        // of what places have in common, which no fit enlarges.
+        let (mut lit, mut errors, mut start) = (Vec::new(), Vec::new(), 0);
+        let own = |n: usize| draws(n as u64, (light[n].variance - light[n].common).max(0.0).sqrt());
         for run in self.owners.chunk_by(|a, b| a == b) {
-            let (mut sum, mut own, mut common, mut count) = (Vec3::ZERO, 0.0, 0.0, 0.0);
-            for l in light[start..start + run.len()].iter().filter(|l| l.variance >= 0.0) {
-                (sum, own, common) = (sum + l.radiance, own + (l.variance - l.common), common + l.common);
+            let (mut sum, mut drawn, mut common, mut count) = (Vec3::ZERO, Vec3::ZERO, 0.0, 0.0);
+            for n in (start..start + run.len()).filter(|&n| light[n].variance >= 0.0) {
+                (sum, drawn, common) = (sum + light[n].radiance, drawn + own(n), common + light[n].common);
                 count += 1.0;
             }
-            let owner = usize::try_from(run[0]).expect("a point's number");
             if count > 0.0 {
+                let owner = usize::try_from(run[0]).expect("a point's number");
                 grid.radiance[owner] = (sum / count).to_array();
-                grid.std_error[owner] = (own / (count * count) + common / count).sqrt();
                 grid.mask[owner] = Mask::Filled;
+                lit.push(owner);
+                errors.push((drawn / count, common / count));
             }
             start += run.len();
         }
-        let lit = |o: usize| grid.mask[o] == Mask::Filled && self.owners.binary_search(&(o as u64)).is_ok();
-        let free = NodeSet::new(self.lattice.len(), lit);
-        let wishes: Vec<Wish> = self
-            .positions
-            .par_iter()
-            .zip(light)
-            .filter(|(_, l)| l.variance >= 0.0)
-            .map(|(&position, l)| Wish { position, light: l.radiance, weight: 1.0 })
-            .collect();
+        let free = NodeSet::new(self.lattice.len(), |o| grid.mask[o] == Mask::Filled && lit.binary_search(&o).is_ok());
+        let wishes = |wish: &(dyn Fn(usize) -> Vec3 + Sync)| -> Vec<Wish> {
+            let places = self.positions.par_iter().enumerate().filter(|(n, _)| light[*n].variance >= 0.0);
+            places.map(|(n, &position)| Wish { position, light: wish(n), weight: 1.0 }).collect()
+        };
+        let places = self.len() as u64;
+        let before = |o: usize| match free.slot(o) {
+            Some(slot) => errors[slot].0,
+            None => draws(places + o as u64, grid.std_error[o]),
+        };
+        let variances = fitted_variance(self.field, self.lattice, &wishes(&own), &before, &free, PULL, &|_| true);
+        for ((o, variance), (_, common)) in lit.into_iter().zip(variances).zip(errors) {
+            grid.std_error[o] = (variance + common).sqrt();
+        }
+        let wishes = wishes(&|n| light[n].radiance);
         grid.radiance = fit(self.field, self.lattice, &wishes, grid.radiance, &free, PULL, &|_| true);
         grid.split = grid.split.map(|split| self.fit_parts(scene, side, split, light, &free));
         grid

@@ -80,8 +80,8 @@ const LEVEL_SIDE: u64 = 12;
 const KEPT_SIDE: u64 = 12;
 const DONE_SIDE: u64 = 15;
 
-/// Bytes per fitted point: seven vectors of conjugate gradients.
-const FITTED: u64 = 84;
+/// Bytes per fitted point: seven vectors of conjugate gradients, its number, and its error before.
+const FITTED: u64 = 108;
 
 /// Bytes that writing holds at most: two batches of packed blocks, and raw ones. Of points without light little is left
 /// when they are packed.

@@ -7,7 +7,7 @@ use super::{BakeSettings, Interpolation, Lit, PhotonCounts, stages};
 use crate::checkpoint::{self, Checkpoint};
 use crate::embree::{Device, GraphTracer, pyramids};
 use crate::error::{Error, Result};
-use crate::fitted_grid::{PULL, Wish, fit};
+use crate::fitted_grid::{PULL, Wish, draws, fit, fitted_variance};
 use crate::flattened::Side;
 use crate::illumination_grid::{IlluminationGrid, shepard};
 use crate::irradiance_caching::interpolate;
@@ -268,10 +268,19 @@ impl<'a> FieldLight<'a> {
                         }
                         Interpolation::Fit => {
                             let mut grid = blended();
-                            let wishes: Vec<Wish> = samples.iter().map(Wish::from).collect();
+                            let mut wishes: Vec<Wish> = samples.iter().map(Wish::from).collect();
+                            let errors: Vec<f32> = samples.iter().map(|s| s.variance.sqrt()).collect();
                             drop(samples);
                             let free = NodeSet::new(lattice.len(), |o| grid.mask[o] != Mask::Empty);
                             grid.radiance = fit(&scene.field, lattice, &wishes, grid.radiance, &free, PULL, tick);
+                            for ((n, wish), &error) in (0..).zip(&mut wishes).zip(&errors) {
+                                wish.light = draws(n, error);
+                            }
+                            let start = |o: usize| draws((errors.len() + o) as u64, grid.std_error[o]);
+                            let variances = fitted_variance(&scene.field, lattice, &wishes, &start, &free, PULL, tick);
+                            for (o, variance) in free.members(0..lattice.len()).zip(variances) {
+                                grid.std_error[o] = variance.sqrt();
+                            }
                             grid
                         }
                     }
