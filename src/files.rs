@@ -3,9 +3,9 @@
 
 use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
-use flate2::read::{MultiGzDecoder, ZlibDecoder};
+use flate2::bufread::{GzDecoder, ZlibDecoder};
 use std::fs::File;
-use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::io::{BufRead, BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
 
 /// What may be allocated on the word of a header alone, beyond twice the file's size.
@@ -63,9 +63,21 @@ pub(crate) fn open(path: &Path) -> Result<File> {
 /// Reads a whole file.
 ///
 /// # Errors
-/// `Io` with the path.
+/// As [`open`].
 pub(crate) fn read(path: &Path) -> Result<Vec<u8>> {
-    std::fs::read(path).map_err(|e| Error::io(path, e))
+    let mut bytes = Vec::new();
+    open(path)?.read_to_end(&mut bytes).map_err(|e| Error::io(path, e))?;
+    Ok(bytes)
+}
+
+/// Reads a whole text in UTF-8.
+///
+/// # Errors
+/// As [`open`]; `Io` if it is none.
+pub(crate) fn read_text(path: &Path) -> Result<String> {
+    let mut text = String::new();
+    open(path)?.read_to_string(&mut text).map_err(|e| Error::io(path, e))?;
+    Ok(text)
 }
 
 /// Length of a file in bytes.
@@ -123,9 +135,29 @@ fn open_section(path: &Path, section: Section) -> Result<Box<dyn Read>> {
     file.seek(SeekFrom::Start(section.start)).map_err(|e| Error::io(path, e))?;
     Ok(match section.packing {
         Packing::Plain => Box::new(file),
-        Packing::Gzip => Box::new(MultiGzDecoder::new(BufReader::new(file))),
+        Packing::Gzip => Box::new(Members(Some(GzDecoder::new(BufReader::new(file))))),
         Packing::Zlib => Box::new(ZlibDecoder::new(BufReader::new(file))),
     })
+}
+
+/// The gzip members of a stream one after the other. What follows the last one and is none, such as the zeros that fill
+/// blocks of tapes, is let pass, as gzip and zlib do.
+struct Members<R>(Option<GzDecoder<R>>);
+
+impl<R: BufRead> Read for Members<R> {
+    fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
+        while let Some(member) = &mut self.0 {
+            match member.read(buffer)? {
+                0 if !buffer.is_empty() => {
+                    let mut rest = self.0.take().expect("a member").into_inner();
+                    // The first byte of every member.
+                    self.0 = (rest.fill_buf()?.first() == Some(&0x1f)).then(|| GzDecoder::new(rest));
+                }
+                n => return Ok(n),
+            }
+        }
+        Ok(0)
+    }
 }
 
 /// Reads at most the first `n` bytes of a section.
@@ -270,6 +302,16 @@ mod tests {
         assert_eq!(read_section(&path, packed, 3).unwrap(), [2, 3, 4]);
         assert_eq!(read_head(&path, packed, 2).unwrap(), [2, 3]);
         assert!(matches!(read_section(&path, packed, 4), Err(Error::Invalid(_))));
+        // Further members, and what is none.
+        let mut more = [&stored[..], &gz(&[5, 6])].concat();
+        for behind in [&[][..], &[0; 512], b"\n"] {
+            more.extend(behind);
+            std::fs::write(&path, &more).unwrap();
+            assert_eq!(read_section(&path, packed, 5).unwrap(), [2, 3, 4, 5, 6], "{} bytes behind", behind.len());
+        }
+        // A member that breaks off is none that is let pass.
+        std::fs::write(&path, [&stored[..], &gz(&[5, 6])[..9]].concat()).unwrap();
+        assert!(matches!(read_section(&path, packed, 3), Err(Error::Invalid(_))));
         // Cut inside the checksum: all samples are there, but nothing vouches for them.
         std::fs::write(&path, &stored[..stored.len() - 3]).unwrap();
         assert!(matches!(read_section(&path, packed, 3), Err(Error::Invalid(_))));

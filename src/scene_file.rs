@@ -18,6 +18,7 @@ pub use surface::{Albedo, BoundaryName, ColourStop, OutsideName, Rgb, SidesName,
 use crate::bake::BakeOptions;
 use crate::error::{Error, Result};
 use crate::field::{Field, Sweep};
+use crate::files;
 use crate::polygon::Polygon;
 use crate::scene::{Placement, Scene, check_edges, check_spacing, cornell_box, read_context, read_obj};
 use crate::volume::generate::Generator;
@@ -313,7 +314,7 @@ struct Source {
 
 impl Source {
     fn read(path: &Path) -> Result<Self> {
-        let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+        let text = files::read_text(path)?;
         Ok(Self { path: path.to_path_buf(), text })
     }
 

@@ -74,8 +74,10 @@ impl Lattice {
             || determinant.abs() <= 1e-9 * size
             || !inverse.is_finite()
         {
-            let [x, y, z] = [axes.x_axis, axes.y_axis, axes.z_axis];
-            let [dx, dy, dz] = [x, y, z].map(|axis| Shortest(axis.length()));
+            let shown = |v: DVec3| format!("({}, {}, {})", Shortest(v.x), Shortest(v.y), Shortest(v.z));
+            let [x, y, z] = [axes.x_axis, axes.y_axis, axes.z_axis].map(shown);
+            let [dx, dy, dz] = [axes.x_axis, axes.y_axis, axes.z_axis].map(|axis| Shortest(axis.length()));
+            let origin = shown(origin);
             return Err(Error::Invalid(format!(
                 "spacing {dx}, {dy}, {dz} along the axes {x}, {y}, {z} from the origin {origin}: must be finite and not 0, and \
                  the axes linearly independent"

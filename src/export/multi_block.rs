@@ -38,7 +38,7 @@ pub(super) fn completed(path: &Path, parts: &[(String, String)]) -> Result<Atomi
 /// # Errors
 /// `Io`; `Invalid` if it is none or names nothing.
 pub fn read(path: &Path) -> Result<Vec<PathBuf>> {
-    let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+    let text = files::read_text(path)?;
     let document = files::xml(&text).map_err(|e| Error::invalid(path, format!("is no well-formed XML: {e}")))?;
     let folder = path.parent().unwrap_or(Path::new(""));
     let parts = document.descendants().filter(|n| n.has_tag_name("DataSet"));

@@ -7,6 +7,7 @@
 use super::{Mesh, coarse_in_f32, colour_bytes};
 use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
+use crate::files;
 use glam::DVec3;
 use std::io::{self, Write};
 use std::path::Path;
@@ -125,7 +126,7 @@ impl PlyMesh {
 /// `Io`, or as [`parse`].
 pub fn read(path: impl AsRef<Path>) -> Result<PlyMesh> {
     let path = path.as_ref();
-    parse(&std::fs::read(path).map_err(|e| Error::io(path, e))?, path)
+    parse(&files::read(path)?, path)
 }
 
 /// The scalar types of PLY.

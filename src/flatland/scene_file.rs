@@ -3,11 +3,11 @@
 use super::{FlatScene, HeightField, Segment};
 use crate::error::{Error, Result};
 use crate::field::Sweep;
+use crate::files;
 use crate::flattened::Side;
 use crate::scene_file::{OutsideName, Rgb, numbers, parse_toml};
 use glam::{DVec2, DVec3};
 use serde::Deserialize;
-use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 #[derive(Debug, Deserialize)]
@@ -56,10 +56,8 @@ struct BoxKeys {
 /// # Errors
 /// `Io`; `Invalid` with file, line and key; what reading the field returns.
 pub fn load(path: &Path) -> Result<FlatScene> {
-    let text = std::fs::read_to_string(path).map_err(|e| match e.kind() {
-        ErrorKind::InvalidData => Error::invalid(path, "is no text; a scene file of n = 2 (.toml) is wanted"),
-        _ => Error::io(path, e),
-    })?;
+    let text = String::from_utf8(files::read(path)?)
+        .map_err(|_| Error::invalid(path, "is no text; a scene file of n = 2 (.toml) is wanted"))?;
     let file: File = parse_toml(path, &text)?;
     build(path, &file).map_err(|e| match e {
         // What is wrong in the field's own file names that file already.
@@ -80,6 +78,9 @@ fn folder(path: &Path) -> &Path {
 fn build(path: &Path, file: &File) -> Result<FlatScene> {
     let sweep = file.isovalues.map(|[lo, hi]| Sweep::new(lo, hi)).transpose()?;
     let field = match (&file.field.file, &file.field.generator) {
+        (Some(_), None) if file.field.size.is_some() => {
+            return Err(Error::Invalid("[field] size is the generator's; a file has its own".into()));
+        }
         (Some(f), None) => HeightField::open(&folder(path).join(f), sweep)?,
         (None, Some(name)) => {
             let default = if name == "ramp" { (0.0, 1.0) } else { (3.6, 95.0) };

@@ -1,6 +1,7 @@
 //! Material libraries of OBJ files, checked and completed line by line before tobj reads them.
 
 use crate::error::{Error, Result};
+use crate::files;
 use std::path::Path;
 
 /// Statements of a colour.
@@ -12,7 +13,7 @@ const COLOURS: [&str; 4] = ["Ka", "Kd", "Ks", "Ke"];
 /// # Errors
 /// `Io`; `Invalid` with file and line for what is malformed.
 pub(super) fn text(path: &Path) -> Result<String> {
-    let source = std::fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+    let source = files::read_text(path)?;
     let mut text = String::with_capacity(source.len());
     for (n, line) in source.lines().enumerate() {
         let line = line.trim();

@@ -49,8 +49,8 @@ impl<'a> Fields<'a> {
             if text.is_empty() {
                 return Ok(Line::Nothing);
             }
-            let Some((key, value)) = text.split_once('=').map(|(k, v)| (k.trim(), v.trim())) else {
-                let shown: String = text.chars().take(40).collect();
+            let Some((key, value)) = text.split_once(['=', ':']).map(|(k, v)| (k.trim(), v.trim())) else {
+                let shown: String = text.chars().take(40).flat_map(char::escape_debug).collect();
                 return Err(Error::invalid(path, format!("line {number}, `{shown}`, is no `key = value`")));
             };
             let (last, key, value) = (key == DATA_FILE, key.to_string(), value.to_string());

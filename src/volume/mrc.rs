@@ -17,6 +17,9 @@ const HEADER: usize = 1024;
 /// Marks files of IMOD, whose 8-bit samples may be unsigned.
 const IMOD_STAMP: i32 = 1_146_047_817;
 
+/// Space groups from here on are those of one of several volumes, and MZ (word 10) is how many sections it has.
+const VOLUME_STACK: i32 = 401;
+
 /// The header's words, numbered from 1 as \[MRC2014\] does.
 struct Header<'a> {
     path: &'a Path,
@@ -31,11 +34,21 @@ struct Header<'a> {
 ///
 /// # Errors
 /// `Io`; `Invalid` for a broken header, too few bytes (known before they are allocated) or a damaged gzip stream;
-/// `NotSupported` for complex and other modes.
+/// `NotSupported` for complex and other modes, and for several volumes.
 pub fn read(path: &Path) -> Result<Volume> {
     let packing = files::gzip_or_plain(path, 0)?;
     let header = Header::read(path, packing)?;
     let dims = [header.count(1)?, header.count(2)?, header.count(3)?];
+    let (space_group, sections) = (header.int(23), header.int(10));
+    if space_group >= VOLUME_STACK && sections > 0 && (sections as usize) < dims[2] {
+        let (all, one) = (dims[2], sections);
+        return Err(Error::not_supported(
+            path,
+            format!(
+                "holds several volumes (ISPG, word 23, is {space_group}: {all} sections, {one} to a volume); save one of them"
+            ),
+        ));
+    }
     let lattice = header.lattice(dims)?;
     let unsigned = header.int(39) == IMOD_STAMP && header.int(40) & 1 == 0;
     let (element, half) = match header.int(4) {
@@ -264,5 +277,9 @@ mod tests {
         refused(&[map(0, &[(1, 100_000), (2, 100_000)], &[], false), vec![0; 12]].concat(), "cannot hold");
         refused(&[map(0, &[(24, -1)], &[], false), vec![0; 12]].concat(), "NSYMBT");
         refused(&[map(0, &[(3, 1)], &[], false), vec![0; 6]].concat(), "flatland");
+        // Two volumes of a section each; not one of two.
+        let stack = |sections: i32| [map(0, &[(23, 401), (10, sections)], &[], false), vec![0; 12]].concat();
+        refused(&stack(1), "several volumes (ISPG, word 23, is 401: 2 sections, 1 to a volume)");
+        assert!(open(&stack(2)).is_ok());
     }
 }

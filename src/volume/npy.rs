@@ -121,8 +121,13 @@ fn parse_header(text: &str) -> Result<Header> {
     };
     let shape = value("shape")?;
     let inside = shape.strip_prefix('(').and_then(|s| s.split(')').next());
-    let shape: Option<Vec<usize>> =
-        inside.and_then(|s| s.split(',').map(str::trim).filter(|w| !w.is_empty()).map(|w| w.parse().ok()).collect());
+    let shape: Option<Vec<usize>> = inside.and_then(|s| {
+        s.split(',')
+            .map(str::trim)
+            .filter(|w| !w.is_empty())
+            .map(|w| w.strip_suffix('L').unwrap_or(w).parse().ok())
+            .collect()
+    });
     let shape = shape.ok_or_else(|| Error::Invalid(format!("shape is no tuple of numbers: {shown}")))?;
     Ok(Header { element, half, endian: if order == b'>' { Endian::Big } else { Endian::Little }, fortran, shape })
 }
@@ -189,7 +194,7 @@ mod tests {
     #[test]
     fn x_is_the_fastest_axis() {
         let data: Vec<u8> = (0..24).collect();
-        for (fortran, shape) in [("False", "(4, 3, 2)"), ("True", "(2, 3, 4)"), ("False", "(1, 4, 3, 2)")] {
+        for (fortran, shape) in [("False", "(4, 3, 2)"), ("True", "(2, 3, 4)"), ("False", "(1, 4L, 3L, 2L)")] {
             for version in 1..=3 {
                 let v = open(&npy(version, &dict("|u1", fortran, shape), &data)).unwrap();
                 assert_eq!(v.lattice.dims(), [2, 3, 4], "{shape}");

@@ -29,7 +29,7 @@ pub fn read(path: &Path) -> Result<Volume> {
     let keep = header.kept_axes()?;
     let sizes: Vec<usize> = header.list("sizes")?;
     let dims = keep.map(|a| sizes[a]);
-    let lattice = header.lattice(dims, keep).map_err(|e| e.in_file(path))?;
+    let lattice = header.lattice(dims, keep)?;
     let element = header.element()?;
     let samples = header.samples(lattice.len(), element)?;
     let space = header.get("space").and_then(Space::from_name).unwrap_or_default();
@@ -134,7 +134,7 @@ impl<'a> std::ops::Deref for Fields<'a> {
 impl<'a> Fields<'a> {
     /// Reads the lines up to the first empty one; a detached header may end without it.
     fn read(path: &'a Path) -> Result<Self> {
-        let mut begun = false;
+        let (mut begun, mut listed) = (false, false);
         let no_nrrd = || Error::invalid(path, "does not begin with NRRD0001 … NRRD0005, so it is no NRRD file");
         let header = Header::read(path, |number, text| {
             if number == 1 {
@@ -147,15 +147,21 @@ impl<'a> Fields<'a> {
             if text.is_empty() {
                 return Ok(Line::End);
             }
+            if listed {
+                // The names of files follow, on which `samples` has the last word.
+                return Ok(Line::Nothing);
+            }
             // `key:=value` pairs are the user's own notes.
             match text.split_once(':').filter(|(_, v)| !v.starts_with('=')) {
                 _ if text.starts_with('#') => Ok(Line::Nothing),
                 Some((key, value)) => {
-                    Ok(Line::Field(key.replace(' ', "").to_ascii_lowercase(), value.trim().to_string()))
+                    let (key, value) = (key.replace(' ', "").to_ascii_lowercase(), value.trim().to_string());
+                    listed = key.starts_with("datafile") && value.starts_with("LIST");
+                    Ok(Line::Field(key, value))
                 }
                 None if text.contains(":=") => Ok(Line::Nothing),
                 None => {
-                    let shown: String = text.chars().take(80).collect();
+                    let shown: String = text.chars().take(80).flat_map(char::escape_debug).collect();
                     Err(Error::invalid(path, format!("line {number}, `{shown}`, is no `field: value`")))
                 }
             }
@@ -251,7 +257,7 @@ impl<'a> Fields<'a> {
                     .ok_or_else(|| self.wrong("spaceorigin", "it must be one vector `(x,y,z)`"))?,
                 None => DVec3::ZERO,
             };
-            return Lattice::new(dims, origin, axes);
+            return Lattice::new(dims, origin, axes).map_err(|e| e.in_file(self.path));
         }
         let per_axis = |key: &str| -> Result<[f64; 3]> {
             let values: Vec<f64> =
@@ -278,7 +284,7 @@ impl<'a> Fields<'a> {
                 origin[a] = maxs[a] - inset - step[a] * dims[a].saturating_sub(1) as f64;
             }
         }
-        Lattice::aligned(dims, origin, step)
+        Lattice::aligned(dims, origin, step).map_err(|e| e.in_file(self.path))
     }
 
     fn element(&self) -> Result<ElementType> {

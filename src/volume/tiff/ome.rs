@@ -33,6 +33,23 @@ pub(super) fn spacing(pixels: Node) -> Result<DVec3, String> {
     Ok(spacing)
 }
 
+/// Whether pages are slices in order: `TiffData` may give each page (`IFD`) another slice (`FirstZ`).
+///
+/// # Errors
+/// A message that names the first page that is another slice.
+pub(super) fn check_order(pixels: Node) -> Result<(), String> {
+    for data in pixels.children().filter(|n| n.tag_name().name() == "TiffData") {
+        let number = |key: &str| data.attribute(key).and_then(|v| v.trim().parse::<u64>().ok()).unwrap_or(0);
+        let (page, slice) = (number("IFD"), number("FirstZ"));
+        if page != slice {
+            return Err(format!(
+                "OME's text says that page {page} is slice {slice} (TiffData); save it anew with the slices in order"
+            ));
+        }
+    }
+    Ok(())
+}
+
 /// The length of a unit of OME's `UnitsLength`; `None` for those without one and for unknown words.
 fn micrometres(unit: &str) -> Option<f64> {
     const INCH: f64 = 25_400.0;
