@@ -2,7 +2,7 @@
 
 use super::{expect_extension, one_frame, outputs};
 use crate::error::{Error, Result};
-use crate::export::slices;
+use crate::export::{bake_file, slices};
 use crate::progress::{Progress, say};
 use crate::scene_file::{Inputs, RawOptions};
 use crate::volume::vti::{self, VtiFile, VtiWriter};
@@ -113,11 +113,12 @@ impl Export {
     }
 }
 
-/// An array of a `.vti`: the one of that name, else `radiance`, else the scalars.
+/// An array of a `.vti`: the one of that name, else `radiance` of a bake, else the scalars.
 fn array_of(path: &Path, name: Option<&str>) -> Result<Array> {
     let mut file = VtiFile::read(path)?;
     let space = file.space();
-    let chosen = file.point_data.iter().position(|a| a.name == name.unwrap_or("radiance"));
+    let name = name.or_else(|| bake_file::is_bake(&file).then_some("radiance"));
+    let chosen = file.point_data.iter().position(|a| Some(&*a.name) == name);
     let Some(chosen) = chosen else {
         if let Some(name) = name {
             let names: Vec<String> = file.point_data.iter().map(|a| format!("`{}`", a.name)).collect();

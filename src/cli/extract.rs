@@ -5,12 +5,14 @@ use super::{expect_extension, outputs};
 use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
 use crate::export::{Mesh, ply};
+use crate::field::{Field, Sweep};
 use crate::progress::{Progress, say, unless_interrupted};
 use crate::reference::Origin;
 use crate::scene::Scene;
-use crate::scene_file::{Inputs, SceneOptions, load};
+use crate::scene_file::{BoundaryName, Inputs, Loaded, SceneOptions, load};
 use crate::series::is_pattern;
 use crate::surface_mesh::{SurfaceMesh, channel, display_colours, unit_isovalue};
+use crate::volume::Volume;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -56,7 +58,13 @@ impl Extract {
         outputs([&*self.output], &Inputs::of(&self.input, &self.scene)?)?;
         let rays = self.rays.settings()?;
         let begun = Instant::now();
-        let (scene, baked) = open_scene(&self.input, &self.scene, self.field.as_deref())?;
+        if self.scene.surface.boundary == Some(BoundaryName::Capped) {
+            return Err(Error::Invalid(
+                "--boundary capped: the mesh is the surface alone, open where the volume's faces cut it; leave the flag out"
+                    .into(),
+            ));
+        }
+        let Opened { mut scene, baked, volume } = open_scene(&self.input, &self.scene, self.field.as_deref())?;
         match (rays, &baked) {
             (Some(_), None) => {
                 return Err(Error::invalid(
@@ -70,7 +78,12 @@ impl Extract {
         let isovalue = match &baked {
             // There is light on isosurfaces of the sweep only.
             Some(_) => unit_isovalue(&scene.field, self.isovalue).map_err(|e| self.without_light(&e))?,
-            None => scene.field.sweep().isovalue(self.isovalue),
+            None => {
+                if let Some(field) = volume.and_then(|volume| around(&volume, scene.field.sweep(), self.isovalue)) {
+                    scene.field = field.into();
+                }
+                scene.field.sweep().isovalue(self.isovalue)
+            }
         };
         unless_interrupted()?;
         let mesh = SurfaceMesh::extract(&scene, isovalue, self.refine)?;
@@ -126,6 +139,20 @@ impl Extract {
     }
 }
 
+/// The volume in units that tell its samples near `isovalue` apart: as far outside the sweep as the sweep is wide, or
+/// many times nearer to 0, f32 does not. `None` within the sweep, and where the volume has no such isovalue.
+fn around(volume: &Volume, sweep: Sweep, isovalue: f64) -> Option<Field> {
+    // So much wider than the rest of the data the numbers of the unit may not become.
+    const NARROWEST: f64 = 1e-30;
+    let (lo, hi) = (sweep.lo(), sweep.hi());
+    if isovalue >= lo && isovalue <= hi {
+        return None;
+    }
+    let width = hi - lo;
+    let step = 0.5 * isovalue.abs().clamp(NARROWEST.max(f64::MIN_POSITIVE / width) * width, width);
+    Field::new(volume, Sweep::new(isovalue - step, isovalue + step).ok()?).ok()
+}
+
 /// The bake in a `.vti` or `.vtm`, if it is one; it takes no scene from `options`.
 pub(super) fn open_bake(path: &Path, options: &SceneOptions) -> Result<Option<BakedVolume>> {
     let is = |extension: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(extension));
@@ -143,18 +170,23 @@ pub(super) fn open_bake(path: &Path, options: &SceneOptions) -> Result<Option<Ba
     }
 }
 
-/// The scene of a bake, volume or scene file, seen from the volume named `field` (the first if there is no name), and
-/// the bake if it is one, seen likewise.
-pub(super) fn open_scene(
-    path: &Path,
-    options: &SceneOptions,
-    field: Option<&str>,
-) -> Result<(Scene, Option<BakedVolume>)> {
+/// A scene, and where it came from.
+pub(super) struct Opened {
+    pub(super) scene: Scene,
+    /// The bake, if it is one.
+    pub(super) baked: Option<BakedVolume>,
+    /// Otherwise the volume.
+    pub(super) volume: Option<Volume>,
+}
+
+/// The scene of a bake, volume or scene file, seen from the volume named `field` (the first if there is no name).
+pub(super) fn open_scene(path: &Path, options: &SceneOptions, field: Option<&str>) -> Result<Opened> {
     if let Some(baked) = open_bake(path, options)? {
         let baked = if let Some(name) = field { baked.select(name).map_err(|e| e.in_file(path))? } else { baked };
-        return Ok((baked.scene.clone(), Some(baked)));
+        return Ok(Opened { scene: baked.scene.clone(), baked: Some(baked), volume: None });
     }
-    let scene = load(path, options)?.scene;
+    let Loaded { scene, volume, companions, .. } = load(path, options)?;
     let number = field.map(|name| scene.field_named(name)).transpose().map_err(|e| e.in_file(path))?;
-    Ok((number.map_or_else(|| scene.clone(), |n| scene.seen_from(n)), None))
+    let volume = std::iter::once(volume).chain(companions).nth(number.unwrap_or(0));
+    Ok(Opened { scene: number.map_or_else(|| scene.clone(), |n| scene.seen_from(n)), baked: None, volume })
 }

@@ -1,6 +1,6 @@
 //! `isolume reference`: one isosurface illuminated in ordinary 3D, per vertex with variance, or as a picture.
 
-use super::extract::open_scene;
+use super::extract::{Opened, open_scene};
 use super::{device, expect_extension, outputs};
 use crate::embree::{Device, GraphTracer, SurfaceTracer};
 use crate::error::{Error, Result};
@@ -85,7 +85,7 @@ impl ReferenceArgs {
         if self.integrator == Integrator::Path && (self.photons.is_some() || self.photons_per_estimate.is_some()) {
             return Err(Error::Invalid("--photons, --photons-per-estimate: are for --integrator photon".into()));
         }
-        let (scene, baked) = open_scene(&self.input, &self.scene, self.field.as_deref())?;
+        let Opened { scene, baked, .. } = open_scene(&self.input, &self.scene, self.field.as_deref())?;
         let of_bake = baked.is_some();
         baked.map_or(Ok(()), |b| b.whole()).map_err(|e| e.in_file(&self.input))?;
         // Alone, if the scene's volumes give each other no light.

@@ -331,6 +331,11 @@ fn flats(textures: &[TextureDescription], count: usize, arrays: &Arrays) -> Resu
     Ok(flats)
 }
 
+/// Whether a file is a bake, whole or damaged.
+pub fn is_bake(file: &VtiFile) -> bool {
+    Description::text(file).is_some()
+}
+
 impl BakedVolume {
     /// A bake as if it were read.
     pub fn new(scene: Scene, bake: Bake) -> Self {

@@ -204,6 +204,16 @@ fn messages_say_what_to_do_instead() {
     {
         assert!(std::process::Command::new("mkfifo").arg(dir.join("f.npy")).status().unwrap().success());
         refused(dir, &["info", "f.npy"], &["f.npy", "pipe"]);
+        // Those that are read as a whole, too.
+        for name in ["f.vti", "f.vtk", "f.toml"] {
+            fs::rename(dir.join("f.npy"), dir.join(name)).unwrap();
+            refused(dir, &["bake", name, "-o", "out.vti"], &[name, "pipe"]);
+            fs::rename(dir.join(name), dir.join("f.npy")).unwrap();
+        }
+        for device in ["zero.vti", "zero.ply"] {
+            std::os::unix::fs::symlink("/dev/zero", dir.join(device)).unwrap();
+        }
+        refused(dir, &["info", "zero.vti"], &["zero.vti", "device"]);
     }
 }
 
@@ -344,6 +354,8 @@ fn scene_flags_are_refused_where_the_input_is_a_bake() {
         ok(dir, &with(&["--isovalue", "50"]));
     }
     refused(dir, &["extract", "lit.vti", "-o", "m.ply", "--isovalue", "90"], &["lit.vti", "isolume export", "value"]);
+    let capped = ["extract", "b.vti", "-o", "m.ply", "--isovalue", "50", "--boundary", "capped"];
+    refused(dir, &capped, &["--boundary capped: the mesh is the surface alone"]);
     // The way that the message says, and a volume as it was.
     ok(dir, &["export", "lit.vti", "--array", "value", "-o", "value.vti", "-q"]);
     for volume in ["value.vti", "b.vti"] {

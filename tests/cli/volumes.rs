@@ -3,8 +3,9 @@
 
 use super::{QUICK, ok, refused, text};
 use glam::DVec3;
-use isolume::volume::vti::VtiFile;
-use isolume::volume::{Lattice, Samples, Volume};
+use isolume::export::ply;
+use isolume::volume::vti::{VtiFile, VtiWriter};
+use isolume::volume::{Lattice, Samples, Volume, npy};
 use std::fs;
 
 #[test]
@@ -259,4 +260,50 @@ fn info_of_a_damaged_bake_is_that_of_its_volume() {
     assert_eq!((&info["range"], info.get("bake")), (&serde_json::json!([0.0, 26.0]), None));
     let said = text(&output.stderr);
     assert!(said.contains("v.vti") && said.contains("'isolume'") && said.contains("isovalues"), "{said}");
+}
+
+/// A Gaussian: what is suggested leaves out its tail, of which 32 bits in the sweep's units tell nothing.
+fn gaussian() -> (Lattice, Vec<f64>) {
+    let lattice = Lattice::aligned([24; 3], DVec3::ZERO, DVec3::ONE).unwrap();
+    let value = |o: usize| {
+        let p = DVec3::from_array(lattice.ijk(o).map(|i| i as f64)) - 11.5;
+        (-p.length_squared() / 5.0).exp()
+    };
+    let values = (0..lattice.len()).map(value).collect();
+    (lattice, values)
+}
+
+#[test]
+fn isosurfaces_far_outside_the_suggested_sweep_are_where_they_are() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let (lattice, values) = gaussian();
+    npy::write(&dir.join("g.npy"), &lattice, 1, (&Samples::F64(values)).into()).unwrap();
+    for (isovalue, sweep) in [("1e-7", ["5e-8", "2e-7"]), ("1e-11", ["5e-12", "2e-11"])] {
+        ok(dir, &["extract", "g.npy", "--isovalue", isovalue, "-o", "m.ply", "-q"]);
+        let there = ["extract", "g.npy", "--isovalue", isovalue, "-o", "n.ply", "-q", "--isovalues"];
+        ok(dir, &[&there[..], &sweep].concat());
+        let [m, n] = ["m.ply", "n.ply"].map(|name| ply::read(dir.join(name)).unwrap());
+        assert_eq!(m.triangles, n.triangles, "{isovalue}");
+        for axis in ["x", "y", "z"] {
+            let [a, b] = [&m, &n].map(|mesh| mesh.property(axis).unwrap());
+            assert!(a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-4), "{isovalue}");
+        }
+    }
+    refused(dir, &["extract", "g.npy", "--isovalue", "3", "-o", "m.ply"], &["no surface at this isovalue"]);
+}
+
+/// Not what happens to be called as a bake's array is.
+#[test]
+fn the_scalars_of_a_volume_are_exported() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let lattice = Lattice::aligned([2; 3], DVec3::ZERO, DVec3::ONE).unwrap();
+    let [density, radiance] = [[1u8, 2, 3, 4, 5, 6, 7, 8], [9; 8]].map(|v| Samples::U8(v.to_vec()));
+    let file = VtiWriter::new(&lattice).point_data("radiance", 1, &radiance).point_data("density", 1, &density);
+    file.active_scalars("density").write(&dir.join("v.vti")).unwrap();
+    for (array, expected) in [(&[][..], &density), (&["--array", "radiance"], &radiance)] {
+        ok(dir, &[&["export", "v.vti", "-o", "v.npy", "-q"], array].concat());
+        assert_eq!(Volume::open(dir.join("v.npy")).unwrap().samples(), expected, "{array:?}");
+    }
 }

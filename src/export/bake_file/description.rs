@@ -109,10 +109,15 @@ impl PolygonDescription {
 impl Description {
     /// What a file holds, if it is a bake.
     pub(super) fn of(file: &VtiFile) -> Result<Option<Self>> {
-        // Other files may use the name for something else, as generated volumes did.
-        let own = |(name, text): &&(String, String)| name == DESCRIPTION && text.starts_with('{');
-        let Some((_, text)) = file.field_strings.iter().find(own) else { return Ok(None) };
+        let Some(text) = Self::text(file) else { return Ok(None) };
         let parsed = serde_json::from_str(text);
         parsed.map(Some).map_err(|e| Error::Invalid(format!("field data '{DESCRIPTION}': {e}")))
+    }
+
+    /// Its text, if the file is a bake.
+    pub(super) fn text(file: &VtiFile) -> Option<&str> {
+        // Other files may use the name for something else, as generated volumes did.
+        let own = |(name, text): &&(String, String)| name == DESCRIPTION && text.starts_with('{');
+        file.field_strings.iter().find(own).map(|(_, text)| &**text)
     }
 }
