@@ -226,7 +226,11 @@ pub fn compare(texture: &[DVec3], references: &[ReferenceMesh], exposure: f64) -
     let vertices = chosen.len() as f64;
     let percent = |square: f64| 100.0 * square.max(0.0).sqrt();
     let square = sum / vertices;
-    let deviation = ((squares / vertices - square * square).max(0.0) / vertices).sqrt();
+    // A single vertex says nothing about how others scatter.
+    let deviation = match chosen.len() {
+        0 | 1 => f64::INFINITY,
+        _ => ((squares / vertices - square * square).max(0.0) / (vertices - 1.0)).sqrt(),
+    };
     out.percent_rms = percent(square);
     out.percent_rms_sqrt3 = out.percent_rms / 3f64.sqrt();
     out.percent_rms_area = if area > 0.0 { percent(area_sum / area) } else { 0.0 };

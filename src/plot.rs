@@ -75,23 +75,34 @@ impl Axis {
         self.page[0] + (v - lo) / (hi - lo) * (self.page[1] - self.page[0])
     }
 
-    /// Ticks, at 1, 2, 5 × powers of ten, with their labels.
+    /// Ticks, at 1, 2, 5 × powers of ten, with their labels; where a logarithmic axis is too short for two of them, at
+    /// all digits, or even steps.
     fn ticks(&self) -> Vec<(f64, String)> {
-        let [lo, hi] = self.range;
-        if self.log {
-            #[allow(clippy::cast_possible_truncation, reason = "exponents of what is plotted")]
-            let (first, last) = (lo.floor() as i32, hi.ceil() as i32);
-            let steps: &[f64] = if hi - lo < 2.5 { &[1.0, 2.0, 5.0] } else { &[1.0] };
-            let all = (first..=last).flat_map(|e| steps.iter().map(move |s| s * 10f64.powi(e)));
-            return all.filter(|v| (lo..=hi).contains(&v.log10())).map(|v| (v, label(v, v))).collect();
+        if !self.log {
+            return even_ticks(self.range);
         }
-        let raw = (hi - lo) / 6.0;
-        let power = 10f64.powf(raw.log10().floor());
-        let step = [1.0, 2.0, 5.0, 10.0].map(|s| s * power).into_iter().find(|s| *s >= raw).unwrap_or(raw);
-        let first = (lo / step).ceil();
-        let all = (0..12).map(|i| (first + f64::from(i)) * step).take_while(|v| *v <= hi + 1e-9 * step);
-        all.map(|v| (v, label(v, step))).collect()
+        let [lo, hi] = self.range;
+        #[allow(clippy::cast_possible_truncation, reason = "exponents of what is plotted")]
+        let (first, last) = (lo.floor() as i32, hi.ceil() as i32);
+        let at = |digits: &[f64]| -> Vec<(f64, String)> {
+            let all = (first..=last).flat_map(|e| digits.iter().map(move |d| d * 10f64.powi(e)));
+            all.filter(|v| (lo..=hi).contains(&v.log10())).map(|v| (v, label(v, v))).collect()
+        };
+        let few: &[f64] = if hi - lo < 2.5 { &[1.0, 2.0, 5.0] } else { &[1.0] };
+        let all: Vec<f64> = (1..10).map(f64::from).collect();
+        let enough = [few, &all].into_iter().map(at).find(|ticks| ticks.len() > 1);
+        enough.unwrap_or_else(|| even_ticks([lo, hi].map(|v| 10f64.powf(v))))
     }
+}
+
+/// About six ticks at even steps, with their labels.
+fn even_ticks([lo, hi]: [f64; 2]) -> Vec<(f64, String)> {
+    let raw = (hi - lo) / 6.0;
+    let power = 10f64.powf(raw.log10().floor());
+    let step = [1.0, 2.0, 5.0, 10.0].map(|s| s * power).into_iter().find(|s| *s >= raw).unwrap_or(raw);
+    let first = (lo / step).ceil();
+    let all = (0..12).map(|i| (first + f64::from(i)) * step).take_while(|v| *v <= hi + 1e-9 * step);
+    all.map(|v| (v, label(v, step))).collect()
 }
 
 fn escaped(text: &str) -> String {
@@ -254,6 +265,11 @@ mod tests {
         assert_eq!((values(&axis), labels(&axis).join(" ")), (vec![20.0, 40.0, 60.0, 80.0], "20 40 60 80".into()));
         let axis = Axis { range: [-0.1, 1.1], log: true, page: [0.0, 1.0] };
         assert_eq!((values(&axis), labels(&axis).join(" ")), (vec![1.0, 2.0, 5.0, 10.0], "1 2 5 10".into()));
+        let short = |lo: f64, hi: f64| labels(&Axis { range: [lo, hi].map(f64::log10), log: true, page: [0.0, 1.0] });
+        assert_eq!(short(2.1, 4.7), ["3", "4"]);
+        assert_eq!(short(22.0, 48.0), ["30", "40"]);
+        assert_eq!(short(1.12, 1.93), ["1.2", "1.4", "1.6", "1.8"]);
+        assert_eq!(short(2.995e-4, 3.101e-4), ["3e-4", "3.02e-4", "3.04e-4", "3.06e-4", "3.08e-4", "3.1e-4"]);
         let shown = |lo: f64, hi: f64| labels(&Axis { range: [lo, hi], log: false, page: [0.0, 1.0] });
         assert_eq!(shown(-0.29, 0.3), ["-0.2", "-0.1", "0", "0.1", "0.2", "0.3"]);
         assert_eq!(shown(110_000.0, 190_000.0), ["1.2e5", "1.4e5", "1.6e5", "1.8e5"]);

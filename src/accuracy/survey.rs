@@ -223,12 +223,12 @@ fn stream(settings: &SurveySettings, index: u64) -> Rng {
     Rng::stream(seed(settings, 3), Stage::Sample, index)
 }
 
-/// Mean of the squares, and its 95 % confidence interval.
+/// Mean of the squares, and its 95 % confidence interval: any, of a single one.
 fn mean_square(all: &[Deviation]) -> (f64, [f64; 2]) {
-    let n = (all.len() as f64).max(1.0);
-    let mean = all.iter().map(|d| d.square).sum::<f64>() / n;
-    let variance = all.iter().map(|d| (d.square - mean).powi(2)).sum::<f64>() / n;
-    let deviation = (variance / n).sqrt();
+    let n = all.len() as f64;
+    let mean = all.iter().map(|d| d.square).sum::<f64>() / n.max(1.0);
+    let scatter = all.iter().map(|d| (d.square - mean).powi(2)).sum::<f64>();
+    let deviation = if n > 1.0 { (scatter / ((n - 1.0) * n)).sqrt() } else { f64::INFINITY };
     (mean, [mean - 1.96 * deviation, mean + 1.96 * deviation])
 }
 
@@ -342,6 +342,9 @@ mod tests {
         // Outermost and innermost cells have corners beyond the sweep.
         assert!((250..=300).contains(&s.grid_points), "{s:?}");
         assert_eq!(s.parts.iter().map(|p| p.points).sum::<usize>(), 300);
+        // How far one may be from the others it does not say.
+        let [lo, hi] = surveyed(&scene, |_| 0.1, 1).confidence;
+        assert!(lo == 0.0 && hi == f64::INFINITY, "{lo} {hi}");
         let right = surveyed(&scene, |_| 0.0, 300);
         assert!(right.percent_rms < 1e-4 && right.bias.abs() < 1e-4, "{right:?}");
     }

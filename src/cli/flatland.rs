@@ -59,16 +59,18 @@ impl Flatland {
                 self.scene.display()
             );
         }
-        super::folder(&self.output)?;
         let device = super::device()?;
         let begun = Instant::now();
         let transports: &[Transport] =
             if self.ordinary { &[Transport::Flattened, Transport::Ordinary] } else { &[Transport::Flattened] };
+        let world = |&transport: &Transport| World::new(&device, scene.clone(), transport);
+        let all: Vec<World> =
+            transports.iter().map(world).collect::<Result<_>>().map_err(|e| e.in_file(&self.scene))?;
+        super::folder(&self.output)?;
         let mut worlds = Vec::new();
-        for &transport in transports {
-            let world = World::new(&device, scene.clone(), transport)?;
+        for (world, transport) in all.into_iter().zip(transports) {
             // A sphere of directions needs more of them, and more of its luminaire, than a circle.
-            let more = if transport == Transport::Ordinary { 2 } else { 1 };
+            let more = if *transport == Transport::Ordinary { 2 } else { 1 };
             let settings = SolveSettings {
                 gather: self.gather * more,
                 shadow: 16 * more * more,

@@ -3,8 +3,8 @@
 use super::HeightField;
 use glam::DVec2;
 
-/// Segments of L(h, c) in index coordinates, c in units of the sweep. In a saddle cell the bilinear centre decides
-/// which corners join. Chords of the curve: ends are exact on the cells' edges.
+/// Segments of L(h, c) in index coordinates, c in units of the sweep. In a saddle cell h at the saddle decides which
+/// corners join \[NH91\]. Chords of the curve: ends are exact on the cells' edges.
 pub(super) fn level_curve(field: &HeightField, c: f64) -> Vec<[DVec2; 2]> {
     let [nx, ny] = field.dims();
     let mut segments = Vec::new();
@@ -27,8 +27,8 @@ pub(super) fn level_curve(field: &HeightField, c: f64) -> Vec<[DVec2; 2]> {
                 [a, b] => segments.push([a, b]),
                 [a, b, d, e] => {
                     // Cuts 0 and 1 enclose corner 1: they join if that corner stands alone.
-                    let centre_inside = 0.25 * s.iter().sum::<f64>() >= c;
-                    if (s[1] >= c) == centre_inside {
+                    let saddle = (s[0] * s[3] - s[1] * s[2]) / (s[0] + s[3] - s[1] - s[2]);
+                    if (s[1] >= c) == (saddle >= c) {
                         segments.extend([[a, e], [b, d]]);
                     } else {
                         segments.extend([[a, b], [d, e]]);
@@ -62,12 +62,18 @@ mod tests {
     }
 
     #[test]
-    fn saddles_join_the_way_their_centre_says() {
+    fn saddles_join_the_way_their_value_says() {
         let sweep = Sweep::new(0.0, 1.0).unwrap();
-        for (values, joined) in [([1.0, 0.0, 0.0, 1.0], true), ([0.9, 0.0, 0.0, 0.9], false)] {
+        for (values, c, joined) in [
+            ([1.0, 0.0, 0.0, 1.0], 0.5, true),
+            ([0.9, 0.0, 0.0, 0.9], 0.5, false),
+            // 0.232 at the saddle, 0.325 in the middle.
+            ([1.0, 0.0, 0.0, 0.302], 0.25, false),
+            ([1.0, 0.0, 0.0, 0.302], 0.22, true),
+        ] {
             let field = HeightField::new([2, 2], DVec2::ZERO, DVec2::ONE, &values, sweep).unwrap();
-            // At the centre 0.5 or 0.45 against c = 0.5: the high corners are one region, or two.
-            let segments = level_curve(&field, 0.5);
+            // At the saddle 0.5 or 0.45 against c = 0.5: the high corners are one region, or two.
+            let segments = level_curve(&field, c);
             let around_low = segments.iter().any(|[a, b]| {
                 let m = 0.5 * (*a + *b);
                 m.x > 0.5 && m.y < 0.5 && m.x - m.y > 0.4

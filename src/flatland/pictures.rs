@@ -122,23 +122,37 @@ struct View<'a> {
     /// Forward, right and down, the latter two per pixel.
     basis: [DVec3; 3],
     size: [usize; 2],
+    seed: u64,
 }
 
 impl<'a> View<'a> {
-    fn new(world: &'a World, geometry: &'a GraphSurface, width: usize) -> Self {
+    fn new(world: &'a World, geometry: &'a GraphSurface, width: usize, seed: u64) -> Self {
         let [lo, hi] = world.scene.field.bounds();
         let (size, height) = (hi - lo, world.scene.height);
         let unit = size.max_element();
         let up = world.scene.outside.facing(1.0);
         let middle = if up > 0.0 { 0.25 } else { 0.75 };
         let target = (lo + size * DVec2::new(0.5, 0.5)).extend(middle * height);
-        let eye = target + DVec3::new(0.0, 1.35, 1.85 * up) * unit;
+        let back = DVec3::new(0.0, 1.35, 1.85 * up);
         let pixels = [width, (width * 4).div_ceil(5)];
-        let forward = (target - eye).normalize();
+        let forward = -back.normalize();
         let right = forward.cross(DVec3::Z).normalize();
-        let scale = 2.0 * f64::to_radians(15.5).tan() / pixels[1] as f64;
-        let basis = [forward, right * scale, forward.cross(right) * scale];
-        Self { world, geometry, eye, basis, size: pixels }
+        let down = forward.cross(right);
+        let slope = f64::to_radians(15.5).tan();
+        let scale = 2.0 * slope / pixels[1] as f64;
+        // As far back as it takes to see all corners of the box.
+        let slopes = [(right, slope * pixels[0] as f64 / pixels[1] as f64), (down, slope)];
+        let mut distance = back.length() * unit;
+        for corner in 0..8 {
+            let at = |axis: u32| if corner >> axis & 1 == 0 { DVec3::ZERO } else { DVec3::AXES[axis as usize] };
+            let p = lo.extend(0.0) + (at(0) + at(1) + at(2)) * size.extend(height) - target;
+            for (axis, slope) in slopes {
+                distance = distance.max(p.dot(axis).abs() / slope - p.dot(forward));
+            }
+        }
+        let eye = target - distance * forward;
+        let basis = [forward, right * scale, down * scale];
+        Self { world, geometry, eye, basis, size: pixels, seed }
     }
 
     /// World direction through pixel coordinates.
@@ -201,7 +215,7 @@ impl<'a> View<'a> {
             if interrupted() {
                 return;
             }
-            let set = Sobol::set(1, Stage::Picture, o as u64);
+            let set = Sobol::set(self.seed, Stage::Picture, o as u64);
             let mut sum = DVec3::ZERO;
             for i in 0..samples {
                 let [x, y] = set.point2(i, 0);
@@ -304,11 +318,11 @@ pub fn write_pictures(
     worlds: &[(World, Solution)],
     settings: &PictureSettings,
 ) -> Result<Vec<String>> {
-    let Some((first, _)) = worlds.first() else { return Ok(Vec::new()) };
+    let Some((first, solution)) = worlds.first() else { return Ok(Vec::new()) };
     // Walls reach down to a graph that dips a little below the sweep, else a slit would show.
     let lowest = first.scene.field.samples().iter().fold(0f32, |m, &s| m.min(s)).max(-0.1);
     let geometry = GraphSurface::with_heights(device, &first.scene, [f64::from(lowest), 1.0])?;
-    let view = View::new(first, &geometry, settings.width);
+    let view = View::new(first, &geometry, settings.width, solution.seed());
     let levels: Vec<f64> = (0..settings.levels).map(|k| (k as f64 + 0.5) / settings.levels as f64).collect();
     let mut names = Vec::new();
     let mut both = Vec::new();
@@ -366,7 +380,7 @@ pub fn write_pictures(
 fn draw_paths(view: &View, world: &World, picture: &mut Picture, plane: f64, count: u64) -> Result<()> {
     for index in 0..count {
         unless_interrupted()?;
-        let path = world.photon_path(1, index, plane, 3);
+        let path = world.photon_path(view.seed, index, plane, 3);
         let mut colour = DVec3::new(1.0, 0.75, 0.05);
         for pair in path.windows(2) {
             view.line(picture, pair[0].position, pair[1].position, colour, 1.2);

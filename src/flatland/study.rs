@@ -44,6 +44,17 @@ impl Default for StudySettings {
     }
 }
 
+impl StudySettings {
+    /// # Errors
+    /// `Invalid` if fewer samples are allowed than the study begins with.
+    pub fn check(&self) -> Result<()> {
+        if self.most < 1000 {
+            return Err(Error::Invalid(format!("--most {}: the study begins at 1000 samples", self.most)));
+        }
+        Ok(())
+    }
+}
+
 /// Where samples stand.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Placement {
@@ -220,9 +231,7 @@ const FIGURE5: u64 = 20_000;
 /// # Errors
 /// `Io`, `Embree`, `Interrupted`; `Invalid` if fewer than 1000 samples are allowed.
 pub fn flatland(folder: &Path, device: &Device, settings: &StudySettings, progress: Progress) -> Result<()> {
-    if settings.most < 1000 {
-        return Err(Error::Invalid(format!("--most {}: the study begins at 1000 samples", settings.most)));
-    }
+    settings.check()?;
     let begun = Instant::now();
     let bench = Bench::new(device, settings)?;
     let solved = begun.elapsed().as_secs_f64();
@@ -268,7 +277,7 @@ fn write(path: &Path, text: &str) -> Result<()> {
     file.finish(written)
 }
 
-/// Samples as dots of their radiance, and the grid made from them.
+/// Samples as dots of the grid's radiance there, and the grid made from them.
 fn figure5(bench: &Bench, positions: &[DVec2], grid: &[DVec3]) -> crate::export::picture::Picture {
     const FACTOR: usize = 5;
     /// A blue that no light of the box has.

@@ -232,10 +232,6 @@ fn judge(input: &Input, engine: Engine, device: &Device) -> Outcome {
         (Ok(bake), Expect::Refusal(_)) => return Err(format!("was baked: {} points", bake.lattice.len())),
         (Ok(bake), _) => bake,
         (Err(Error::Invalid(message)), Expect::Refusal(words)) if message.contains(words) => return Ok(()),
-        // Polygons inside the volume are the photon engine's.
-        (Err(Error::NotSupported(message)), _) if engine == Engine::Sweep && message.contains("--engine photon") => {
-            return Ok(());
-        }
         (Err(e), _) => return Err(format!("refused: {e}")),
     };
     let bad = numbers(&bake).filter(|x| !x.is_finite()).count();

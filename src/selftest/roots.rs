@@ -238,6 +238,14 @@ fn judge_cell_by(solver: impl Solver, cell: &Cell, c: f32, p: DVec3, d: DVec3) -
         Some(t) if !(0.0..=end).contains(&t) => Err(format!("{}: t = {t} is outside [0, {end}]", case())),
         Some(t) => {
             let step = ULPS * (end.next_up() - end);
+            // The first: where the exact function turns before it, it has not crossed yet.
+            let before = turning_points(&cubic, t - step)
+                .into_iter()
+                .map(|turn| exact(turn.hi))
+                .find(|v| v.not_negative() != start.not_negative() && v.hi.abs() > CELL_BOUND * unit);
+            if let Some(v) = before {
+                return Err(format!("{}: t = {t} is not the first crossing, depth {} before", case(), v.hi));
+            }
             let (lo, hi) = (exact((t - step).max(0.0)), exact((t + step).min(end)));
             let value = exact(t).hi.abs();
             if lo.not_negative() != hi.not_negative() || unit == 0.0 { Ok(0.0) } else { Ok(value / unit) }
@@ -318,5 +326,24 @@ mod tests {
         // Sign changes that the ends do not demand, and those that they do.
         assert!(judged(|p: &Cubic, end: f64, a: bool, b: bool| p.first_crossing(end, a, b).filter(|_| a != b)).1 > 0);
         assert!(judged(|p: &Cubic, end: f64, a: bool, b: bool| p.first_crossing(end, a, b).filter(|_| a == b)).1 > 0);
+    }
+
+    /// From the other end the first crossing is the last.
+    #[test]
+    fn the_last_crossing_is_not_the_first() {
+        let last = |p: &Cubic, end: f64, a: bool, b: bool| {
+            let [c0, c1, c2, c3] = p.c;
+            let at_end = ((c3 * end + c2) * end + c1) * end + c0;
+            let slope = (3.0 * c3 * end + 2.0 * c2) * end + c1;
+            let turned = Cubic { c: [at_end, -slope, 3.0 * c3 * end + c2, -c3] };
+            turned.first_crossing(end, b, a).map(|t| (end - t).max(0.0))
+        };
+        let mut caught = 0;
+        for (i, family) in (0..20_000).flat_map(|i| (0..CELLS.len()).map(move |family| (i, family))) {
+            let (s, c, p, d) = cell(family, i);
+            let judged = judge_cell_by(last, &s, c, p, d);
+            caught += u32::from(judged.is_err_and(|message| message.contains("is not the first crossing")));
+        }
+        assert!(caught > 100, "{caught}");
     }
 }

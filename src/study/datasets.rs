@@ -105,7 +105,12 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
             let s = bake.report.seconds;
             let [nx, ny, nz] = bake.lattice.dims();
             let mut row = key(mode);
-            row.extend([format!("{nx}x{ny}x{nz}"), settings.photons.to_string(), bake.report.samples.to_string()]);
+            // Sweeps need none.
+            let emitted = match bake.report.photons.emitted {
+                0 => "-".to_owned(),
+                emitted => emitted.to_string(),
+            };
+            row.extend([format!("{nx}x{ny}x{nz}"), emitted, bake.report.samples.to_string()]);
             let numbers = [
                 a.percent_rms,
                 a.confidence[0],

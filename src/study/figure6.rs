@@ -9,6 +9,7 @@ use crate::progress::Progress;
 use crate::render::{Camera, Shading, render};
 use crate::sampling::positions;
 use glam::DVec3;
+use std::path::PathBuf;
 
 /// Pixels along a panel's edge, and between panels.
 const PANEL: usize = 400;
@@ -16,7 +17,7 @@ const GAP: usize = 8;
 /// Samples drawn: more would cover the panel.
 const DRAWN: u64 = 40_000;
 
-/// Writes `figure6-<subject>-<strategy>.png`: seen along +y, with z up, samples coloured by their radiance (left), a
+/// Writes `figure6-<subject>-<strategy>.png`: seen along +y, with z up, samples coloured by the grid's light there (left), a
 /// slice through the illumination grid at 0.4 of its depth (middle), the isosurface reported first (right).
 ///
 /// # Errors
@@ -46,7 +47,12 @@ pub(super) fn figure6(study: &Study, subject: &Subject, name: &str, strategy: St
             sheet.rgb[at..at + PANEL].copy_from_slice(pixels);
         }
     }
-    sheet.write_png(study.folder.join(format!("figure6-{}-{name}.png", subject.name)), baked.exposure as f32)
+    sheet.write_png(figure6_path(study, subject, name), baked.exposure as f32)
+}
+
+/// Where the picture of a strategy goes.
+pub(super) fn figure6_path(study: &Study, subject: &Subject, name: &str) -> PathBuf {
+    study.folder.join(format!("figure6-{}-{name}.png", subject.name))
 }
 
 fn square(baked: &BakedVolume) -> Camera {

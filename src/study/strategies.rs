@@ -1,6 +1,6 @@
 //! BB09's table: where radiance is sampled, against the isovalue. \[BB09 §3\]
 
-use super::figure6::figure6;
+use super::figure6::{figure6, figure6_path};
 use super::{Effort, Study, Subject, Table, accuracy_of, exactly, provenance};
 use crate::bake::{BakeOptions, BakeSettings, Engine, StrategyName};
 use crate::error::Result;
@@ -70,7 +70,10 @@ fn measure(study: &Study, works: &[Work], base: &BakeOptions, counts: &[u64], ta
         for &count in counts {
             for (strategy, name) in STRATEGIES {
                 let key = |c: f64| vec![subject.name.clone(), count.to_string(), name.to_owned(), exactly(c)];
-                if isovalues.iter().all(|&c| table.has(&key(c))) {
+                let pictured = strategy != StrategyName::Nodes && count == counts[1];
+                if isovalues.iter().all(|&c| table.has(&key(c)))
+                    && (!pictured || figure6_path(study, subject, name).is_file())
+                {
                     continue;
                 }
                 study.say(&format!("{}: {count} samples, {name}", subject.name));
@@ -108,7 +111,7 @@ fn measure(study: &Study, works: &[Work], base: &BakeOptions, counts: &[u64], ta
                     row.extend(job.clone());
                     table.push(row)?;
                 }
-                if strategy != StrategyName::Nodes && count == counts[1] {
+                if pictured {
                     figure6(study, subject, name, strategy, bake)?;
                 }
             }
@@ -117,7 +120,8 @@ fn measure(study: &Study, works: &[Work], base: &BakeOptions, counts: &[u64], ta
     Ok(())
 }
 
-/// The largest grid of Ω's proportions that takes at most `count` samples (two for points that neighbours stand for).
+/// The largest grid of Ω's proportions that takes at most `count` samples, or what costs as much: points that others
+/// around stand for take more of them, of fewer rays.
 ///
 /// # Errors
 /// `Invalid` if it has too many points.
@@ -131,12 +135,7 @@ fn grid_of(subject: &Subject, count: u64) -> Result<GridSize> {
         tried += 1;
         let grid = GridSize::Points(dims.map(|n| ((n as f64 * factor) as usize).max(2)));
         let lattice = grid.lattice(subject.scene.lattice())?;
-        let taken = |m: &Mask| match m {
-            Mask::Empty => 0u64,
-            Mask::Valid => 1,
-            Mask::Filled => 2,
-        };
-        let samples: u64 = masks(field, &lattice).iter().map(taken).sum();
+        let samples = masks(field, &lattice).iter().filter(|m| **m != Mask::Empty).count() as u64;
         if samples <= count && samples as f64 > 0.9 * count as f64 || lattice.len() == 8 || tried == 32 {
             return Ok(grid);
         }

@@ -117,7 +117,9 @@ impl Table {
         let shown = self.columns.len() - 1;
         let mut text = format!("# {heading}\n\n| {} |\n|{}\n", self.columns[..shown].join(" | "), "---|".repeat(shown));
         for row in &self.rows {
-            writeln!(text, "| {} |", row[..shown].join(" | ")).expect("strings take all that is written");
+            // A bar would end the cell.
+            let cells: Vec<String> = row[..shown].iter().map(|cell| cell.replace('|', "\\|")).collect();
+            writeln!(text, "| {} |", cells.join(" | ")).expect("strings take all that is written");
         }
         write!(text, "\n{notes}\n").expect("strings take all that is written");
         write_text(path, &text)
@@ -194,9 +196,11 @@ mod tests {
         assert!(t.expect("last", "j").is_ok() && t.expect("none", "k").is_ok() && t.expect_program("p").is_ok());
         assert!(t.expect("last", "k").unwrap_err().to_string().contains("(job j, this one is k)"));
         assert!(t.expect_program("q").unwrap_err().to_string().contains("made by `p`, this is `q`"));
+        t.push(["a|b", "1", "0.5", "j", "p"].map(String::from).to_vec()).unwrap();
         let (shown, notes) = (dir.path().join("t.md"), "made by p");
         t.write_markdown(&shown, "t", notes).unwrap();
         let shown = std::fs::read_to_string(shown).unwrap();
         assert!(shown.contains("| error | job |\n|---|---|---|---|\n") && shown.contains("| last | 1 | 0.5 | j |\n"));
+        assert!(shown.contains("| a\\|b | 1 | 0.5 | j |\n"), "{shown}");
     }
 }

@@ -31,6 +31,13 @@ fn paths_have_a_most() {
     let dir = tempfile::tempdir().unwrap();
     fs::write(dir.path().join("s.toml"), SCENE).unwrap();
     refused(dir.path(), &["flatland", "s.toml", "-o", "o", "--paths", "65537"], &["--paths 65537: 0 to 65536"]);
+    // Before there is a folder.
+    refused(dir.path(), &["study", "flatland", "--most", "999", "-o", "none"], &["--most 999"]);
+    for limit in ["nan", "0"] {
+        let curve = ["study", "curve", "s.toml", "-o", "none", "--limit", limit];
+        refused(dir.path(), &curve, &["--limit", "positive number of seconds"]);
+    }
+    assert!(!dir.path().join("none").exists());
 }
 
 /// The picture of the paths is the last one.
