@@ -99,9 +99,9 @@ pub(crate) fn draws(index: u64, deviation: f32) -> Vec3 {
 
 /// The variance of what [`fit`] with the same `pull` makes of the nodes that `free` holds, in rising order, if `errors`
 /// are [`draws`] of the samples' errors instead of their light and `start` tells those of the nodes that it started
-/// from. Between samples in a cell's corner the fit extrapolates, and enlarges them. The fit is linear, so the errors go
-/// through it as light does; three draws know the variance of one node to about 4/5, that of many nodes' light well.
-/// Takes what [`fit`] takes.
+/// from. From samples in a cell's corner the fit extrapolates, and enlarges them. It is linear, so errors go through it
+/// as light does; three draws know the variance of one node to about 4/5, that of many nodes' light well. Takes what
+/// [`fit`] takes.
 pub(crate) fn fitted_variance(
     field: &Field,
     lattice: &Lattice,
@@ -321,8 +321,8 @@ mod tests {
         assert!(held < 0.5 * before, "Shepard {before}, fitted {held}");
     }
 
-    /// Samples in one corner of their cells and nodes that are fixed, all with errors: the variance of many fits is what
-    /// one tells, and more than the samples'.
+    /// Samples in one corner of their cells and nodes that are fixed, all with errors: the variance of many fits is
+    /// what one tells.
     #[test]
     fn errors_go_through_the_fit() {
         let lattice = Lattice::aligned([12; 3], DVec3::ZERO, DVec3::ONE).unwrap();

@@ -446,8 +446,8 @@ impl<'a> Beside<'a> {
         mut grid: IlluminationGrid,
         light: &[BesideLight],
     ) -> IlluminationGrid {
-        // Of the points that get light, its error where the fit starts: three draws of each place's own, and the variance
-        // of what places have in common, which no fit enlarges.
+        // Of the points that get light, its error where the fit starts: three draws of each place's own, and the
+        // variance of what places have in common, which no fit enlarges.
         let (mut lit, mut errors, mut start) = (Vec::new(), Vec::new(), 0);
         let own = |n: usize| draws(n as u64, (light[n].variance - light[n].common).max(0.0).sqrt());
         for run in self.owners.chunk_by(|a, b| a == b) {

@@ -17,8 +17,8 @@ const GAP: usize = 8;
 /// Samples drawn: more would cover the panel.
 const DRAWN: u64 = 40_000;
 
-/// Writes `figure6-<subject>-<strategy>.png`: seen along +y, with z up, samples coloured by the grid's light there (left), a
-/// slice through the illumination grid at 0.4 of its depth (middle), the isosurface reported first (right).
+/// Writes `figure6-<subject>-<strategy>.png`: seen along +y, with z up, samples coloured by the grid's light there
+/// (left), a slice through the illumination grid at 0.4 of its depth (middle), the isosurface reported first (right).
 ///
 /// # Errors
 /// As rendering; `Io`.

@@ -1,7 +1,7 @@
 //! Tiles packed by LZW, unpacked whole.
 //!
-//! The decoder reads tiles that reach beyond the picture row by row, and takes a row that ends where a code does for the
-//! end of the file (image-tiff, issue 395). So such pages are given to it with their tiles unpacked.
+//! The decoder reads tiles that reach beyond the picture row by row, and takes a row that ends where a code does for
+//! the end of the file (image-tiff, issue 395). So such pages are given to it with their tiles unpacked.
 
 use std::io::{Read, Seek, SeekFrom};
 use tiff::decoder::{ChunkType, Decoder};
@@ -23,8 +23,8 @@ const KEPT: [Tag; 9] = [
     Tag::SampleFormat,
 ];
 
-/// The page on which `decoder` stands, of one grey sample per pixel, as a BigTIFF of its own whose tiles are not packed;
-/// `None` if they are not packed by LZW. Holds no more than there is.
+/// The page on which `decoder` stands, of one grey sample per pixel, as a BigTIFF of its own whose tiles are not
+/// packed; `None` if they are not packed by LZW. Holds no more than there is.
 ///
 /// # Errors
 /// Of reading, with `UnexpectedEof` if a tile holds less than it should; `InvalidData` for what is not LZW.
@@ -133,8 +133,8 @@ mod tests {
     const SIZE: [usize; 2] = [50, 33];
     const TILE: [usize; 2] = [16, 32];
 
-    /// Samples that no code packs well, so that codes end anywhere in rows; one page, in tiles of which the last of each
-    /// row and column reach beyond it.
+    /// Samples that no code packs well, so that codes end anywhere in rows; one page, in tiles of which the last of
+    /// each row and column reach beyond it.
     fn page(order: ByteOrder, seed: u64, cut: usize) -> (Vec<u8>, Vec<u16>) {
         let mut rng = Rng::stream(seed, Stage::Test, 0);
         let samples: Vec<u16> = (0..SIZE[0] * SIZE[1]).map(|_| (rng.bits() >> 48) as u16).collect();
