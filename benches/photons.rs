@@ -2,7 +2,6 @@
 //! per estimate, against a gather of many rays. Then the reference's paths. Rates are per CPU second of all threads.
 
 use glam::DVec3;
-use isolume::checkpoint;
 use isolume::direct::{Receiver, luminance};
 use isolume::embree::{Device, GraphTracer, SurfaceTracer};
 use isolume::field::{Field, Sweep};
@@ -14,7 +13,7 @@ use isolume::nearest::Neighbours;
 use isolume::photon::{PhotonSettings, trace_photons};
 use isolume::photon_map::{EstimateSettings, Estimator, PhotonMap};
 use isolume::progress::processor_seconds;
-use isolume::radiance_cache::{CacheSettings, RadianceCache};
+use isolume::radiance_cache::{CacheSettings, NodeBand, NodePhotons, RadianceCache};
 use isolume::reference::{Integrator, ReferenceSettings, reference};
 use isolume::rng::Stage;
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
@@ -100,8 +99,9 @@ fn main() {
     let other = trace_photons(&scene, &tracer, &emission(1 << 22, 2), &|_| true);
     let truth: Vec<DVec3> = {
         let fine = EstimateSettings::default();
-        let saved = [checkpoint::Stage::UNSAVED; 2];
-        let cache = RadianceCache::new(&scene, &tracer, &other, fine, &cache_settings, true, saved, &|_| true);
+        let mut cache = RadianceCache::new(&scene, &tracer, &other, &cache_settings, &|_| true);
+        let source = NodePhotons::new(&scene, &other, fine);
+        cache.fill(&scene, &tracer, &source, &cache_settings, NodeBand::WHOLE, &|_| true);
         let gather = |(i, r): (usize, &Receiver)| {
             gathered_irradiance(&scene, &tracer, &cache, r, 512, Stage::Gather.key(3, i as u64)).estimate.mean
         };

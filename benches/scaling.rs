@@ -5,7 +5,6 @@
 
 use glam::Vec3;
 use isolume::bake::{BakeOptions, BakeSettings, Engine, Preset, bake};
-use isolume::checkpoint;
 use isolume::embree::{Device, GraphTracer, SurfaceTracer};
 use isolume::export::bake_file;
 use isolume::field::{Field, Sweep};
@@ -18,8 +17,8 @@ use isolume::node_set::NodeSet;
 use isolume::photon::{PhotonSettings, trace_photons};
 use isolume::photon_map::EstimateSettings;
 use isolume::progress::{Clock, Progress};
-use isolume::radiance::{Indirect, RadianceSample, sample_radiance};
-use isolume::radiance_cache::{CacheSettings, NodePhotons, RadianceCache};
+use isolume::radiance::{Indirect, RadianceSample, Sampler};
+use isolume::radiance_cache::{CacheSettings, NodeBand, NodePhotons, RadianceCache};
 use isolume::reference::{Integrator, ReferenceSettings, reference};
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
 use isolume::smoothing::smooth;
@@ -98,7 +97,6 @@ fn main() {
     let device = Device::new(1).expect("Embree starts");
     let tracer = GraphTracer::new(&device, &scene).expect("a tracer");
     let lattice = scene.lattice();
-    let unsaved = checkpoint::Stage::UNSAVED;
 
     let photon_settings = PhotonSettings {
         count: 1 << 20,
@@ -117,11 +115,10 @@ fn main() {
         seed: 1,
     };
     let estimate = EstimateSettings::default();
-    let dark =
-        || RadianceCache::new(&scene, &tracer, &photons, estimate, &cache_settings, false, [unsaved; 2], &|_| true);
+    let dark = || RadianceCache::new(&scene, &tracer, &photons, &cache_settings, &|_| true);
     let source = NodePhotons::new(&scene, &photons, estimate);
     let filled = |cache: &mut RadianceCache| {
-        cache.fill_band(&scene, &tracer, &source, 0.0..=1.0, &cache_settings, [unsaved; 2], 0, &|_| true);
+        cache.fill(&scene, &tracer, &source, &cache_settings, NodeBand::WHOLE, &|_| true);
     };
     let mut cache = dark();
     filled(&mut cache);
@@ -131,7 +128,8 @@ fn main() {
     let some: Vec<Vec3> = nodes.iter().copied().step_by(5).collect();
     let gather = Indirect::Gather(&cache, 64);
     let sampled = |at: &[Vec3], rays: u32| {
-        sample_radiance(&scene, &tracer, &gather, at, Side::Lower, rays, 1, unsaved, &|_| true)
+        let (scene, tracer, indirect, side) = (&scene, &tracer, &gather, Side::Lower);
+        Sampler { scene, tracer, indirect, side, shadow_rays: rays, seed: 1 }.samples(at, &|_| true)
     };
     let samples: Vec<RadianceSample> = sampled(&some, 16).samples.into_iter().flatten().collect();
     // As many as BB09 took, around nodes with a surface of the sweep.

@@ -271,11 +271,9 @@ impl<T: Tracer, L: KnownLight> Corners<'_, T, L> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::checkpoint;
     use crate::field::{Field, Sweep};
     use crate::isovalue_axis::IsovalueAxis;
     use crate::photon::{FlatPhoton, Photons};
-    use crate::photon_map::EstimateSettings;
     use crate::radiance_cache::CacheSettings;
     use crate::rng::Stage;
     use crate::scene::{Boundary, Surface, cornell_box};
@@ -323,10 +321,8 @@ mod tests {
             axis: IsovalueAxis::EVEN,
             seed: 1,
         };
-        let saved = [checkpoint::Stage::UNSAVED; 2];
         let tracer = Floor(floor);
-        let estimate = EstimateSettings::default();
-        let cache = RadianceCache::new(&scene, &tracer, &photons, estimate, &settings, false, saved, &|_| true);
+        let cache = RadianceCache::new(&scene, &tracer, &photons, &settings, &|_| true);
         let light = [Side::Lower, Side::Higher].map(|side| {
             let position = DVec3::new(8.0 * 0.47, 4.0, 0.05);
             let normal = scene.normal(position, side).unwrap();

@@ -103,6 +103,13 @@ pub struct Sampler<'a, T> {
 }
 
 impl<T: Tracer> Sampler<'_, T> {
+    /// The samples at `positions`, random numbers keyed by their place in the list. `tick(n)` reports n samples done;
+    /// returning false stops early.
+    pub fn samples(&self, positions: &[Vec3], tick: &(dyn Fn(u64) -> bool + Sync)) -> RadianceSamples {
+        let place = |n: usize| (n as u64, positions[n]);
+        sample_places(self, positions.len(), &place, checkpoint::Stage::UNSAVED, 0, tick)
+    }
+
     /// The sample at `position`, its random numbers keyed by `key`; `None` where ∇h vanishes, no light between a
     /// luminaire and the wall that it covers ([`Scene::covers`]). Adds rays and misses to `counts`.
     #[allow(clippy::cast_possible_truncation, reason = "isovalues and storage are f32")]
@@ -179,26 +186,8 @@ impl<T: Tracer> Sampler<'_, T> {
 /// Samples per block.
 pub const BLOCK: usize = 1024;
 
-/// Samples `side` of the level sets through `positions`. `tick(n)` reports n samples done; returning false stops early.
-/// Blocks are kept in `saved` and looked for there.
-#[allow(clippy::too_many_arguments, reason = "one call per bake")]
-pub fn sample_radiance<T: Tracer>(
-    scene: &Scene,
-    tracer: &T,
-    indirect: &Indirect<'_>,
-    positions: &[Vec3],
-    side: Side,
-    shadow_rays: u32,
-    seed: u64,
-    saved: checkpoint::Stage<'_>,
-    tick: &(dyn Fn(u64) -> bool + Sync),
-) -> RadianceSamples {
-    let sampler = Sampler { scene, tracer, indirect, side, shadow_rays, seed };
-    sample_places(&sampler, positions.len(), &|n| (n as u64, positions[n]), saved, 0, tick)
-}
-
-/// As [`sample_radiance`], at places given by number with the keys of their random numbers; `first` is the number of
-/// their first block.
+/// As [`Sampler::samples`], at places given by number with the keys of their random numbers. Blocks are kept in `saved`
+/// and looked for there; `first` is the number of the first.
 pub fn sample_places<T: Tracer>(
     sampler: &Sampler<'_, T>,
     count: usize,

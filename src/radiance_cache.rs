@@ -116,6 +116,22 @@ impl<'a> NodePhotons<'a> {
     }
 }
 
+/// Isovalues whose nodes are filled at a time, in units of the sweep.
+#[derive(Clone, Debug)]
+pub struct NodeBand<'a> {
+    /// From the lowest to the highest.
+    pub range: RangeInclusive<f32>,
+    /// Where blocks of the nodes of each side (lower, higher) are kept and looked for.
+    pub saved: [checkpoint::Stage<'a>; 2],
+    /// The number of the first of these blocks.
+    pub first: usize,
+}
+
+impl NodeBand<'_> {
+    /// The whole sweep, kept nowhere.
+    pub const WHOLE: Self = NodeBand { range: 0.0..=1.0, saved: [checkpoint::Stage::UNSAVED; 2], first: 0 };
+}
+
 /// Isovalues beyond a band, in units of the sweep, whose cells a hit may be rounded into.
 const MARGIN: f32 = 1e-4;
 
@@ -138,18 +154,13 @@ pub struct RadianceCache {
 }
 
 impl RadianceCache {
-    /// Fills the cache: flats always, nodes if `with_nodes` (a gather needs them, pictures of walls do not). `tick(n)`
-    /// reports n nodes done; returning false stops early. `saved`: where the blocks of nodes of each side (lower,
-    /// higher) are kept and looked for.
-    #[allow(clippy::too_many_arguments, reason = "one call per bake")]
+    /// A cache of what walls and caps show; its nodes are for [`RadianceCache::fill`]. `tick(n)` reports n of their
+    /// [`flat::texels`] done; returning false stops early.
     pub fn new<T: Tracer>(
         scene: &Scene,
         tracer: &T,
         photons: &Photons,
-        estimate: EstimateSettings,
         settings: &CacheSettings,
-        with_nodes: bool,
-        saved: [checkpoint::Stage<'_>; 2],
         tick: &(dyn Fn(u64) -> bool + Sync),
     ) -> Self {
         let rays = AtomicU64::new(0);
@@ -157,46 +168,24 @@ impl RadianceCache {
         let pools = Pools::new(scene, settings.flat_resolution);
         let filled = (0..flat::count(scene)).into_par_iter().map(|n| {
             let photons = pools.of(n).flat_map(|m| photons_of.flat(m));
-            let filled = fill_flat(scene, tracer, n, photons, pools.area(scene, n), settings, &rays);
+            let filled = fill_flat(scene, tracer, n, photons, pools.area(scene, n), settings, (&rays, tick));
             (filled.gathered, filled.shown)
         });
         let (flats, shown) = filled.unzip();
         let nodes = (0..scene.fields()).map(|_| None).collect();
-        let mut cache = Self { nodes, flats, shown: Some(shown), rays: rays.into_inner() };
-        if with_nodes {
-            cache.fill(scene, tracer, photons, estimate, settings, saved, tick);
-        }
-        cache
+        Self { nodes, flats, shown: Some(shown), rays: rays.into_inner() }
     }
 
-    /// Fills the nodes of the scene's own field; of a scene of several, seen from each in turn.
-    #[allow(clippy::too_many_arguments, reason = "one call per bake and field")]
+    /// Fills the nodes of the scene's own field (of a scene of several, seen from each in turn) that surfaces with
+    /// isovalues in `band` need, and forgets the others; what was filled before is not computed again. `tick(n)`
+    /// reports n nodes done; returning false stops early.
     pub fn fill<T: Tracer>(
         &mut self,
         scene: &Scene,
         tracer: &T,
-        photons: &Photons,
-        estimate: EstimateSettings,
-        settings: &CacheSettings,
-        saved: [checkpoint::Stage<'_>; 2],
-        tick: &(dyn Fn(u64) -> bool + Sync),
-    ) {
-        let source = NodePhotons::new(scene, photons, estimate);
-        self.fill_band(scene, tracer, &source, 0.0..=1.0, settings, saved, 0, tick);
-    }
-
-    /// Fills the nodes that surfaces with isovalues in `band` need, and forgets the others; what was filled before is
-    /// not computed again. `first` is the number of the band's first block.
-    #[allow(clippy::too_many_arguments, reason = "one call per band and field")]
-    pub fn fill_band<T: Tracer>(
-        &mut self,
-        scene: &Scene,
-        tracer: &T,
         source: &NodePhotons<'_>,
-        band: RangeInclusive<f32>,
         settings: &CacheSettings,
-        saved: [checkpoint::Stage<'_>; 2],
-        first: usize,
+        NodeBand { range: band, saved, first }: NodeBand<'_>,
         tick: &(dyn Fn(u64) -> bool + Sync),
     ) {
         let rays = AtomicU64::new(0);

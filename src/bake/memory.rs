@@ -15,7 +15,7 @@ use crate::mask::{Mask, masks, own_light};
 use crate::node_set::NodeSet;
 use crate::photon::{FlatPhoton, PhotonSettings, SurfacePhoton, trace_photons};
 use crate::radiance::RadianceSample;
-use crate::scene::Scene;
+use crate::scene::{Member, Scene};
 use crate::sweep;
 use crate::volume::Volume;
 use rayon::prelude::*;
@@ -235,115 +235,151 @@ struct Parts {
     export: u64,
 }
 
-impl Parts {
+/// What the fields of a scene hold, all together. Counts, but where it says bytes.
+#[derive(Default)]
+struct Census {
+    /// Bytes of volumes, fields, pyramids and masks.
+    held: u64,
+    /// Nodes of the volumes.
+    voxels: u64,
+    /// Points of the grids, these for each stored side, those that hold light, and those that others around stand for.
+    points: u64,
+    side_points: u64,
+    shown: u64,
+    filled: u64,
+    /// Sides that any field stores.
+    stored: u64,
+    /// Samples of a side.
+    samples: u64,
+    /// Bytes of what smoothing keeps of gathers, and of its slices.
+    halves: u64,
+    slices: u64,
+    /// Of sweeps: places of nodes that they light, nodes that rays look at afterwards, bytes of what lines of
+    /// luminaires see.
+    places: u64,
+    known: u64,
+    seen: u64,
+}
+
+impl Census {
+    /// Counts a field, of whose own lattice `masks` tells the nodes: a finer grid needs about the same share of its
+    /// points.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "an estimate of positive numbers")]
-    fn new(scene: &Scene, volumes: &[&Volume], settings: &BakeSettings, device: &Device) -> Result<Self> {
-        let mut base = PROGRAM;
-        // Of all fields; sides stored of any.
-        let (mut voxels, mut points, mut filled, mut samples, mut side_points, mut stored) = (0, 0, 0, 0, 0, 0);
-        let (mut halves, mut slices) = (0, 0);
-        let (mut shown, mut places, mut known, mut seen) = (0, 0, 0, 0);
-        let smoothing = settings.smooths() && settings.strategy == StrategyName::Nodes;
-        let mut all_masks = Vec::new();
-        let members = scene.members();
-        for (member, volume) in members.iter().zip(volumes) {
-            let lattice = settings.grid.lattice(member.field.lattice())?;
-            let (own_voxels, own_points) = (member.field.lattice().len() as u64, lattice.len() as u64);
-            // On the volume's own lattice: a finer one needs about the same share of its points.
-            let masks = masks(&member.field, member.field.lattice());
-            let beyond = settings.engine == Engine::Sweep || settings.gather_rays > 0;
-            let own_light = own_light(&member.field, member.field.lattice(), &masks, beyond);
-            let lit: Vec<bool> = (0..masks.len()).into_par_iter().with_min_len(1 << 12).map(own_light).collect();
-            let count = |is: &(dyn Fn(usize) -> bool + Sync)| {
-                let count = (0..masks.len()).into_par_iter().filter(|&o| is(o)).count();
-                (count as f64 / own_voxels as f64 * own_points as f64) as u64
-            };
-            let own = count(&|o| lit[o]);
-            let own_filled = count(&|o| masks[o] != Mask::Empty) - own;
-            if settings.engine == Engine::Sweep {
-                let share = sweep::places(member.field.lattice().dims(), &lit) as f64 / own_voxels as f64;
-                places += (share * own_points as f64) as u64;
-                seen = sweep::seen(scene, &lattice).max(seen);
-                known += if 2 * (own + own_filled) > own_points { own_points } else { own + own_filled };
-            }
-            shown += own + own_filled;
-            drop(lit);
-            let sides = member.surface.stored_sides().len() as u64;
-            let element = volume.samples().element_type().size() as u64;
-            // Volume, field, the pyramid of min and max, the masks of volume and grid.
-            base += own_voxels * (element + 4 + 1) + own_voxels * 33 / 16 + own_points;
-            let spread = own_filled * STAND_INS as u64;
-            let own_samples = match (settings.strategy, settings.samples) {
-                (StrategyName::Nodes, _) => own + spread,
-                (_, Some(n)) => n,
-                (_, None) => ((own + own_filled) as f64 * settings.samples_per_point) as u64,
-            };
-            samples = own_samples.saturating_add(samples).min(MOST_SAMPLES);
-            if smoothing {
-                halves += own * PACKED * sides;
-                let [nx, ny, nz] = lattice.dims().map(|n| n as u64);
-                slices = slices.max(nx * ny * SLICES.min(nz * 112));
-            }
-            (voxels, points) = (voxels + own_voxels, points + own_points);
-            (filled, stored) = (filled + own_filled, sides.max(stored));
-            side_points += own_points * sides;
-            all_masks.push(masks);
+    fn add(
+        &mut self,
+        scene: &Scene,
+        (member, volume): (&Member, &Volume),
+        masks: &[Mask],
+        settings: &BakeSettings,
+    ) -> Result<()> {
+        let field = &member.field;
+        let lattice = settings.grid.lattice(field.lattice())?;
+        let (voxels, points) = (field.lattice().len() as u64, lattice.len() as u64);
+        let of_grid = |nodes: usize| (nodes as f64 / voxels as f64 * points as f64) as u64;
+        let beyond = settings.engine == Engine::Sweep || settings.gather_rays > 0;
+        let own_light = own_light(field, field.lattice(), masks, beyond);
+        let lit: Vec<bool> = (0..masks.len()).into_par_iter().with_min_len(1 << 12).map(own_light).collect();
+        let own = of_grid(lit.par_iter().filter(|lit| **lit).count());
+        let shown = of_grid(masks.par_iter().filter(|mask| **mask != Mask::Empty).count());
+        let filled = shown - own;
+        if settings.engine == Engine::Sweep {
+            self.places += of_grid(sweep::places(field.lattice().dims(), &lit));
+            self.seen = sweep::seen(scene, &lattice).max(self.seen);
+            self.known += if 2 * shown > points { points } else { shown };
         }
-        let steps = if settings.engine == Engine::Photon { REACH } else { 0 };
-        let levels = Levels::new(members.iter().zip(&all_masks).map(|(m, masks)| (&*m.field, &masks[..])), steps);
-        let across = settings.wall_resolution;
-        let texels = match settings.engine {
-            Engine::Sweep => sweep::texels(scene, across, settings.wall_isovalues),
-            Engine::Photon => flat::texels(scene, across, settings.wall_isovalues),
-        } as u64;
+        let sides = member.surface.stored_sides().len() as u64;
+        let element = volume.samples().element_type().size() as u64;
+        // Volume, field, the pyramid of min and max, the masks of volume and grid.
+        self.held += voxels * (element + 4 + 1) + voxels * 33 / 16 + points;
+        let samples = match (settings.strategy, settings.samples) {
+            (StrategyName::Nodes, _) => own + filled * STAND_INS as u64,
+            (_, Some(n)) => n,
+            (_, None) => (shown as f64 * settings.samples_per_point) as u64,
+        };
+        self.samples = samples.saturating_add(self.samples).min(MOST_SAMPLES);
+        if settings.smooths() && settings.strategy == StrategyName::Nodes {
+            self.halves += own * PACKED * sides;
+            let [nx, ny, nz] = lattice.dims().map(|n| n as u64);
+            self.slices = self.slices.max(nx * ny * SLICES.min(nz * 112));
+        }
+        self.voxels += voxels;
+        self.points += points;
+        self.side_points += points * sides;
+        self.shown += shown;
+        self.filled += filled;
+        self.stored = sides.max(self.stored);
+        Ok(())
+    }
+
+    /// Bytes of a sweep, at most.
+    fn swept(&self, scene: &Scene, settings: &BakeSettings) -> u64 {
+        let Self { points, places, stored, .. } = *self;
         let sides = sweep::swept_sides(scene).len() as u64;
         let settling = BEFORE_SIDE + if sweep::bright(scene) { LEVEL_SIDE } else { 0 };
         let summed = PLACED + 2 * stored * SPREAD_SIDE + sides * (PLACED_SIDE + KEPT_SIDE);
-        let swept = points * SWEPT
-            + sides * points * SWEPT_SIDE
-            + places * summed
-            + (sides * (points * SETTLING_SIDE + places * settling).max(places * 2 * SUMMED_SIDE))
-                .max(sides * places * DIRECT_SIDE + seen)
-            + sweep::reports(scene, across, settings.wall_isovalues) as u64;
-        let ([landings, lower, higher], gather) = match settings.engine {
-            Engine::Photon => (landings(scene, settings, device)?, settings.gather_rays > 0),
-            Engine::Sweep => ([0.0; 3], false),
+        let indirect = sides * (points * SETTLING_SIDE + places * settling).max(places * 2 * SUMMED_SIDE);
+        let direct = sides * places * DIRECT_SIDE + self.seen;
+        let walls = sweep::reports(scene, settings.wall_resolution, settings.wall_isovalues) as u64;
+        points * SWEPT + sides * points * SWEPT_SIDE + places * summed + indirect.max(direct) + walls
+    }
+
+    /// Bytes of scattered samples, and of their interpolation.
+    fn scattered(&self, settings: &BakeSettings) -> [u64; 2] {
+        if settings.strategy == StrategyName::Nodes || settings.engine == Engine::Sweep {
+            return [0; 2];
+        }
+        let looked_at = match settings.interpolation {
+            Interpolation::Shepard => self.samples * SHEPARD,
+            Interpolation::Fit => self.samples * SHEPARD + self.points * FITTED,
+            Interpolation::Irradiance => self.samples * CACHING,
         };
-        let photon = size_of::<SurfacePhoton>().max(size_of::<FlatPhoton>()) as f64;
-        let nodes = settings.strategy == StrategyName::Nodes || settings.engine == Engine::Sweep;
-        let (scattered, scattering) = match nodes {
-            true => (0, 0),
-            false => {
-                let looked_at = match settings.interpolation {
-                    Interpolation::Shepard => samples * SHEPARD,
-                    Interpolation::Fit => samples * SHEPARD + points * FITTED,
-                    Interpolation::Irradiance => samples * CACHING,
-                };
-                (samples * stored * SAMPLE, samples * SAMPLE + looked_at + points * GRID)
-            }
-        };
+        [self.samples * self.stored * SAMPLE, self.samples * SAMPLE + looked_at + self.points * GRID]
+    }
+}
+
+impl Parts {
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "an estimate of positive numbers")]
+    fn new(scene: &Scene, volumes: &[&Volume], settings: &BakeSettings, device: &Device) -> Result<Self> {
+        let mut census = Census::default();
+        let members = scene.members();
+        let mut all_masks = Vec::new();
+        for (member, volume) in members.iter().zip(volumes) {
+            let masks = masks(&member.field, member.field.lattice());
+            census.add(scene, (member, volume), &masks, settings)?;
+            all_masks.push(masks);
+        }
+        let photon = settings.engine == Engine::Photon;
+        let nodes = settings.strategy == StrategyName::Nodes || !photon;
+        let steps = if photon { REACH } else { 0 };
+        let levels = Levels::new(members.iter().zip(&all_masks).map(|(m, masks)| (&*m.field, &masks[..])), steps);
+        let texels = if photon { flat::texels } else { sweep::texels };
+        let texels = texels(scene, settings.wall_resolution, settings.wall_isovalues) as u64;
+        let [landings, lower, higher] = if photon { landings(scene, settings, device)? } else { [0.0; 3] };
+        let largest = size_of::<SurfacePhoton>().max(size_of::<FlatPhoton>()) as f64;
+        let [scattered, scattering] = census.scattered(settings);
+        let Census { voxels, points, side_points, shown, filled, stored, places, known, .. } = census;
         Ok(Self {
             engine: settings.engine,
-            base,
+            base: PROGRAM + census.held,
             // For gathers and for pictures, from outside solids and maybe from within.
-            flats: texels * if settings.engine == Engine::Photon { 48 } else { 24 },
-            photons: (landings * photon).min(MOST) as u64,
+            flats: texels * if photon { 48 } else { 24 },
+            photons: (landings * largest).min(MOST) as u64,
             maps: ((lower + higher) * MAP).min(MOST) as u64,
-            cached: if gather { 2 } else { 0 },
+            cached: if photon && settings.gather_rays > 0 { 2 } else { 0 },
             levels,
             voxels,
             points,
             grids: side_points * (GRID + if settings.split { SPLIT } else { 0 }),
             wishes: if settings.split { 3 * WISH } else { WISH },
             gathered: stored * (known * CACHED + places * DONE_SIDE) + known * CACHED,
-            halves,
-            slices,
+            halves: census.halves,
+            slices: census.slices,
             beside: if nodes { STAND_INS as u64 * filled } else { 0 },
             filled,
-            samples: samples * stored,
+            samples: census.samples * stored,
             scattered,
             scattering,
-            swept,
+            swept: census.swept(scene, settings),
             export: WRITER.min((points + shown) * (5 + 29 * stored)),
         })
     }

@@ -4,10 +4,11 @@ use super::bands::{Band, Levels, REACH};
 use super::contacts::{Contacts, Wedge};
 use super::grid_points::{Beside, BesideLight, Counts, GridPoints, PointLight, rays_beside};
 use super::{BakeSettings, Interpolation, Lit, PhotonCounts, stages};
-use crate::checkpoint::{self, Checkpoint};
+use crate::checkpoint::Checkpoint;
 use crate::embree::{Device, GraphTracer, pyramids};
 use crate::error::{Error, Result};
 use crate::fitted_grid::{PULL, Wish, draws, fit, fitted_variance};
+use crate::flat;
 use crate::flattened::Side;
 use crate::illumination_grid::{IlluminationGrid, shepard};
 use crate::irradiance_caching::interpolate;
@@ -17,7 +18,7 @@ use crate::node_set::NodeSet;
 use crate::photon::trace_photons;
 use crate::progress::{Clock, Progress, interrupted};
 use crate::radiance::{BLOCK, Indirect, RadianceSample, Sampler, sample_places};
-use crate::radiance_cache::{NodePhotons, RadianceCache};
+use crate::radiance_cache::{NodeBand, NodePhotons, RadianceCache};
 use crate::sampling::{Strategy, positions};
 use crate::scene::Scene;
 use crate::volume::Lattice;
@@ -66,13 +67,12 @@ pub(super) fn light(
 
     // The walls' light of all isovalues; what the nodes take from photons.
     let clock = Clock::start();
-    let stage = progress.stage("walls", 0);
     let cache_settings = settings.cache(axis);
+    let texels = flat::texels(first, cache_settings.flat_resolution, cache_settings.isovalue_resolution) as u64;
+    let stage = progress.stage("walls", texels);
     let estimate = settings.estimate();
     let gather = settings.gather_rays > 0;
-    let unsaved = [checkpoint::Stage::UNSAVED; 2];
-    let tick = |n| stage.tick(n);
-    let mut cache = RadianceCache::new(first, &tracers[0], &photons, estimate, &cache_settings, false, unsaved, &tick);
+    let mut cache = RadianceCache::new(first, &tracers[0], &photons, &cache_settings, &|n| stage.tick(n));
     let sources: Vec<NodePhotons> = jobs.iter().map(|job| NodePhotons::new(&job.scene, &photons, estimate)).collect();
     drop(photons);
     stage.end()?;
@@ -94,9 +94,9 @@ pub(super) fn light(
         let clock = Clock::start();
         for ((job, tracer), source) in jobs.iter().zip(&tracers).zip(&sources).filter(|_| gather) {
             let saved = stages(checkpoint, STAGES * job.number);
-            let block = band.number * RadianceCache::blocks(&job.scene);
-            let tick = |n| stage.tick(n * node);
-            cache.fill_band(&job.scene, tracer, source, band.range(), &cache_settings, saved, block, &tick);
+            let first = band.number * RadianceCache::blocks(&job.scene);
+            let nodes = NodeBand { range: band.range(), saved, first };
+            cache.fill(&job.scene, tracer, source, &cache_settings, nodes, &|n| stage.tick(n * node));
         }
         lit.spend(clock, |s| &mut s.cache);
         let clock = Clock::start();

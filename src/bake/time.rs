@@ -1,7 +1,6 @@
 //! How long a bake takes, before it takes it.
 
 use super::{BakeSettings, Engine, StrategyName};
-use crate::checkpoint;
 use crate::direct::{Receiver, direct_irradiance};
 use crate::embree::{Device, GraphTracer, pyramids};
 use crate::error::Result;
@@ -14,7 +13,7 @@ use crate::node_set::NodeSet;
 use crate::photon::{PhotonSettings, Photons, trace_photons};
 use crate::photon_map::PhotonMap;
 use crate::progress::{interrupted, unless_interrupted};
-use crate::radiance::{Indirect, sample_radiance};
+use crate::radiance::{Indirect, Sampler};
 use crate::radiance_cache::{CacheSettings, RadianceCache};
 use crate::rng::Stage;
 use crate::sampling::{Strategy, positions_at_hand};
@@ -24,6 +23,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 use std::hint::black_box;
 use std::sync::Mutex;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
 
 /// Photons and samples tried: a second or so. Where these take more than so many rays in all samples are fewer, but no
@@ -41,6 +41,8 @@ const REPLICATES: usize = 2;
 /// A trial is repeated up to so many times while that takes no more than this many seconds.
 const MOST_TRIES: usize = 5;
 const SHORT: f64 = 0.2;
+/// One that takes more than so many seconds is cut off: thousands of luminaires light every texel.
+const LONG: f64 = 10.0;
 
 /// Luminaire points that a sweep is tried with, and the fewest of each luminaire. Walls look at sixteen of one
 /// together.
@@ -266,10 +268,14 @@ fn walls_seconds(scene: &Scene, tracer: &GraphTracer<'_>, photons: &Photons, set
     let share = (photons.emitted as f64 / settings.photons.max(1) as f64).min(MOST_SHADOWED / all.max(1.0));
     let across = ((walls as f64 * share.sqrt()) as usize).clamp(walls.min(LEAST_ACROSS), walls);
     let tried = CacheSettings { flat_resolution: across, ..settings.cache(IsovalueAxis::EVEN) };
-    let unsaved = [checkpoint::Stage::UNSAVED; 2];
-    let begun = Instant::now();
-    RadianceCache::new(scene, tracer, photons, settings.estimate(), &tried, false, unsaved, &|_| !interrupted());
-    begun.elapsed().as_secs_f64() * all / texels(across).max(1.0)
+    let (begun, done) = (Instant::now(), AtomicU64::new(0));
+    let seconds = || begun.elapsed().as_secs_f64();
+    RadianceCache::new(scene, tracer, photons, &tried, &|n| {
+        done.fetch_add(n, Ordering::Relaxed);
+        !interrupted() && seconds() < LONG
+    });
+    let done = if seconds() < LONG { texels(across) } else { done.into_inner() as f64 };
+    seconds() * all / done.max(1.0)
 }
 
 /// Estimated seconds of the cache's nodes and of the samples of the scene's own field.
@@ -283,7 +289,8 @@ fn field_seconds(
     let own = scene.lattice();
     let needed = masks(&scene.field, own).iter().filter(|&&m| m != Mask::Empty).count() as f64;
     let side = scene.surface.outside;
-    let rays = u64::from(settings.gather_rays.saturating_add(settings.shadow_rays));
+    let shadow_rays = u64::from(settings.shadow_rays) * scene.luminaires().len() as u64;
+    let rays = u64::from(settings.gather_rays) + shadow_rays;
     let count = (RAYS / rays.max(1)).clamp(LEAST_SAMPLES, SAMPLES);
     let at = positions_at_hand(&scene.field, &Strategy::Uniform, count, settings.seed)?;
     let tried = at.len().max(1) as f64;
@@ -314,9 +321,9 @@ fn field_seconds(
         0 => Indirect::Map(&map),
         rays => Indirect::Gather(&cache, rays),
     };
-    let unsaved = checkpoint::Stage::UNSAVED;
-    let (shadow, seed) = (settings.shadow_rays, settings.seed);
-    sample_radiance(&shining, tracer, &indirect, &at, side, shadow, seed, unsaved, &|_| !interrupted());
+    let (shadow_rays, seed) = (settings.shadow_rays, settings.seed);
+    let sampler = Sampler { scene: &shining, tracer, indirect: &indirect, side, shadow_rays, seed };
+    sampler.samples(&at, &|_| !interrupted());
     let seconds = begun.elapsed().as_secs_f64();
     // A finer grid needs about the same share of its points, and its masks may need more memory than there is.
     let points = needed * settings.grid.lattice(own)?.len() as f64 / own.len() as f64;

@@ -31,6 +31,9 @@ pub(super) struct Filled {
     pub shown: Option<FlatLight>,
 }
 
+/// Reports texels done; returning false stops early.
+pub(super) type Tick<'a> = &'a (dyn Fn(u64) -> bool + Sync);
+
 /// Direct light of texels and photons of later landings, on so many times the flat's area.
 pub(super) fn fill_flat<T: Tracer>(
     scene: &Scene,
@@ -39,7 +42,7 @@ pub(super) fn fill_flat<T: Tracer>(
     photons: impl Iterator<Item = FlatPhoton>,
     areas: f64,
     settings: &CacheSettings,
-    rays: &AtomicU64,
+    (rays, tick): (&AtomicU64, Tick<'_>),
 ) -> Filled {
     let Some(flat) = flat::flat(scene, number).filter(|f| !f.albedo.black()) else { return Filled::default() };
     let dims = flat.resolution(settings.flat_resolution, settings.isovalue_resolution);
@@ -53,7 +56,7 @@ pub(super) fn fill_flat<T: Tracer>(
     // Where no solid stands, none holds photons.
     let solid = solid.filter(|_| open.is_some());
     let isovalues = settings.axis.centres(dims[2]);
-    let raster = Raster { scene, tracer, number, flat: &flat, settings, rays, dims, isovalues, parts, open };
+    let raster = Raster { scene, tracer, number, flat: &flat, settings, rays, tick, dims, isovalues, parts, open };
     let binned = raster.binned(photons, solid.as_ref(), areas);
     let known = raster.direct();
     let within = raster.within(&known);
@@ -72,6 +75,7 @@ struct Raster<'a, T> {
     flat: &'a Flat,
     settings: &'a CacheSettings,
     rays: &'a AtomicU64,
+    tick: Tick<'a>,
     dims: [usize; 3],
     isovalues: Vec<f64>,
     parts: Vec<Texel>,
@@ -139,14 +143,19 @@ impl<T: Tracer> Raster<'_, T> {
             Some(open) if open.outer[i] => open.place(i, true),
             _ => Some(self.part(i).at),
         };
-        direct_light(self.dims, |i, rays| Some(self.estimate(i, place(i)?, rays)), self.shadow_rays())
+        let [few, many] = self.shadow_rays();
+        let estimate = |i: usize, rays: u32| {
+            let go_on = (self.tick)(u64::from(rays == few));
+            Some(self.estimate(i, place(i).filter(|_| go_on)?, rays))
+        };
+        direct_light(self.dims, estimate, [few, many])
     }
 
     /// The same within the solids that stand on a wall; `None` if there are none.
     fn within(&self, known: &[Option<DVec3>]) -> Option<WithinSolids> {
         let open = self.open.as_ref().filter(|_| self.number < self.scene.polygons().len())?;
         let [few, many] = self.shadow_rays();
-        let solid = |i: usize| self.part(i).covered > 0.0 && open.shares[i] < 1.0;
+        let solid = |i: usize| self.part(i).covered > 0.0 && open.shares[i] < 1.0 && (self.tick)(0);
         let own = (0..known.len()).into_par_iter().with_min_len(256).map(|i| match solid(i) {
             true if self.outer(i) => open.place(i, false).map(|at| {
                 let roughly = self.estimate(i, at, few);
@@ -344,8 +353,10 @@ mod tests {
             let mut rng = Rng::stream(1, Stage::Test, i);
             FlatPhoton { flat: ceiling, uvc: [(); 3].map(|()| rng.unit() as f32), power, bounces: 1 }
         });
-        let texture =
-            fill_flat(&scene, &Nothing, number, photons, 1.0, &SETTINGS, &AtomicU64::new(0)).gathered.unwrap().outside;
+        let texture = fill_flat(&scene, &Nothing, number, photons, 1.0, &SETTINGS, (&AtomicU64::new(0), &|_| true))
+            .gathered
+            .unwrap()
+            .outside;
         let (hidden, expected) = (Hidden::new(&scene, number, &flat), reflected(flat.albedo.at(0.5), DVec3::ONE).x);
         let mut shown = [crate::stats::Moments::default(); 2];
         let mut most = 0f64;
@@ -383,7 +394,7 @@ mod tests {
         let [few, many] = [8, 4096].map(|flat_shadow_rays| {
             let settings = CacheSettings { flat_shadow_rays, ..SETTINGS };
             let nothing = std::iter::empty();
-            let filled = fill_flat(&scene, &Edge, floor, nothing, 1.0, &settings, &AtomicU64::new(0));
+            let filled = fill_flat(&scene, &Edge, floor, nothing, 1.0, &settings, (&AtomicU64::new(0), &|_| true));
             filled.shown.unwrap().outside.texels
         });
         let sum = |square: &dyn Fn(usize) -> f32| (0..many.len()).map(square).sum::<f32>();
@@ -417,7 +428,7 @@ mod tests {
             .collect();
         assert!(photons.len() > 100_000 && photons.len() < 300_000, "{}", photons.len());
         let fill = |photons: &[FlatPhoton]| {
-            fill_flat(&scene, &Nothing, floor, photons.iter().copied(), 1.0, &SETTINGS, &AtomicU64::new(0))
+            fill_flat(&scene, &Nothing, floor, photons.iter().copied(), 1.0, &SETTINGS, (&AtomicU64::new(0), &|_| true))
                 .gathered
                 .unwrap()
                 .outside
@@ -495,7 +506,7 @@ mod tests {
             .collect();
         let tracer = Outside(&scene.field);
         let fill = |scene: &Scene| {
-            fill_flat(scene, &tracer, floor, photons.iter().copied(), 1.0, &SETTINGS, &AtomicU64::new(0))
+            fill_flat(scene, &tracer, floor, photons.iter().copied(), 1.0, &SETTINGS, (&AtomicU64::new(0), &|_| true))
         };
         let filled = fill(&scene).gathered.unwrap();
         assert_eq!(fill(&one).gathered.unwrap(), filled, "whatever else is stored");
@@ -540,7 +551,7 @@ mod tests {
             };
             let photons = (0..count).map(|i| place(1, i)).filter(|&p| depth(p) >= 0.0);
             let photons = photons.map(|p| FlatPhoton { flat: 2, uvc: p.map(|x| x as f32), power, bounces: 1 });
-            let filled = fill_flat(&scene, &Nothing, number, photons, 1.0, &SETTINGS, &AtomicU64::new(0));
+            let filled = fill_flat(&scene, &Nothing, number, photons, 1.0, &SETTINGS, (&AtomicU64::new(0), &|_| true));
             let FlatLight { outside: texture, within } = filled.gathered.unwrap();
             assert_eq!(within, Within::Same, "no light is within");
             let expected = reflected(flat.albedo.at(0.5), DVec3::splat(irradiance)).x;

@@ -11,7 +11,7 @@ use isolume::nearest::Neighbours;
 use isolume::photon::Photons;
 use isolume::photon_map::{EstimateSettings, PhotonMap};
 use isolume::polygon::Polygon;
-use isolume::radiance::{Indirect, sample_radiance};
+use isolume::radiance::{Indirect, Sampler};
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
 use isolume::stats::Moments;
 use std::f64::consts::PI;
@@ -300,17 +300,10 @@ fn occlusion_by_an_infinite_wall() {
     assert_eq!(map.irradiance(&receiver, &mut Neighbours::default()).mean, DVec3::ZERO);
     let cases = [(0.6, 0.071_254), (2.0, 0.276_393), (10.0, 0.450_248)];
     let at: Vec<_> = cases.iter().map(|&(k, _)| local(&scene, DVec3::new(-1.0 / k, 0.0, 0.0))).collect();
-    let got = sample_radiance(
-        &scene,
-        &tracer,
-        &Indirect::Map(&map),
-        &at,
-        Side::Lower,
-        1 << 15,
-        7,
-        isolume::checkpoint::Stage::UNSAVED,
-        &|_| true,
-    );
+    let indirect = &Indirect::Map(&map);
+    let sampler =
+        Sampler { scene: &scene, tracer: &tracer, indirect, side: Side::Lower, shadow_rays: 1 << 15, seed: 7 };
+    let got = sampler.samples(&at, &|_| true);
     for ((k, expected), sample) in cases.into_iter().zip(got.samples) {
         let taken = 1.0 - f64::from(sample.unwrap().radiance.y);
         println!("k = {k}: {taken:.6}, expected {expected}");

@@ -3,7 +3,6 @@
 use crate::companions::{coloured, joint, member, unit};
 use crate::support::*;
 use glam::{DVec2, DVec3};
-use isolume::checkpoint;
 use isolume::direct::Receiver;
 use isolume::embree::{Device, GraphTracer, SurfaceTracer};
 use isolume::flattened::{Departure, Side};
@@ -11,8 +10,8 @@ use isolume::gather::gathered_irradiance;
 use isolume::isovalue_axis::IsovalueAxis;
 use isolume::photon::trace_photons;
 use isolume::photon_map::EstimateSettings;
-use isolume::radiance::{Indirect, RadianceSample, sample_radiance};
-use isolume::radiance_cache::{CacheSettings, RadianceCache};
+use isolume::radiance::{Indirect, RadianceSample, Sampler};
+use isolume::radiance_cache::{CacheSettings, NodeBand, NodePhotons, RadianceCache};
 use isolume::reference::{ReferenceSettings, reference};
 use isolume::rng::Stage;
 use isolume::scene::{Scene, Surface, cornell_box};
@@ -80,9 +79,9 @@ fn at_vertices(
         });
         let chosen: Vec<usize> = (0..mesh.local.len()).filter(|&v| paths[0].sampled[v]).collect();
         let at: Vec<_> = chosen.iter().map(|&v| mesh.local[v].as_vec3()).collect();
-        let (gather, side, unsaved) =
-            (Indirect::Gather(&cache, rays), seen.surface.outside, checkpoint::Stage::UNSAVED);
-        let got = sample_radiance(seen, &tracers[k], &gather, &at, side, 4 * rays, 1, unsaved, &|_| true);
+        let (indirect, side) = (&Indirect::Gather(&cache, rays), seen.surface.outside);
+        let sampler = Sampler { scene: seen, tracer: &tracers[k], indirect, side, shadow_rays: 4 * rays, seed: 1 };
+        let got = sampler.samples(&at, &|_| true);
         let vertex = |(&v, sample): (&usize, &Option<RadianceSample>)| {
             let gathered = sample.as_ref()?.radiance.as_dvec3();
             let world = seen.lattice().to_world(mesh.local[v]);
@@ -103,9 +102,12 @@ fn joint_cache(views: &[Scene; 2], tracers: &[GraphTracer; 2], count: u64) -> Ra
         axis: IsovalueAxis::EVEN,
         seed: 1,
     };
-    let (estimate, unsaved) = (EstimateSettings::default(), [checkpoint::Stage::UNSAVED; 2]);
-    let mut cache = RadianceCache::new(&views[0], &tracers[0], &photons, estimate, &settings, true, unsaved, &|_| true);
-    cache.fill(&views[1], &tracers[1], &photons, estimate, &settings, unsaved, &|_| true);
+    let estimate = EstimateSettings::default();
+    let mut cache = RadianceCache::new(&views[0], &tracers[0], &photons, &settings, &|_| true);
+    for (view, tracer) in views.iter().zip(tracers) {
+        let source = NodePhotons::new(view, &photons, estimate);
+        cache.fill(view, tracer, &source, &settings, NodeBand::WHOLE, &|_| true);
+    }
     cache
 }
 

@@ -10,7 +10,7 @@ use isolume::isovalue_axis::IsovalueAxis;
 use isolume::nearest::Neighbours;
 use isolume::photon::{ENERGY_BINS, PhotonSettings, Photons, octant};
 use isolume::photon_map::{EstimateSettings, Estimator, Normalisation, PhotonMap};
-use isolume::radiance_cache::{CacheSettings, RadianceCache};
+use isolume::radiance_cache::{CacheSettings, NodeBand, NodePhotons, RadianceCache};
 use isolume::rng::{Rng, Stage};
 use isolume::scene::{Scene, Surface, cornell_box};
 use isolume::stats::Moments;
@@ -191,16 +191,10 @@ fn forward_is_backward() {
         seed: 2,
     };
     let estimate = EstimateSettings::default();
-    let cache = RadianceCache::new(
-        &scene,
-        &tracer,
-        &Photons::default(),
-        estimate,
-        &settings,
-        true,
-        [isolume::checkpoint::Stage::UNSAVED; 2],
-        &|_| true,
-    );
+    let dark = Photons::default();
+    let mut cache = RadianceCache::new(&scene, &tracer, &dark, &settings, &|_| true);
+    let source = NodePhotons::new(&scene, &dark, estimate);
+    cache.fill(&scene, &tracer, &source, &settings, NodeBand::WHOLE, &|_| true);
     let backward = |receiver: &Receiver, index: u64| {
         let direct = direct_irradiance(&scene, &tracer, receiver, 8, Stage::Direct.key(2, index)).mean;
         [direct, gathered_irradiance(&scene, &tracer, &cache, receiver, 16, Stage::Gather.key(2, index)).estimate.mean]
