@@ -303,6 +303,28 @@ fn the_browser_shows_what_render_draws() {
     println!("{} ms per frame of 640×480", String::from_utf8_lossy(get("milliseconds")));
 }
 
+/// Labels: a box of 200 within one of 80 within 0. Samples equal to the isovalue belong to the solid.
+#[test]
+fn plateaus_at_the_isovalue_are_within() {
+    let Some(program) = chromium() else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let lattice = Lattice::aligned([17; 3], DVec3::ZERO, DVec3::splat(1.0 / 16.0)).unwrap();
+    let within = |o: usize, range: std::ops::Range<usize>| lattice.ijk(o).iter().all(|i| range.contains(i));
+    let label = |o: usize| if within(o, 6..10) { 200 } else { 80 * u8::from(within(o, 4..13)) };
+    let samples = (0..lattice.len()).map(label).collect();
+    Volume::new("labels", lattice.clone(), Samples::U8(samples)).unwrap().write(dir.join("b.nrrd")).unwrap();
+    let bake = ["bake", "b.nrrd", "--isovalues", "1", "201", "-o", "out.vti", "--engine", "photon"];
+    isolume(dir, &[&bake[..], &QUICK].concat());
+    // 79 of 200 is no whole number of the page's steps, and rounds down.
+    let view = |name, isovalue: u32| View {
+        name,
+        page: format!("{{ iso: {} }}", f64::from(isovalue - 1) / 200.0),
+        render: words(&format!("--isovalue {isovalue}")),
+    };
+    compare(dir, &program, &[view("at-80", 80), view("at-200", 200)], "");
+}
+
 /// Anisotropic, oblique and flipped axes, closed by caps inside a box with a margin, both sides stored, far from the
 /// origin: all that could be mixed up.
 #[test]

@@ -14,7 +14,7 @@ const initial = () => ({
   walls: true, clip: "", cut: 0.5,
 });
 let state = initial();
-let gl, programs, textures = {}, flats = [], pending = false, quality = 1, busy = 0, last = 0, settle = 0, timer = 0, size = null;
+let gl, programs, textures = {}, flats = [], pending = false, quality = 1, busy = 0, cost = 0, settle = 0, timer = 0, size = null;
 
 function fail(text) {
   for (const id of ["bar", "settings", "title", "help"]) $(id).hidden = true;
@@ -168,17 +168,21 @@ function upload(bytes) {
   if (error) throw new Error(`WebGL error ${error} (out of graphics memory?)`);
 }
 
-/// Eye and basis; `right` and `up` reach from the picture's centre to its edges at distance 1.
+/// Eye, its distance from what it turns around, and basis; `right` and `up` reach from the picture's centre to its edges
+/// at distance 1.
 function camera(width, height) {
   const [lo, hi] = scene.bounds, home = scene.camera.eye, pivot = add([0, 0, 0], state.shift);
   const a = state.azimuth * Math.PI / 180, e = state.elevation * Math.PI / 180;
   const forward = [Math.sin(a) * Math.cos(e), Math.cos(a) * Math.cos(e), -Math.sin(e)];
-  const x = unit(cross(forward, [0, 0, 1])), y = cross(x, forward), distance = -home[1] / state.zoom;
-  // The front face stays in narrow windows too.
+  const x = unit(cross(forward, [0, 0, 1])), y = cross(x, forward);
+  // The front face stays in narrow windows too: the eye steps back from it.
   const aspect = width / height, fit = Math.max(1, (hi[0] - lo[0]) / (hi[2] - lo[2]) / aspect - 1e-3);
-  const tangent = Math.tan(scene.camera.fov * Math.PI / 360) * fit;
-  const near = Math.max(0.01, distance - 3), far = distance + 4;
+  const front = 0.5 * (hi[1] - lo[1]), distance = (front + fit * (-home[1] - front)) / state.zoom;
+  const tangent = Math.tan(scene.camera.fov * Math.PI / 360);
+  // The box lies within 1 of the origin, wherever the pivot is.
+  const depth = distance - dot(pivot, forward), near = Math.max(0.01, depth - 1.01), far = Math.max(depth, near) + 1.01;
   return {
+    distance,
     u_eye: add(pivot, forward, -distance), u_forward: forward, u_right: x.map((v) => v * tangent * aspect),
     u_up: y.map((v) => v * tangent), u_depth: [(far + near) / (far - near), -2 * far * near / (far - near)],
   };
@@ -216,7 +220,8 @@ function draw() {
   gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
   const common = {
     ...camera(width, height), u_value: 0, u_dims: scene.dims, u_inverse: scene.inverse, u_origin: scene.origin,
-    u_iso: state.iso, u_clip: clipPlane(), u_clipped: state.clip ? 1 : 0, u_local: state.shading === "local" ? 1 : 0,
+    // As samples are stored: equal ones stay equal.
+    u_iso: Math.round(32768 * state.iso) / 32768, u_clip: clipPlane(), u_clipped: state.clip ? 1 : 0, u_local: state.shading === "local" ? 1 : 0,
     u_gain: state.tint.map((t) => t * state.exposure), u_scale: scene.scale,
     u_outside_lower: scene.outside_lower ? 1 : 0,
   };
@@ -255,13 +260,13 @@ function draw() {
 /// Coarser pictures while the user drags on a slow device; the full one as soon as nothing moves.
 function frame(now) {
   if (now < settle) {
-    const elapsed = now - last;
-    if (busy++ > 1) quality = clamp(quality * (elapsed > 70 ? 0.75 : elapsed < 25 ? 1.15 : 1), 0.2, 1);
+    if (busy++ > 1) quality = clamp(quality * (cost > 70 ? 0.75 : cost < 25 ? 1.15 : 1), 0.2, 1);
     clearTimeout(timer);
     timer = setTimeout(invalidate, Math.max(settle - performance.now(), 0) + 1);
   } else busy = 0;
-  last = now;
   draw();
+  // Not the time until the next one: that is the user's.
+  requestAnimationFrame((then) => { cost = then - now; });
 }
 
 function invalidate() {
@@ -299,6 +304,7 @@ function show() {
   state.elevation = clamp(state.elevation, -89, 89);
   state.zoom = clamp(state.zoom, 0.1, 50);
   $("isovalue").value = state.iso;
+  $("isovalue").setAttribute("aria-valuetext", digits(toSource(state.iso)));
   if (document.activeElement !== $("number")) $("number").value = digits(toSource(state.iso));
   $("shading").value = state.shading;
   $("exposure").value = Math.log2(state.exposure);
@@ -313,7 +319,8 @@ function show() {
 
 /// The state behind the page's name: #isovalue=80&shading=local …
 function fromAddress() {
-  for (const [key, value] of new URLSearchParams(location.hash.slice(1))) {
+  // A + is one, as in 1e+6.
+  for (const [key, value] of new URLSearchParams(location.hash.slice(1).replaceAll("+", "%2B"))) {
     const number = Number(value);
     if (key === "isovalue" && value && Number.isFinite(number)) state.iso = toUnit(number);
     else if (key === "shading" && ["local", "global"].includes(value)) state.shading = value;
@@ -338,6 +345,15 @@ function controls() {
   const on = (id, event, action) => $(id).addEventListener(event, (e) => { action(e.target); show(); });
   on("isovalue", "input", (t) => { state.iso = Number(t.value); });
   on("number", "input", (t) => { if (t.value !== "") state.iso = toUnit(Number(t.value)); });
+  $("number").addEventListener("blur", (e) => { e.target.value = digits(toSource(state.iso)); });
+  $("number").addEventListener("keydown", (e) => {
+    const step = { ArrowUp: 0.005, ArrowDown: -0.005 }[e.key];
+    if (!step) return;
+    e.preventDefault();
+    state.iso += step;
+    show();
+    e.target.value = digits(toSource(state.iso));
+  });
   on("shading", "change", (t) => { state.shading = t.value; });
   on("exposure", "input", (t) => { state.exposure = 2 ** Number(t.value); });
   on("tint", "input", (t) => { state.tint = fromHex(t.value.slice(1)); });
@@ -351,14 +367,20 @@ function controls() {
     state.iso = (e.clientX - box.left) / box.width;
     show();
   };
-  $("histogram").addEventListener("pointerdown", pick);
-  $("histogram").addEventListener("pointermove", (e) => { if (e.buttons) pick(e); });
+  $("histogram").addEventListener("pointerdown", (e) => {
+    if (e.button) return;
+    document.activeElement?.blur();
+    e.target.setPointerCapture(e.pointerId);
+    pick(e);
+  });
+  $("histogram").addEventListener("pointermove", (e) => { if (e.target.hasPointerCapture(e.pointerId)) pick(e); });
+  $("help").addEventListener("click", (e) => { e.currentTarget.hidden = true; });
 
   const fingers = new Map();
   const pan = (dx, dy) => {
-    const c = camera(canvas.clientWidth, canvas.clientHeight), distance = -scene.camera.eye[1] / state.zoom;
-    state.shift = add(state.shift, c.u_right, -2 * dx / canvas.clientWidth * distance);
-    state.shift = add(state.shift, c.u_up, 2 * dy / canvas.clientHeight * distance);
+    const c = camera(canvas.clientWidth, canvas.clientHeight);
+    state.shift = add(state.shift, c.u_right, -2 * dx / canvas.clientWidth * c.distance);
+    state.shift = add(state.shift, c.u_up, 2 * dy / canvas.clientHeight * c.distance);
   };
   canvas.addEventListener("pointerdown", (e) => {
     canvas.setPointerCapture(e.pointerId);
@@ -405,17 +427,21 @@ function controls() {
   addEventListener("keydown", (e) => {
     const typing = e.target.matches?.("input[type=number], select");
     const sliding = e.target.matches?.("input[type=range]") && e.key.startsWith("Arrow");
-    if (!keys[e.key] || e.ctrlKey || e.altKey || e.metaKey || typing || sliding) return;
+    // Capitals are small letters; some keyboards have brackets behind alt only.
+    const key = keys[e.key] ? e.key : e.key.toLowerCase();
+    if (!keys[key] || e.ctrlKey || (e.altKey && !"[]{}".includes(key)) || e.metaKey || typing || sliding) return;
     e.preventDefault();
-    keys[e.key]();
+    keys[key]();
     show();
   });
   addEventListener("resize", show);
   addEventListener("hashchange", reset);
   canvas.addEventListener("webglcontextlost", (e) => {
     e.preventDefault();
+    programs = null;
     fail("The graphics driver took the picture away. Reload the page.");
   });
+  canvas.addEventListener("webglcontextrestored", () => location.reload());
 }
 
 /// For scripts in the console: await isolume.ready; isolume.set({iso: 0.3}); isolume.pixels(640, 480); isolume.time(20).
@@ -444,7 +470,7 @@ const isolume = {
 window.isolume = isolume;
 
 isolume.ready = (async () => {
-  document.title = `${scene.title} – isolume`;
+  if (scene.title) document.title = `${scene.title} – isolume`;
   $("title").textContent = scene.title;
   gl = canvas.getContext("webgl2", { antialias: false, alpha: false });
   if (!gl) throw new Error("This page needs WebGL2, which this browser or its graphics driver does not offer. " +
@@ -453,7 +479,8 @@ isolume.ready = (async () => {
   upload(await unpack());
   $("facts").textContent = `${scene.dims.join(" × ")} points, isovalues ${digits(scene.isovalues[0])} to ` +
     `${digits(scene.isovalues[1])}. Made by isolume.`;
-  for (const id of ["bar", "settings", "title"]) $(id).hidden = false;
+  for (const id of ["bar", "settings"]) $(id).hidden = false;
+  $("title").hidden = !scene.title;
   $("message").hidden = true;
   controls();
   reset();
