@@ -119,8 +119,8 @@ pub struct SweptSide {
     /// What of it comes straight from luminaires; empty unless [`SweepSettings::direct`] asks for it.
     pub direct: Vec<[f32; 3]>,
     /// Standard error of the luminance of the reflected radiance ρE/π, from the spread of the replicates and how much
-    /// better than independent ones they are together (measured at one node in sixteen; a bound unless they are 4, 8,
-    /// 16 …). Empty with fewer than 2. What the grid cannot hold between its nodes is not part of it.
+    /// better than independent ones they are together (measured at one node in sixteen or fewer; a bound unless they
+    /// are 4, 8, 16 …). Empty with fewer than 2. What the grid cannot hold between its nodes is not part of it.
     pub std_error: Vec<f32>,
 }
 

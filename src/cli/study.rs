@@ -27,7 +27,7 @@ enum What {
     Strategies(SceneStudy),
     /// Error, interpolation floor and seconds of each data set
     Datasets(SceneStudy),
-    /// Error against wall seconds over photons, samples and gather rays
+    /// Error against wall seconds over directions, luminaire points, photons, samples and gather rays
     Curve(Curve),
 }
 

@@ -39,7 +39,7 @@ pub(super) struct Along {
 }
 
 impl Slot {
-    /// Where points lie, in steps beside a node: two to a cell are exact for cubics, such as |∇h|² [Gauss]. At nodes
+    /// Where points lie, in steps beside a node: two to a cell are exact for cubics, such as |∇h|² (Gauss). At nodes
     /// gradients are differences of single pairs of samples, which noise makes larger than they are between them.
     pub(super) const BESIDE: f64 = 0.211_324_865_405_187_1;
 
