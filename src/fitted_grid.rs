@@ -90,9 +90,11 @@ pub fn fit(
     start
 }
 
-/// Three draws of an error with mean 0 and this standard deviation; equal `index`, equal signs.
+/// Three draws of an error with mean 0 and this standard deviation; equal `index`, equal signs. None where it is not
+/// finite: a fit would carry that everywhere.
 #[inline]
 pub(crate) fn draws(index: u64, deviation: f32) -> Vec3 {
+    let deviation = if deviation.is_finite() { deviation } else { 0.0 };
     let bits = Stage::Noise.key(0, index).stream().bits();
     Vec3::from_array([0, 1, 2].map(|n| if bits >> n & 1 == 0 { deviation } else { -deviation }))
 }

@@ -271,8 +271,9 @@ fn walls_seconds(scene: &Scene, tracer: &GraphTracer<'_>, photons: &Photons, set
     let (begun, done) = (Instant::now(), AtomicU64::new(0));
     let seconds = || begun.elapsed().as_secs_f64();
     RadianceCache::new(scene, tracer, photons, &tried, &|n| {
-        done.fetch_add(n, Ordering::Relaxed);
-        !interrupted() && seconds() < LONG
+        let go_on = !interrupted() && seconds() < LONG;
+        done.fetch_add(if go_on { n } else { 0 }, Ordering::Relaxed);
+        go_on
     });
     let done = if seconds() < LONG { texels(across) } else { done.into_inner() as f64 };
     seconds() * all / done.max(1.0)

@@ -139,8 +139,8 @@ impl Extract {
     }
 }
 
-/// The volume in units that tell its samples near `isovalue` apart: as far outside the sweep as the sweep is wide, or
-/// many times nearer to 0, f32 does not. `None` within the sweep, and where the volume has no such isovalue.
+/// The volume in units that tell its samples near an `isovalue` outside the sweep apart, which the sweep's own do not
+/// in f32 where all is many times nearer to 0. `None` within the sweep, and where the volume has no such isovalue.
 fn around(volume: &Volume, sweep: Sweep, isovalue: f64) -> Option<Field> {
     // So much wider than the rest of the data the numbers of the unit may not become.
     const NARROWEST: f64 = 1e-30;
@@ -149,7 +149,7 @@ fn around(volume: &Volume, sweep: Sweep, isovalue: f64) -> Option<Field> {
         return None;
     }
     let width = hi - lo;
-    let step = 0.5 * isovalue.abs().clamp(NARROWEST.max(f64::MIN_POSITIVE / width) * width, width);
+    let step = 0.5 * isovalue.abs().max(NARROWEST * width).min(width);
     Field::new(volume, Sweep::new(isovalue - step, isovalue + step).ok()?).ok()
 }
 
