@@ -122,7 +122,8 @@ pub struct Accuracy {
     /// Share of the vertices that are as bright as can be displayed in all channels, by the bake and by the references:
     /// no error is seen there.
     pub clamped: f64,
-    /// 95 % confidence interval of `percent_rms`, from the scatter over vertices (as if they were independent).
+    /// 95 % confidence interval of `percent_rms`, from the scatter over vertices (as if they were independent);
+    /// of a single one, up to infinity.
     pub confidence: [f64; 2],
     /// What a perfect bake would show against one reference: 100 √⟨Σ variance⟩ of clamped rgb, as if the reference's
     /// noise were Gaussian around what it holds.

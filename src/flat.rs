@@ -351,6 +351,12 @@ pub fn texels(scene: &Scene, across: usize, isovalues: usize) -> usize {
     flats.map(|f| f.resolution(across, isovalues).iter().product::<usize>()).sum()
 }
 
+/// As [`texels`], of flats that reflect something: the others need none.
+pub fn lit_texels(scene: &Scene, across: usize, isovalues: usize) -> usize {
+    let flats = (0..count(scene)).filter_map(|n| flat(scene, n)).filter(|f| !f.albedo.black());
+    flats.map(|f| f.resolution(across, isovalues).iter().product::<usize>()).sum()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

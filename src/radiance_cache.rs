@@ -155,7 +155,7 @@ pub struct RadianceCache {
 
 impl RadianceCache {
     /// A cache of what walls and caps show; its nodes are for [`RadianceCache::fill`]. `tick(n)` reports n of their
-    /// [`flat::texels`] done; returning false stops early.
+    /// [`flat::lit_texels`] done; returning false stops early.
     pub fn new<T: Tracer>(
         scene: &Scene,
         tracer: &T,

@@ -63,7 +63,8 @@ pub struct Survey {
     pub percent_rms_texture: f64,
     /// The same per channel: / √3.
     pub percent_rms_sqrt3: f64,
-    /// 95 % confidence interval of `percent_rms`, from the scatter over points (as if they were independent).
+    /// 95 % confidence interval of `percent_rms`, from the scatter over points (as if they were independent);
+    /// of a single one, up to infinity.
     pub confidence: [f64; 2],
     /// Points of the grid that took part: those beside the others that hold light of their own level set.
     pub grid_points: usize,

@@ -461,7 +461,8 @@ impl<'a> Beside<'a> {
                 grid.radiance[owner] = (sum / count).to_array();
                 grid.mask[owner] = Mask::Filled;
                 lit.push(owner);
-                errors.push((drawn / count, common / count));
+                let unknown = light[start..start + run.len()].iter().any(|l| l.variance == f32::INFINITY);
+                errors.push((drawn / count, if unknown { f32::INFINITY } else { common / count }));
             }
             start += run.len();
         }

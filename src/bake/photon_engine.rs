@@ -68,7 +68,7 @@ pub(super) fn light(
     // The walls' light of all isovalues; what the nodes take from photons.
     let clock = Clock::start();
     let cache_settings = settings.cache(axis);
-    let texels = flat::texels(first, cache_settings.flat_resolution, cache_settings.isovalue_resolution) as u64;
+    let texels = flat::lit_texels(first, cache_settings.flat_resolution, cache_settings.isovalue_resolution) as u64;
     let stage = progress.stage("walls", texels);
     let estimate = settings.estimate();
     let gather = settings.gather_rays > 0;
@@ -279,7 +279,9 @@ impl<'a> FieldLight<'a> {
                             let start = |o: usize| draws((errors.len() + o) as u64, grid.std_error[o]);
                             let variances = fitted_variance(&scene.field, lattice, &wishes, &start, &free, PULL, tick);
                             for (o, variance) in free.members(0..lattice.len()).zip(variances) {
-                                grid.std_error[o] = variance.sqrt();
+                                if grid.std_error[o].is_finite() {
+                                    grid.std_error[o] = variance.sqrt();
+                                }
                             }
                             grid
                         }

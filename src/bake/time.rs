@@ -263,7 +263,7 @@ impl SweepParts {
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a part of a length")]
 fn walls_seconds(scene: &Scene, tracer: &GraphTracer<'_>, photons: &Photons, settings: &BakeSettings) -> f64 {
     let walls = settings.wall_resolution;
-    let texels = |across: usize| flat::texels(scene, across, settings.wall_isovalues) as f64;
+    let texels = |across: usize| flat::lit_texels(scene, across, settings.wall_isovalues) as f64;
     let all = texels(walls);
     let share = (photons.emitted as f64 / settings.photons.max(1) as f64).min(MOST_SHADOWED / all.max(1.0));
     let across = ((walls as f64 * share.sqrt()) as usize).clamp(walls.min(LEAST_ACROSS), walls);

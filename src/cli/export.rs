@@ -13,8 +13,8 @@ use std::path::{Path, PathBuf};
 #[command(after_help = "\
 The arrays of a bake: `radiance` (linear RGB), `rgb` (the same for the eye: exposed, clamped, sRGB-encoded), `std_error` (of
 radiance, in luminance), `mask` (1: light of the point's own isosurface; 2: filled for those beside it; 0: none), of --split
-`indirect` and `visible`, the same of the other side with _inside, and `value`, the volume itself. A .nrrd holds vectors as 3D Slicer reads them; a .npy has the shape (z, y, x) or (z, y, x, 3); an .exr has one
-layer per slice along z.
+`indirect` and `visible`, the same of the other side with _inside, and `value`, the volume itself. A .nrrd holds vectors as 3D
+Slicer reads them; a .npy has the shape (z, y, x) or (z, y, x, 3); an .exr has one layer per slice along z.
 
 Examples:
   isolume export lit.vti -o radiance.npy

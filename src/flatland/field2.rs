@@ -3,10 +3,10 @@
 use crate::digits::span;
 use crate::error::{Error, Result};
 use crate::field::Sweep;
+use crate::files;
 use crate::volume::Volume;
 use crate::volume::plane::Plane;
 use glam::DVec2;
-use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
 
@@ -237,7 +237,7 @@ type Raster = ([usize; 2], DVec2, DVec2, Vec<f64>);
 
 fn read_png(path: &Path) -> Result<Raster> {
     let broken = |e: png::DecodingError| Error::invalid(path, format!("not a readable PNG: {e}"));
-    let file = File::open(path).map_err(|e| Error::io(path, e))?;
+    let file = files::open(path)?;
     let mut decoder = png::Decoder::new(BufReader::new(file));
     decoder.set_transformations(png::Transformations::EXPAND);
     let mut reader = decoder.read_info().map_err(broken)?;
@@ -313,7 +313,7 @@ mod tests {
     fn grey_pictures_stand_upright() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("p.png");
-        let mut encoder = png::Encoder::new(File::create(&path).unwrap(), 3, 2);
+        let mut encoder = png::Encoder::new(std::fs::File::create(&path).unwrap(), 3, 2);
         encoder.set_color(png::ColorType::Grayscale);
         encoder.set_depth(png::BitDepth::Eight);
         encoder.write_header().unwrap().write_image_data(&[10, 20, 30, 40, 50, 60]).unwrap();

@@ -143,12 +143,8 @@ impl<T: Tracer> Raster<'_, T> {
             Some(open) if open.outer[i] => open.place(i, true),
             _ => Some(self.part(i).at),
         };
-        let [few, many] = self.shadow_rays();
-        let estimate = |i: usize, rays: u32| {
-            let go_on = (self.tick)(u64::from(rays == few));
-            Some(self.estimate(i, place(i).filter(|_| go_on)?, rays))
-        };
-        direct_light(self.dims, estimate, [few, many])
+        let estimate = |i: usize, rays: u32| Some(self.estimate(i, place(i).filter(|_| (self.tick)(0))?, rays));
+        direct_light(self.dims, estimate, self.shadow_rays(), self.tick)
     }
 
     /// The same within the solids that stand on a wall; `None` if there are none.
@@ -230,11 +226,12 @@ impl<T: Tracer> Raster<'_, T> {
 }
 
 /// Direct irradiance of the texels that `estimate` knows, by `few` shadow rays, and by `many` beside those that see a
-/// luminaire in part.
+/// luminaire in part. Those that are known are told to `tick`.
 fn direct_light(
     [nu, nv, nc]: [usize; 3],
     estimate: impl Fn(usize, u32) -> Option<Estimate> + Sync,
     [few, many]: [u32; 2],
+    tick: Tick<'_>,
 ) -> Vec<Option<DVec3>> {
     let texels = nu * nv;
     let isovalue = |first: usize| {
@@ -248,7 +245,12 @@ fn direct_light(
             let penumbra = around.any(|mut run| run.any(|m| roughly[m].is_some_and(differs)));
             if penumbra { estimate(first + n, many) } else { Some(own) }
         };
-        each.map(|n| Some(light(n)?.mean)).collect::<Vec<_>>()
+        let known = each.map(|n| {
+            let found = light(n);
+            tick(1);
+            Some(found?.mean)
+        });
+        known.collect::<Vec<_>>()
     };
     (0..nc).into_par_iter().flat_map(|c| isovalue(c * texels)).collect()
 }

@@ -110,12 +110,15 @@ impl From<TiffError> for Refusal {
 impl Refusal {
     /// As the error of a file's page.
     fn of(self, path: &Path, page: usize) -> Error {
+        use std::io::ErrorKind as K;
         match self {
             // What the system refused is named as such; a file that ends early is not.
-            Self::Decoder(TiffError::IoError(e)) if e.kind() != std::io::ErrorKind::UnexpectedEof => Error::io(path, e),
-            Self::Decoder(TiffError::IoError(_)) => {
-                Error::invalid(path, format!("page {page}: the file is cut short or damaged"))
-            }
+            Self::Decoder(TiffError::IoError(e)) => match e.kind() {
+                K::UnexpectedEof | K::InvalidData | K::InvalidInput => {
+                    Error::invalid(path, format!("page {page}: the file is cut short or damaged"))
+                }
+                _ => Error::io(path, e),
+            },
             Self::Decoder(TiffError::UnsupportedError(e)) => Error::not_supported(path, format!("page {page}: {e}")),
             Self::Decoder(e) => Error::invalid(path, format!("page {page}: {e}")),
             Self::Invalid(message) => Error::invalid(path, format!("page {page} {message}")),
@@ -263,9 +266,10 @@ fn read_pages<R: Read + Seek>(mut decoder: Decoder<R>, length: u64, page: &mut u
 
 /// How a page stores its rows; refuses bits and columns that run backward, which the decoder does not look at.
 fn rows<R: Read + Seek>(decoder: &mut Decoder<R>) -> Result<Rows, Refusal> {
-    if decoder.find_tag_unsigned::<u16>(Tag::FillOrder)?.unwrap_or(1) != 1 {
-        let message = "stores the bits of each byte from the lowest (FillOrder 2); save it anew with FillOrder 1";
-        return Err(Refusal::NotSupported(message.into()));
+    if let Some(order) = decoder.find_tag_unsigned::<u16>(Tag::FillOrder)?.filter(|order| *order != 1) {
+        return Err(Refusal::NotSupported(format!(
+            "stores the bits of each byte from the lowest (FillOrder {order}); save it anew with FillOrder 1"
+        )));
     }
     match decoder.find_tag_unsigned::<u16>(Tag::Orientation)?.unwrap_or(1) {
         // What is no orientation is none, as libtiff has it.

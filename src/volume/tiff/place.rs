@@ -19,6 +19,8 @@ pub(super) struct Place {
     slices: Option<usize>,
     channels: usize,
     frames: usize,
+    /// What OME says against the order of the pages.
+    disorder: Option<String>,
     /// Whether 16-bit samples stand for themselves − 32768.
     pub(super) signed: bool,
 }
@@ -27,7 +29,15 @@ impl Place {
     /// From the first page's tags; texts that are missing or not understood leave the defaults.
     /// The error is a message without the file's name.
     pub(super) fn of<R: Read + Seek>(decoder: &mut Decoder<R>) -> Result<Self, String> {
-        let mut place = Self { spacing: DVec3::ONE, images: 1, slices: None, channels: 1, frames: 1, signed: false };
+        let mut place = Self {
+            spacing: DVec3::ONE,
+            images: 1,
+            slices: None,
+            channels: 1,
+            frames: 1,
+            disorder: None,
+            signed: false,
+        };
         let text = decoder.get_tag(Tag::ImageDescription).and_then(Value::into_string).unwrap_or_default();
         if let Some(lines) = text.strip_prefix("ImageJ=") {
             let steps = [Tag::XResolution, Tag::YResolution].map(|tag| match decoder.get_tag(tag) {
@@ -59,7 +69,7 @@ impl Place {
         let Some(pixels) = document.descendants().find(|n| n.tag_name().name() == "Pixels") else { return Ok(()) };
         let count = |key: &str| pixels.attribute(key).and_then(|v| v.parse().ok()).unwrap_or(1);
         self.spacing = ome::spacing(pixels)?;
-        ome::check_order(pixels)?;
+        self.disorder = ome::check_order(pixels).err();
         (self.channels, self.frames) = (count("SizeC"), count("SizeT"));
         self.slices = pixels.attribute("SizeZ").and_then(|v| v.parse().ok());
         Ok(())
@@ -67,9 +77,12 @@ impl Place {
 
     /// Whether so many pages are a volume by these texts. The error is a message without the file's name.
     pub(super) fn check(&self, pages: usize) -> Result<(), String> {
-        let Self { channels, frames, slices, .. } = *self;
+        let Self { channels, frames, slices, ref disorder, .. } = *self;
         if channels > 1 || frames > 1 {
             return Err(format!("holds {channels} channels and {frames} times; save one of them as a stack"));
+        }
+        if let Some(disorder) = disorder {
+            return Err(disorder.clone());
         }
         match slices {
             Some(slices) if slices != pages => Err(format!(

@@ -248,6 +248,11 @@ fn ome_says_which_page_is_which_slice() {
     assert!(of("SizeZ='3'>").unwrap_err().contains("3 slices, but there are 2 pages"));
     let swapped = data.replace("FirstZ='0'", "FirstZ='9'").replace("FirstZ='1'", "FirstZ='0'").replace('9', "1");
     assert!(of(&swapped).unwrap_err().contains("page 0 is slice 1"));
+    // A plane of each channel, as Bio-Formats tells of them.
+    let channels = "<OME><Image><Pixels SizeC='2' SizeT='1' SizeZ='1'><TiffData IFD='1' FirstC='1' FirstZ='0'/></Pixels>\
+                    </Image></OME>";
+    let message = open(&stack::<colortype::Gray8>(2, channels, |i| i as u8)).unwrap_err();
+    assert!(matches!(&message, Error::NotSupported(m) if m.contains("2 channels")), "{message}");
 }
 
 #[test]

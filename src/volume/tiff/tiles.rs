@@ -7,8 +7,8 @@ use std::io::{Read, Seek, SeekFrom};
 use tiff::decoder::{ChunkType, Decoder};
 use tiff::tags::{ByteOrder, CompressionMethod, Tag};
 use tiff::{TiffError, TiffResult};
-use weezl::BitOrder;
 use weezl::decode::Decoder as Lzw;
+use weezl::{BitOrder, LzwStatus};
 
 /// What of a page's directory says how its samples stand in its tiles.
 const KEPT: [Tag; 9] = [
@@ -48,16 +48,7 @@ pub(super) fn unpacked<R: Read + Seek>(decoder: &mut Decoder<R>) -> TiffResult<O
         let reader = decoder.inner();
         reader.seek(SeekFrom::Start(start))?;
         reader.take(length).read_to_end(&mut packed)?;
-        let from = page.bytes.len();
-        let mut lzw = Lzw::with_tiff_size_switch(BitOrder::Msb, 8);
-        let status = lzw.into_vec(&mut page.bytes).decode(&packed).status;
-        // What stands behind the tile is not looked at.
-        if ((page.bytes.len() - from) as u64) < tile {
-            let kind =
-                if status.is_err() { std::io::ErrorKind::InvalidData } else { std::io::ErrorKind::UnexpectedEof };
-            return Err(TiffError::IoError(std::io::Error::new(kind, "a tile packed by LZW is damaged")));
-        }
-        page.bytes.truncate(from + usize::try_from(tile).unwrap_or(usize::MAX));
+        page.unpack(&packed, tile)?;
     }
     let mut entries = Vec::new();
     for tag in KEPT {
@@ -93,6 +84,27 @@ impl Page {
     fn longs(&mut self, values: impl IntoIterator<Item = u64>) {
         let little = self.order == ByteOrder::LittleEndian;
         self.bytes.extend(values.into_iter().flat_map(|v| if little { v.to_le_bytes() } else { v.to_be_bytes() }));
+    }
+
+    /// Appends a tile of so many bytes. What stands behind it is not unpacked.
+    fn unpack(&mut self, mut packed: &[u8], tile: u64) -> TiffResult<()> {
+        let mut lzw = Lzw::with_tiff_size_switch(BitOrder::Msb, 8);
+        let (mut missing, mut buffer) = (tile, [0; 1 << 14]);
+        while missing > 0 {
+            let room = usize::try_from(missing).unwrap_or(usize::MAX).min(buffer.len());
+            let done = lzw.decode_bytes(packed, &mut buffer[..room]);
+            self.bytes.extend_from_slice(&buffer[..done.consumed_out]);
+            packed = &packed[done.consumed_in..];
+            missing -= done.consumed_out as u64;
+            let kind = match done.status {
+                _ if missing == 0 => break,
+                Ok(LzwStatus::Ok) => continue,
+                Ok(_) => std::io::ErrorKind::UnexpectedEof,
+                Err(_) => std::io::ErrorKind::InvalidData,
+            };
+            return Err(TiffError::IoError(std::io::Error::new(kind, "a tile packed by LZW is damaged")));
+        }
+        Ok(())
     }
 
     /// The file with its directory, and the numbers that do not fit in there before it.
@@ -185,6 +197,19 @@ mod tests {
             let damaged = decode(Cursor::new(&page(*order, seed, 40).0), Path::new("a.tif")).unwrap_err().to_string();
             assert!(damaged.contains("page 0: the file is cut short or damaged"), "{damaged}");
         }
+    }
+
+    /// Of a long run behind a small tile nothing is held; a stream that is no LZW is damaged.
+    #[test]
+    fn tiles_hold_what_they_should() {
+        let run = Encoder::with_tiff_size_switch(BitOrder::Msb, 8).encode(&vec![5; 1 << 22]).unwrap();
+        let mut page = Page::new(ByteOrder::LittleEndian);
+        let header = page.bytes.len();
+        page.unpack(&run, 100_000).unwrap();
+        assert!(page.bytes[header..] == vec![5; 100_000] && page.bytes.capacity() < 1 << 20);
+        // The longest code there is, of which nothing is known yet.
+        let wrong = page.unpack(&[0xff; 64], 100).unwrap_err();
+        assert!(matches!(wrong, TiffError::IoError(e) if e.kind() == std::io::ErrorKind::InvalidData));
     }
 
     fn page_of<R: Read + Seek>(mut decoder: Decoder<R>) -> Vec<u16> {
