@@ -375,7 +375,7 @@ fn compare_computes_what_it_says() {
     close(a.noise_floor, 100.0 * floor.sqrt());
     let mean = squares.iter().sum::<f64>() / 4.0;
     close(a.percent_rms_without_noise, 100.0 * (mean - (a.noise_floor / 100.0).powi(2)).sqrt());
-    let deviation = (squares.iter().map(|s| (s - mean).powi(2)).sum::<f64>() / 4.0 / 4.0).sqrt();
+    let deviation = (squares.iter().map(|s| (s - mean).powi(2)).sum::<f64>() / 3.0 / 4.0).sqrt();
     let bounds = [-1.96, 1.96].map(|k| 100.0 * f64::max(mean + k * deviation, 0.0).sqrt());
     assert!(bounds[0] == 0.0 && bounds[1] > 0.0);
     close(a.confidence[0], bounds[0]);
@@ -396,9 +396,10 @@ fn compare_computes_what_it_says() {
     close(b.confidence[0], b.percent_rms);
     close(b.confidence[1], b.percent_rms);
     let (b, _) = compare(&texture_at([0.25, 0.26, 0.25, 0.26]), std::slice::from_ref(&near), 2.0).unwrap();
-    // Squares 0.03 and 0.0432: mean 0.0366, deviation of the mean 0.0033.
-    close(b.confidence[0], 100.0 * (0.0366f64 - 1.96 * 0.0033).sqrt());
-    close(b.confidence[1], 100.0 * (0.0366f64 + 1.96 * 0.0033).sqrt());
+    // Squares 0.03 and 0.0432, twice: mean 0.0366, deviation of the mean 0.0066/√3.
+    let deviation = 0.0066 / 3f64.sqrt();
+    close(b.confidence[0], 100.0 * (0.0366f64 - 1.96 * deviation).sqrt());
+    close(b.confidence[1], 100.0 * (0.0366f64 + 1.96 * deviation).sqrt());
     let (b, _) = compare(&texture_at([0.25; 4]), &[flat([0.2; 4], 0.004)], 2.0).unwrap();
     assert!(b.noise_floor > b.percent_rms && b.percent_rms_without_noise == 0.0, "{b:?}");
 
