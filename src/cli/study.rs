@@ -92,8 +92,8 @@ impl Study {
         match self.what {
             What::Strategies(v) => v.run(study::strategies, progress),
             What::Datasets(v) => v.run(study::datasets, progress),
-            What::Curve(Curve { limit: Some(limit), .. }) if !(limit > 0.0) => {
-                Err(Error::Invalid(format!("--limit {limit}: must be a positive number of seconds")))
+            What::Curve(Curve { limit: Some(limit), .. }) if !(limit >= 0.0) => {
+                Err(Error::Invalid(format!("--limit {limit}: must be 0 seconds or more")))
             }
             What::Curve(v) => v.study.run(|s, subjects, base| study::curve(s, subjects, base, v.limit), progress),
             What::Flatland(v) => {

@@ -33,9 +33,9 @@ fn paths_have_a_most() {
     refused(dir.path(), &["flatland", "s.toml", "-o", "o", "--paths", "65537"], &["--paths 65537: 0 to 65536"]);
     // Before there is a folder.
     refused(dir.path(), &["study", "flatland", "--most", "999", "-o", "none"], &["--most 999"]);
-    for limit in ["nan", "0"] {
-        let curve = ["study", "curve", "s.toml", "-o", "none", "--limit", limit];
-        refused(dir.path(), &curve, &["--limit", "positive number of seconds"]);
+    for limit in ["nan", "-5"] {
+        let curve = ["study", "curve", "s.toml", "-o", "none", &format!("--limit={limit}")];
+        refused(dir.path(), &curve, &["--limit", "0 seconds or more"]);
     }
     assert!(!dir.path().join("none").exists());
 }
