@@ -17,12 +17,13 @@
 //! library's version), and `rtcGetGeometry*` inside callbacks (slow since 4.0).
 
 mod abi;
-mod bvh;
 mod device;
+mod user;
+mod callbacks;
+mod bvh;
 mod extrusions;
 mod hexahedra;
 mod triangles;
-mod user;
 
 pub use abi::{Hit, Hit16, INVALID_ID, Ray, Ray16, RayHit, RayHit16, RayView, Valid16};
 pub use bvh::{Quality, Scene, SceneBuilder};

@@ -283,6 +283,12 @@ pub struct Loaded {
 }
 
 impl Loaded {
+    /// All volumes, in the order of the scene's fields.
+    #[must_use]
+    pub fn volumes(&self) -> Vec<&Volume> {
+        [&self.volume].into_iter().chain(&self.companions).collect()
+    }
+
     /// `error` about an option of the bake, at the line of the file that sets it if none of `flags` does.
     #[must_use]
     pub fn blame_bake(&self, flags: &BakeOptions, error: Error) -> Error {

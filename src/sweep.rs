@@ -29,7 +29,6 @@ mod grid;
 mod half;
 mod incoming;
 mod lit_rows;
-mod near;
 mod normals;
 mod open_share;
 mod pack;
@@ -56,6 +55,7 @@ use crate::flattened::Side;
 use crate::isa::Isa;
 use crate::scene::{Boundary, Scene};
 pub(crate) use arrive::reports;
+use direct::Direct;
 pub(crate) use fans::seen;
 use flats::Flats;
 pub(crate) use flats::texels;
@@ -289,12 +289,12 @@ pub fn sweep_resumable(
     while state.done < replicates && !stopped {
         let done = state.done as f64;
         let progress = |x: f64| tick(DIRECT_SHARE + (1.0 - DIRECT_SHARE) * (done + x) / replicates as f64);
-        let (indirect, complete) = run.replicate(&mut state, passes.take(), &mut flats, &progress);
-        stopped = !complete;
-        if complete {
-            state.add(&indirect, &flats, (scene, geometry.lit_rows(), &focus));
-            spare.keep(indirect.into_iter().flatten());
-        }
+        let Some(indirect) = run.replicate(&mut state, passes.take(), &mut flats, &progress) else {
+            stopped = true;
+            break;
+        };
+        state.add(&indirect, &flats, (scene, geometry.lit_rows(), &focus));
+        spare.keep(indirect.into_iter().flatten());
     }
     spare.clear();
     if state.done == 0 {
@@ -381,9 +381,16 @@ impl Run<'_> {
                 step += 1;
                 tick(DIRECT_SHARE * step as f64 / (replicates * lights) as f64)
             };
-            let common = (self.geometry, clearance.as_ref(), self.isa, self.spare);
-            let part = Points { seed: s.seed, replicate: number, replicates, count: points };
-            let (direct, all) = direct::direct(self.scene, common, flats, self.sides, part, &mut ask);
+            let direct = Direct {
+                scene: self.scene,
+                geometry: self.geometry,
+                clearance: clearance.as_ref(),
+                sides: self.sides,
+                points: Points { seed: s.seed, replicate: number, replicates, count: points },
+                isa: self.isa,
+                spare: self.spare,
+            };
+            let (direct, all) = direct.light(flats, &mut ask);
             complete = all;
             if complete {
                 state.counts.shadow_rays += state.counts.valid * lights as u64;

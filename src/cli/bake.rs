@@ -1,26 +1,23 @@
 //! `isolume bake`: from a volume or scene to the file that holds it with its light.
 
+mod plan;
 mod warnings;
 
-use super::{device, expect_extension, outputs};
+use super::{expect_extension, outputs};
 use crate::atomic;
-use crate::bake::{
-    BakeOptions, BakeReport, BakeSettings, Engine, MemoryEstimate, TimeEstimate, bake_fields, digest, job, supported,
-};
+use crate::bake::{BakeOptions, BakeReport, Engine, bake_fields, digest, job};
 use crate::checkpoint::{Checkpoint, Held};
 use crate::error::{Error, Result};
 use crate::export::bake_file::{self, BakedVolume};
 use crate::field::Sweep;
-use crate::isa::Isa;
 use crate::progress::{Clock, Progress, say};
 use crate::scene::{Policy, Scene};
 use crate::scene_file::{Inputs, SceneOptions, load, load_series};
 use crate::series::{Series, write_collection};
-use crate::volume::Volume;
+use plan::Plan;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::time::Duration;
-use warnings::warnings;
 
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
@@ -188,105 +185,65 @@ impl Bake {
         said: &mut BTreeSet<String>,
     ) -> Result<(Sweep, serde_json::Value)> {
         let loaded = load(&self.input, &self.scene)?;
-        let load_seconds = begun.seconds();
-        let extension = self.output.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
-        match (loaded.scene.fields(), extension.as_str()) {
-            (1, "vtm") => {
-                return Err(Error::invalid(
-                    &self.output,
-                    "is for several volumes that sweep, the scene has one; name a .vti",
-                ));
-            }
-            (n @ 2.., "vti") => {
-                return Err(Error::invalid(
-                    &self.output,
-                    format!(
-                        "holds one volume, the scene has {n}; name a .vtm, which ParaView opens as one, and a .vti for each \
-                         volume is written beside it"
-                    ),
-                ));
-            }
-            (1, _) => {}
-            _ => {
-                let files: Vec<PathBuf> =
-                    loaded.scene.members().iter().map(|m| bake_file::field_file(&self.output, &m.name)).collect();
-                outputs(self.outputs().chain(files), &Inputs::of(&self.input, &self.scene)?)?;
-            }
-        }
-        let volumes: Vec<&Volume> = [&loaded.volume].into_iter().chain(&loaded.companions).collect();
-        let options = self.bake.clone().or(&loaded.bake);
-        let mut settings = BakeSettings::new(&options, &loaded.scene).map_err(|e| loaded.blame_bake(&self.bake, e))?;
-        let sweep = loaded.scene.field.sweep();
-        supported(&loaded.scene, &settings).map_err(|e| e.in_file(&self.input))?;
-        let members = loaded.scene.members();
-        if progress == Progress::Shown {
-            for member in &members {
-                let ([nx, ny, nz], sweep) = (member.field.lattice().dims(), member.field.sweep());
-                say!(
-                    "{}{}: {nx}×{ny}×{nz}, isovalues {sweep}, {} luminaire(s), {} threads, {}",
-                    self.input.display(),
-                    if members.len() > 1 { format!(" '{}'", member.name) } else { String::new() },
-                    loaded.scene.luminaires().len(),
-                    rayon::current_num_threads(),
-                    Isa::current().name()
-                );
-            }
-        }
-        let device = device()?;
-        let memory = match self.max_memory {
-            Some(most) => {
-                let fit = |s: &BakeSettings| MemoryEstimate::within(most, &loaded.scene, &volumes, s, &device);
-                let (mut bands, mut estimate) = fit(&settings)?;
-                if estimate.peak() > most && settings.engine == Engine::Sweep && options.leaves_engine() {
-                    let photon = BakeSettings::with_engine(&options, Engine::Photon)?;
-                    let photon = BakeSettings { grid: settings.grid, ..photon };
-                    let fitted = fit(&photon)?;
-                    // If neither fits, the one that needs less is worth hearing of.
-                    if fitted.1.peak() < estimate.peak() {
-                        (settings, (bands, estimate)) = (photon, fitted);
-                    }
-                }
-                estimate.check(most, settings.engine, bands)?;
-                settings.bands = bands;
-                estimate
-            }
-            None => MemoryEstimate::new(&loaded.scene, &volumes, &settings, &device)?,
-        };
+        let load = begun.seconds();
+        self.check_volumes(&loaded.scene)?;
+        let plan = Plan::new(loaded, &self.input, &self.bake, self.max_memory, progress)?;
+        let sweep = plan.scene().field.sweep();
         // A trial run may be for another machine.
-        let fits = memory.check_machine(settings.engine);
+        let fits = plan.check_machine();
         let unfit = if self.dry_run { fits.err() } else { fits.map(|()| None)? };
-        for warning in warnings(&loaded.scene, &volumes, &options, &settings)? {
-            if said.insert(warning.clone()) {
-                say!("warning: {warning}");
-            }
-        }
+        plan.warn(said)?;
         if progress == Progress::Shown || self.dry_run {
-            let engine = match settings.engine {
-                Engine::Sweep => "sweep: every isovalue at once",
-                Engine::Photon => "photon: exact rays",
-            };
-            say!("{:>14}  {engine}", "engine");
-            say!("{:>14}  {memory}", "memory");
-            if settings.bands > 1 {
-                say!("{:>14}  {} of isovalues, one after another", "bands", settings.bands);
-            }
+            plan.announce();
         }
         if self.dry_run {
             if let Some(e) = unfit {
                 say!("warning: {e}");
             }
-            let time = TimeEstimate::new(&loaded.scene, &settings, &device)?;
-            say!("{:>14}  {time}", "time");
-            let json = serde_json::json!({
-                "settings": settings,
-                "bytes": memory.stages.iter().copied().collect::<BTreeMap<_, _>>(),
-                "peak_bytes": memory.peak(),
-                "seconds": time.stages.iter().copied().collect::<BTreeMap<_, _>>(),
-                "total_seconds": time.total(),
-            });
-            return Ok((sweep, json));
+            return Ok((sweep, plan.estimates()?));
         }
-        let job = job(&loaded.scene, &settings, &device.version());
+        let json = match self.begin(&plan, first, progress)? {
+            Begun::Whole(report) => report,
+            Begun::At(checkpoint) => {
+                let reports = self.work(&plan, &checkpoint, (begun, load), progress)?;
+                if progress == Progress::Shown {
+                    self.summarise(plan.scene(), &reports);
+                }
+                warn_of_unsettled(&reports);
+                in_one(plan.scene(), &reports)
+            }
+        };
+        self.hand_out(&json)?;
+        Ok((sweep, json))
+    }
+
+    /// Refuses an output that is for another number of volumes, and one that could not be written.
+    fn check_volumes(&self, scene: &Scene) -> Result<()> {
+        let extension = self.output.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        match (scene.fields(), extension.as_str()) {
+            (1, "vtm") => {
+                Err(Error::invalid(&self.output, "is for several volumes that sweep, the scene has one; name a .vti"))
+            }
+            (n @ 2.., "vti") => Err(Error::invalid(
+                &self.output,
+                format!(
+                    "holds one volume, the scene has {n}; name a .vtm, which ParaView opens as one, and a .vti for each \
+                     volume is written beside it"
+                ),
+            )),
+            (1, _) => Ok(()),
+            _ => outputs(self.outputs().chain(self.field_files(scene)), &Inputs::of(&self.input, &self.scene)?),
+        }
+    }
+
+    /// The files of several volumes.
+    fn field_files(&self, scene: &Scene) -> Vec<PathBuf> {
+        scene.members().iter().map(|m| bake_file::field_file(&self.output, &m.name)).collect()
+    }
+
+    /// Where the work begins: with --resume at what is done.
+    fn begin(&self, plan: &Plan, first: bool, progress: Progress) -> Result<Begun> {
+        let job = job(plan.scene(), &plan.settings, &plan.device.version());
         // Of a series, what is there.
         let whole = (self.resume && self.scene.time.is_some()).then(|| self.whole()).flatten();
         let same = |report: &serde_json::Value| report.get("job").and_then(|j| j.as_str()) == Some(&digest(&job));
@@ -295,8 +252,7 @@ impl Bake {
                 if progress == Progress::Shown {
                     say!("{:>14}  {} is complete", "resumed", self.output.display());
                 }
-                self.hand_out(&report)?;
-                return Ok((sweep, report));
+                return Ok(Begun::Whole(report));
             }
             found => found.is_some(),
         };
@@ -312,45 +268,38 @@ impl Bake {
         self.take_up(&checkpoint, progress)?;
         if self.resume {
             // A bake that was killed while it wrote leaves what may be large.
-            let fields = loaded.scene.members().into_iter().map(|m| bake_file::field_file(&self.output, &m.name));
-            fields.chain([self.output.clone()]).for_each(|path| atomic::remove_orphans(&path));
+            let written = self.field_files(plan.scene()).into_iter().chain([self.output.clone()]);
+            written.for_each(|path| atomic::remove_orphans(&path));
         }
-        let work = || -> Result<(Vec<crate::bake::Bake>, Clock)> {
-            let mut bakes = bake_fields(&loaded.scene, &settings, &device, progress, Some(&checkpoint))?;
+        Ok(Begun::At(checkpoint))
+    }
+
+    /// Bakes and writes; if that fails, what is finished is kept. The whole of it began, and loading took, as told.
+    fn work(
+        &self,
+        plan: &Plan,
+        checkpoint: &Checkpoint,
+        (begun, load): (Clock, [f64; 2]),
+        progress: Progress,
+    ) -> Result<Vec<BakeReport>> {
+        let work = || -> Result<_> {
+            let mut bakes = bake_fields(plan.scene(), &plan.settings, &plan.device, progress, Some(checkpoint))?;
             let export = Clock::start();
             for bake in &mut bakes {
-                [bake.report.seconds.load, bake.report.processor_seconds.load] = load_seconds;
+                [bake.report.seconds.load, bake.report.processor_seconds.load] = load;
                 [bake.report.seconds.total, bake.report.processor_seconds.total] = begun.seconds();
             }
-            bake_file::write_fields(&self.output, &loaded.scene, &volumes, &bakes)?;
+            bake_file::write_fields(&self.output, plan.scene(), &plan.loaded.volumes(), &bakes)?;
             Ok((bakes, export))
         };
-        let (bakes, export) = work().inspect_err(|e| keep(&checkpoint, e))?;
+        let (bakes, export) = work().inspect_err(|e| keep(checkpoint, e))?;
         checkpoint.remove();
         let mut reports: Vec<BakeReport> = bakes.into_iter().map(|b| b.report).collect();
         for report in &mut reports {
             [report.seconds.export, report.processor_seconds.export] = export.seconds();
             [report.seconds.total, report.processor_seconds.total] = begun.seconds();
         }
-        // Of several volumes, one report each by name.
-        let json = match &reports[..] {
-            [report] => serde_json::to_value(report),
-            all => serde_json::to_value(members.iter().map(|m| &m.name).zip(all).collect::<BTreeMap<_, _>>()),
-        };
-        let json = json.expect("the report is plain data");
-        self.hand_out(&json)?;
-        if progress == Progress::Shown {
-            self.summarise(&loaded.scene, &reports);
-        }
-        if let Some(r) = reports.iter().find(|r| r.unsettled > UNSETTLED) {
-            say!(
-                "warning: light has not settled in {} bounces: {:.0} % of what is reflected may be missing; use --engine photon, \
-                 or smaller albedos",
-                r.sweep_bounces,
-                100.0 * r.unsettled
-            );
-        }
-        Ok((sweep, json))
+        Ok(reports)
     }
 
     /// What was done, for people.
@@ -415,8 +364,36 @@ impl Bake {
     }
 }
 
+/// What a bake finds when it begins.
+enum Begun {
+    /// The output, made before: its report.
+    Whole(serde_json::Value),
+    /// What was kept of it, or nothing.
+    At(Checkpoint),
+}
+
+/// The reports as one: of several volumes, each by its name.
+fn in_one(scene: &Scene, reports: &[BakeReport]) -> serde_json::Value {
+    let json = match reports {
+        [report] => serde_json::to_value(report),
+        all => serde_json::to_value(scene.members().iter().map(|m| &m.name).zip(all).collect::<BTreeMap<_, _>>()),
+    };
+    json.expect("the report is plain data")
+}
+
 /// The share of indirect light that may be missing without a word: five times what sweeps settle for.
 const UNSETTLED: f64 = 0.02;
+
+fn warn_of_unsettled(reports: &[BakeReport]) {
+    if let Some(r) = reports.iter().find(|r| r.unsettled > UNSETTLED) {
+        say!(
+            "warning: light has not settled in {} bounces: {:.0} % of what is reflected may be missing; use --engine photon, \
+             or smaller albedos",
+            r.sweep_bounces,
+            100.0 * r.unsettled
+        );
+    }
+}
 
 /// Saves what is finished and says so, unless the same command would fail with the same `error` again.
 fn keep(checkpoint: &Checkpoint, error: &Error) {

@@ -7,6 +7,7 @@ use super::{device, expect_extension, outputs};
 use crate::digits::Shortest;
 use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
+use crate::final_gather::FinalGatherSettings;
 use crate::progress::{Progress, say};
 use crate::render::{Camera, Rendered, Shading, render};
 use crate::scene::{Policy, Scene};
@@ -98,114 +99,66 @@ fn first_isovalue(scene: &Scene, name: &str, isovalue: f64) -> Result<f64> {
     Ok(scene.field.sweep().from_unit(sweep.to_unit(isovalue)))
 }
 
+/// What a picture is drawn of.
+enum Source {
+    Bake(BakedVolume),
+    Unbaked(Scene),
+}
+
+impl Source {
+    fn scene(&self) -> &Scene {
+        match self {
+            Self::Bake(baked) => &baked.scene,
+            Self::Unbaked(scene) => scene,
+        }
+    }
+
+    fn baked(&self) -> Option<&BakedVolume> {
+        match self {
+            Self::Bake(baked) => Some(baked),
+            Self::Unbaked(_) => None,
+        }
+    }
+
+    /// What radiance is multiplied by to be shown.
+    fn exposure(&self) -> f64 {
+        match self {
+            Self::Bake(baked) => baked.exposure,
+            Self::Unbaked(scene) => scene.exposure(),
+        }
+    }
+}
+
 impl Render {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
         expect_extension(&self.output, &["png", "exr"])?;
         outputs([&*self.output], &Inputs::of(&self.file, &self.scene)?)?;
         let begun = Instant::now();
-        let pixels = 1..=Camera::MOST;
-        if !pixels.contains(&self.height) || self.width.is_some_and(|w| !pixels.contains(&w)) {
-            return Err(Error::Invalid(format!("--height, --width: 1 to {} pixels", Camera::MOST)));
-        }
-        if !(1..=1 << 16).contains(&self.samples) {
-            return Err(Error::Invalid("--samples: 1 to 65536 rays per pixel".into()));
-        }
-        if !(self.exposure > 0.0 && self.exposure.is_finite()) {
-            return Err(Error::Invalid(format!("--exposure {}: must be a positive finite number", self.exposure)));
-        }
+        self.check_numbers()?;
         let gather = self.rays.settings()?;
-        let baked = match open_bake(&self.file, &self.scene)? {
-            None if !self.reference && !self.local => Some(BakedVolume::read(&self.file)?),
-            found => found,
-        };
-        gather.zip(baked.as_ref()).map_or(Ok(()), |(g, b)| g.check(b)).map_err(|e| e.in_file(&self.file))?;
-        let loaded = match baked {
-            Some(_) => None,
-            None => Some(load(&self.file, &self.scene)?.scene),
-        };
-        let scene = baked.as_ref().map(|b| &b.scene).or(loaded.as_ref()).expect("one of the two was read");
+        let source = self.read(gather)?;
+        let scene = source.scene();
         let isovalue = match &self.field {
             None => self.isovalue,
             Some(name) => first_isovalue(scene, name, self.isovalue).map_err(|e| e.in_file(&self.file))?,
         };
-        let mut camera = Camera::facing(scene, self.height);
-        camera.fov = self.fov;
-        if let Some(width) = self.width {
-            camera.size[0] = width;
-        }
-        let [width, height] = camera.size;
-        if !pixels.contains(&width) {
-            return Err(Error::Invalid(format!(
-                "--height {height}: of the box's proportions the picture would be {width} pixels wide, more than {}; give \
-                 --width, or lower --height",
-                Camera::MOST
-            )));
-        }
-        if let Some(up) = triple(self.up.as_ref(), "up")? {
-            camera.up = up;
-        }
-        let [lo, hi] = scene.bounds();
-        if let Some(eye) = triple(self.eye.as_ref(), "eye")? {
-            (camera.eye, camera.target) = (eye, 0.5 * (lo + hi));
-        }
-        if let Some(target) = triple(self.target.as_ref(), "target")? {
-            camera.target = target;
-        }
-        let exposure = baked.as_ref().map_or_else(|| scene.exposure(), |b| b.exposure);
+        let camera = self.camera(scene)?;
+        let exposure = source.exposure() * self.exposure;
         let exr = self.output.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr"));
         #[allow(clippy::cast_possible_truncation, reason = "a brightness")]
-        let brightness = (exposure * self.exposure) as f32;
-        let storable = exr || (brightness > 0.0 && brightness.is_finite());
-        if !storable {
+        let brightness = exposure as f32;
+        if !exr && !(brightness > 0.0 && brightness.is_finite()) {
             return Err(Error::Invalid(format!(
-                "--exposure {:?}: times {exposure:?}, the exposure of {}, it is no brightness that a .png can have; give \
-                 another",
+                "--exposure {:?}: times {:?}, the exposure of {}, it is no brightness that a .png can have; give another",
                 self.exposure,
+                source.exposure(),
                 self.file.display()
             )));
         }
-        if self.reference && scene.fields() > 1 && scene.policy() == Policy::Independent {
-            return Err(Error::not_supported(
-                &self.file,
-                "policy = \"independent\": paths see all volumes; a picture of one needs a scene of one",
-            ));
-        }
-        let rendered = if self.reference {
-            baked.as_ref().map_or(Ok(()), BakedVolume::whole).map_err(|e| e.in_file(&self.file))?;
-            let picture = picture(scene, isovalue, &camera, self.samples, self.trilinear, &device()?, progress)?;
-            Rendered { picture, unbaked: 0.0, rays: 0 }
-        } else {
-            let shading = match &baked {
-                Some(baked) if !self.local => Shading::Baked(baked, gather),
-                _ => Shading::Local(exposure),
-            };
-            render(scene, isovalue, &camera, shading, self.samples, &device()?, progress)?
-        };
-        let exposure = exposure * self.exposure;
+        let rendered = self.draw(&source, isovalue, &camera, gather, progress)?;
         if exr {
-            let shading = match () {
-                () if self.trilinear => "path traced, trilinear",
-                () if self.reference => "path traced",
-                () if self.local || baked.is_none() => "local",
-                () if gather.is_some() => "baked, by rays",
-                () => "baked",
-            };
-            let vector = |v: DVec3| format!("{:?},{:?},{:?}", v.x, v.y, v.z);
-            let attributes = [
-                ("isolume".to_owned(), format!("{} ({})", env!("CARGO_PKG_VERSION"), env!("ISOLUME_COMMIT"))),
-                ("source".to_owned(), self.file.display().to_string()),
-                ("isovalue".to_owned(), self.isovalue.to_string()),
-                ("field".to_owned(), self.field.clone().unwrap_or_else(|| scene.name.clone())),
-                ("shading".to_owned(), shading.to_owned()),
-                ("eye".to_owned(), vector(camera.eye)),
-                ("target".to_owned(), vector(camera.target)),
-                ("up".to_owned(), vector(camera.up)),
-                ("fov".to_owned(), camera.fov.to_string()),
-                ("exposure".to_owned(), exposure.to_string()),
-                ("samplesPerPixel".to_owned(), self.samples.to_string()),
-                ("renderTimeSeconds".to_owned(), begun.elapsed().as_secs_f64().to_string()),
-                ("report".to_owned(), baked.as_ref().map_or_else(|| "null".into(), |b| b.report.to_string())),
-            ];
+            let mut attributes = self.attributes(&source, &camera, gather);
+            attributes.push(("renderTimeSeconds".into(), begun.elapsed().as_secs_f64().to_string()));
             rendered.picture.write_exr(&self.output, &attributes)?;
         } else {
             rendered.picture.write_png(&self.output, brightness)?;
@@ -222,5 +175,117 @@ impl Render {
             );
         }
         Ok(())
+    }
+
+    fn check_numbers(&self) -> Result<()> {
+        let pixels = 1..=Camera::MOST;
+        if !pixels.contains(&self.height) || self.width.is_some_and(|w| !pixels.contains(&w)) {
+            return Err(Error::Invalid(format!("--height, --width: 1 to {} pixels", Camera::MOST)));
+        }
+        if !(1..=1 << 16).contains(&self.samples) {
+            return Err(Error::Invalid("--samples: 1 to 65536 rays per pixel".into()));
+        }
+        if !(self.exposure > 0.0 && self.exposure.is_finite()) {
+            return Err(Error::Invalid(format!("--exposure {}: must be a positive finite number", self.exposure)));
+        }
+        Ok(())
+    }
+
+    fn read(&self, gather: Option<FinalGatherSettings>) -> Result<Source> {
+        let baked = match open_bake(&self.file, &self.scene)? {
+            None if !self.reference && !self.local => Some(BakedVolume::read(&self.file)?),
+            found => found,
+        };
+        let Some(baked) = baked else { return Ok(Source::Unbaked(load(&self.file, &self.scene)?.scene)) };
+        gather.map_or(Ok(()), |g| g.check(&baked)).map_err(|e| e.in_file(&self.file))?;
+        Ok(Source::Bake(baked))
+    }
+
+    fn camera(&self, scene: &Scene) -> Result<Camera> {
+        let mut camera = Camera::facing(scene, self.height);
+        camera.fov = self.fov;
+        if let Some(width) = self.width {
+            camera.size[0] = width;
+        }
+        let [width, height] = camera.size;
+        if !(1..=Camera::MOST).contains(&width) {
+            return Err(Error::Invalid(format!(
+                "--height {height}: of the box's proportions the picture would be {width} pixels wide, more than {}; give \
+                 --width, or lower --height",
+                Camera::MOST
+            )));
+        }
+        if let Some(up) = triple(self.up.as_ref(), "up")? {
+            camera.up = up;
+        }
+        let [lo, hi] = scene.bounds();
+        if let Some(eye) = triple(self.eye.as_ref(), "eye")? {
+            (camera.eye, camera.target) = (eye, 0.5 * (lo + hi));
+        }
+        if let Some(target) = triple(self.target.as_ref(), "target")? {
+            camera.target = target;
+        }
+        Ok(camera)
+    }
+
+    fn draw(
+        &self,
+        source: &Source,
+        isovalue: f64,
+        camera: &Camera,
+        gather: Option<FinalGatherSettings>,
+        progress: Progress,
+    ) -> Result<Rendered> {
+        let scene = source.scene();
+        if !self.reference {
+            let shading = match source {
+                Source::Bake(baked) if !self.local => Shading::Baked(baked, gather),
+                _ => Shading::Local(source.exposure()),
+            };
+            return render(scene, isovalue, camera, shading, self.samples, &device()?, progress);
+        }
+        if scene.fields() > 1 && scene.policy() == Policy::Independent {
+            return Err(Error::not_supported(
+                &self.file,
+                "policy = \"independent\": paths see all volumes; a picture of one needs a scene of one",
+            ));
+        }
+        source.baked().map_or(Ok(()), BakedVolume::whole).map_err(|e| e.in_file(&self.file))?;
+        let picture = picture(scene, isovalue, camera, self.samples, self.trilinear, &device()?, progress)?;
+        Ok(Rendered { picture, unbaked: 0.0, rays: 0 })
+    }
+
+    /// What an .exr says of itself.
+    fn attributes(
+        &self,
+        source: &Source,
+        camera: &Camera,
+        gather: Option<FinalGatherSettings>,
+    ) -> Vec<(String, String)> {
+        let baked = source.baked();
+        let shading = match () {
+            () if self.trilinear => "path traced, trilinear",
+            () if self.reference => "path traced",
+            () if self.local || baked.is_none() => "local",
+            () if gather.is_some() => "baked, by rays",
+            () => "baked",
+        };
+        let vector = |v: DVec3| format!("{:?},{:?},{:?}", v.x, v.y, v.z);
+        [
+            ("isolume", format!("{} ({})", env!("CARGO_PKG_VERSION"), env!("ISOLUME_COMMIT"))),
+            ("source", self.file.display().to_string()),
+            ("isovalue", self.isovalue.to_string()),
+            ("field", self.field.clone().unwrap_or_else(|| source.scene().name.clone())),
+            ("shading", shading.to_owned()),
+            ("eye", vector(camera.eye)),
+            ("target", vector(camera.target)),
+            ("up", vector(camera.up)),
+            ("fov", camera.fov.to_string()),
+            ("exposure", (source.exposure() * self.exposure).to_string()),
+            ("samplesPerPixel", self.samples.to_string()),
+            ("report", baked.map_or_else(|| "null".into(), |b| b.report.to_string())),
+        ]
+        .map(|(key, value)| (key.to_owned(), value))
+        .into()
     }
 }

@@ -37,7 +37,7 @@ impl UserHits16 {
 /// Primitives that intersect rays themselves.
 ///
 /// Embree calls these functions from C, on any thread, several at a time. **They must not panic:** a panic cannot
-/// cross C, so that it aborts the process (the trampolines are `extern "C"`, which aborts on unwinding since
+/// cross C, so that it aborts the process (those in `callbacks` are `extern "C"`, which aborts on unwinding since
 /// Rust 1.81). They must not query a scene of their own geometry without end, and should not allocate: a query
 /// of a scene with one primitive costs 10 to 25 ns besides what they do.
 ///

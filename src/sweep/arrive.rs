@@ -5,7 +5,7 @@ use super::directions::Layout;
 use super::ends::Ends;
 use super::flats::{Flats, Stop, below, fill_column, shapes, sinks};
 use super::gaps::Crossing;
-use super::gather::{Pass, local_bounds};
+use super::gather::{Bounce, Pass, local_bounds};
 use super::half::{Half4, colour, decode};
 use super::incoming::Arrivals;
 use super::pack::{LANES, OUTSIDE, Pack, Plan};
@@ -138,16 +138,8 @@ pub(super) struct Walls<'a> {
 
 impl<'a> Walls<'a> {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few thousand lines")]
-    pub(super) fn new(
-        pass: &Pass,
-        plan: &'a Plan,
-        ends: &'a Ends,
-        flats: &'a Flats,
-        side: Side,
-        families: usize,
-        unit: f32,
-    ) -> Self {
-        let shear = &plan.shear;
+    pub(super) fn new(pass: &Pass, bounce: &Bounce<'a>, side: Side, plan: &'a Plan, ends: &'a Ends) -> Self {
+        let (shear, flats) = (&plan.shear, bounce.flats);
         let [lo, hi] = local_bounds(pass.scene);
         let far = pass.scene.lattice().far();
         let margin = (lo.min(far - hi)).min_element() < -1e-6;
@@ -166,7 +158,7 @@ impl<'a> Walls<'a> {
         let none = flats.none();
         // Only ratios of weights count.
         let area = shear.area / pass.scene.lattice().unit().powi(2);
-        let line = 4.0 * std::f64::consts::PI / (2 * families) as f64 * area;
+        let line = 4.0 * std::f64::consts::PI / (2 * bounce.lines.len()) as f64 * area;
         let every = |strides: [f64; 2]| Reporting::new(strides.map(|s| if none { 0 } else { s as isize }), phase, line);
         let (rows, columns) = (range(1), range(0));
         let [across, along] = [rows, columns].map(|(least, most)| (most - least + 1) as f64);
@@ -181,10 +173,10 @@ impl<'a> Walls<'a> {
             near: every(near),
             past: every(past),
             capped: super::flats::capped(pass.scene),
-            primary: side == pass.primary,
+            primary: side == pass.sides[0],
             margin,
             caps: pass.scene.polygons().len() as u32,
-            unit,
+            unit: 1.0 / bounce.light.unit,
         }
     }
 

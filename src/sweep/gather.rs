@@ -14,6 +14,7 @@ use super::lit_rows::LitRows;
 use super::normals::decode;
 use super::pack::{LANES, Pack, Plan};
 use super::planes::{Planes, Spare};
+use super::reflect::Reflected;
 use super::runs::Runs;
 use super::scan::{Light, Way};
 use super::simd::prefetch;
@@ -31,8 +32,8 @@ pub(super) struct Pass<'a> {
     /// Where polygons stand, and what Ω's faces touch.
     pub standing: &'a [Standing],
     pub touching: Touching<'a>,
-    /// The side that owns lines without samples.
-    pub primary: Side,
+    /// The sides that receive; the first owns lines without samples.
+    pub sides: &'a [Side],
     /// The instruction set of the hot loops.
     pub isa: Isa,
     /// Memory to use again.
@@ -60,6 +61,30 @@ pub(super) struct Workspace {
     ends: [RowEnds; 2],
     /// Slice and place along v of the rows of nodes beside a row of lines.
     nodes: Vec<[usize; 2]>,
+}
+
+/// The light of a bounce, and the families of lines that bring it.
+pub(super) struct Bounce<'a> {
+    /// Each goes both ways.
+    pub lines: &'a [Shear],
+    /// As [`Sides::goes_on`].
+    pub goes_on: bool,
+    /// What nodes reflect.
+    pub light: &'a Reflected,
+    /// What flats reflect; they receive too.
+    pub flats: &'a Flats,
+}
+
+/// What the families of one order of memory share that bring light to one side.
+struct Receivers<'a> {
+    side: Side,
+    /// What this side's nodes reflect.
+    b: &'a [Half4],
+    /// What the other side's do; nothing if that is dark.
+    back: &'a [Half4],
+    normals: &'a [u32],
+    touched: &'a Touched<'a>,
+    rows: Rows<'a>,
 }
 
 /// What one family of lines reads.
@@ -95,22 +120,20 @@ impl Family<'_> {
 }
 
 impl Pass<'_> {
-    /// Irradiance of every node of `side` from the radiance `b` of the nodes' sides (times `scale`), this one's first,
-    /// and the flats, along all `lines` and both their directions; beyond the last lines it `goes_on` or not. Flats
-    /// receive too. `tick` is asked before every family; false stops with what is done.
-    #[allow(clippy::too_many_arguments, reason = "one caller")]
+    /// Irradiance of every node of side `n` of [`Pass::sides`] by a bounce; the flats' is added to `incoming`. `tick` is
+    /// asked before every family; false stops with what is done, and is returned beside it.
     pub(super) fn gather(
         &self,
-        side: Side,
-        (lines, goes_on): (&[Shear], bool),
-        b: [&[Half4]; 2],
-        scale: f32,
-        flats: &Flats,
+        bounce: &Bounce,
+        n: usize,
         incoming: &mut Incoming,
         tick: &mut dyn FnMut() -> bool,
     ) -> (Planes, bool) {
+        let side = self.sides[n];
+        let of = |n: usize| bounce.light.b.get(n).map_or(&[][..], |b| &b[..]);
+        let lines = bounce.lines;
         let mut e = self.spare.black(self.geometry.places());
-        let touched = self.touching.now(self.geometry, flats, side);
+        let touched = self.touching.now(self.geometry, bounce.flats, side);
         let split = lines.partition_point(|s| !s.layout.transposed);
         let mut complete = true;
         // Walls receive what one family brought while the next is under way.
@@ -119,16 +142,21 @@ impl Pass<'_> {
         for (transposed, some) in [(true, &lines[split..]), (false, &lines[..split])] {
             let Some(any) = some.first() else { continue };
             let turned = transposed.then(|| self.geometry.transposed_normals(self.spare));
-            let normals = turned.as_ref().unwrap_or(&self.geometry.normals);
-            let rows = node_rows(&mut e, self.geometry.lit_rows_of(&any.layout));
+            let receivers = Receivers {
+                side,
+                b: of(n),
+                back: of(1 - n),
+                normals: turned.as_ref().unwrap_or(&self.geometry.normals),
+                touched: &touched,
+                rows: node_rows(&mut e, self.geometry.lit_rows_of(&any.layout)),
+            };
             for shear in some {
                 complete = complete && tick();
                 if complete {
-                    let walls = ((flats, &touched), &mut *incoming, arrivals);
-                    arrivals = self.family((side, shear, lines.len(), goes_on), normals, (b, scale), &rows, walls);
+                    arrivals = self.family(bounce, &receivers, shear, incoming, arrivals);
                 }
             }
-            drop(rows);
+            drop(receivers);
             if let Some(turned) = turned {
                 self.spare.keep_numbers(turned);
                 e = self.geometry.untransposed(e, self.spare);
@@ -168,27 +196,28 @@ impl Pass<'_> {
     /// does.
     fn family(
         &self,
-        (side, shear, lines, goes_on): (Side, &Shear, usize, bool),
-        normals: &[u32],
-        ([b, back], scale): ([&[Half4]; 2], f32),
-        rows: &Rows,
-        ((flats, touched), incoming, before): ((&Flats, &Touched), &mut Incoming, Vec<Arrivals>),
+        bounce: &Bounce,
+        receivers: &Receivers,
+        shear: &Shear,
+        incoming: &mut Incoming,
+        before: Vec<Arrivals>,
     ) -> Vec<Arrivals> {
+        let (flats, side, lines, scale) = (bounce.flats, receivers.side, bounce.lines.len(), bounce.light.unit);
         let sign = if side == Side::Lower { 1.0 } else { -1.0 };
         let plan = Plan::new(*shear, sign);
         let ends = Ends::new(self.scene, (flats, side), shear, self.standing);
-        let walls = arrive::Walls::new(self, &plan, &ends, flats, side, lines, 1.0 / scale);
+        let walls = arrive::Walls::new(self, bounce, side, &plan, &ends);
         let share = 4.0 * std::f64::consts::PI / (2 * lines) as f64 / f64::from(scale);
         let family = Family {
             plan: &plan,
-            source: self.geometry.source(&shear.layout, side, b),
-            back,
-            normals,
+            source: self.geometry.source(&shear.layout, side, receivers.b),
+            back: receivers.back,
+            normals: receivers.normals,
             ends: &ends,
             flats,
-            touched,
+            touched: receivers.touched,
             way: Way { strict: side == Side::Higher, sign, capped: capped(self.scene) },
-            goes_on,
+            goes_on: bounce.goes_on,
             omega: (shear.omega * share).as_vec3().to_array(),
             walls,
         };
@@ -200,7 +229,7 @@ impl Pass<'_> {
         let threads = rayon::current_num_threads();
         let runs = Runs::new(lines.len(), threads);
         let shares = || {
-            let share = |own| self.rows_of_lines(&family, (&lines, &arrivals), rows, (&runs, own));
+            let share = |own| self.rows_of_lines(&family, (&lines, &arrivals), &receivers.rows, (&runs, own));
             (0..threads).into_par_iter().with_max_len(1).for_each(share);
         };
         rayon::join(shares, || incoming.receive(self.isa, &before));

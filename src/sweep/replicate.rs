@@ -9,7 +9,7 @@
 use super::directions::{self, Shear};
 use super::faces::Touching;
 use super::flats::Flats;
-use super::gather::Pass;
+use super::gather::{Bounce, Pass};
 use super::planes::{HalfPlanes, NodeLight, Planes};
 use super::reflect::{Reflected, SHARPENING};
 use super::settling::Settling;
@@ -150,15 +150,14 @@ impl Run<'_> {
     }
 
     /// Bounces: coarse passes until what is missing is known and small, then finer ones. Goes on behind the passes of
-    /// `from`, whose light the flats hold. Returns the indirect irradiance per side, and false if `progress` stopped
-    /// it.
+    /// `from`, whose light the flats hold. Returns the indirect irradiance per side; `None` if `progress` stopped it.
     pub(super) fn replicate(
         &self,
         state: &mut State,
         from: Option<Passes>,
         flats: &mut Flats,
         progress: &dyn Fn(f64) -> bool,
-    ) -> (Vec<Planes>, bool) {
+    ) -> Option<Vec<Planes>> {
         let s = self.settings;
         if from.is_none() && self.saved.due() {
             self.saved.save(0, || state.bytes(None, flats));
@@ -173,7 +172,7 @@ impl Run<'_> {
             geometry: self.geometry,
             standing: self.slits.standing(),
             touching: Touching::new(self.scene, self.geometry, flats),
-            primary: self.sides[0],
+            sides: &self.sides,
             isa: self.isa,
             spare: self.spare,
             workspaces: Mutex::default(),
@@ -199,37 +198,24 @@ impl Run<'_> {
                 let passes = bounce as f64 - 1.0 + f64::from(family) / total as f64;
                 progress(passes / (bounce as f64 + more))
             };
-            let mut by_few = None;
-            let mut complete = true;
+            let by_few = if few.is_empty() {
+                None
+            } else {
+                let Some(received) = self.bounce(&pass, &now.light, (&few, false), flats, &mut ask) else {
+                    self.stop(state, &now, flats);
+                    return None;
+                };
+                let nodes: Vec<_> = received.iter().map(|e| HalfPlanes::new(e, 1.0, None)).collect();
+                self.spare.keep(received.into_iter().flatten());
+                Some((nodes, flats.indirect()))
+            };
             // What goes on linearly may grow from bounce to bounce where light is rough, and what is nearest cannot:
             // until light has settled, that does.
-            for (lines, goes_on) in [(&few, false), (&lines, kind != Kind::Coarse)] {
-                if lines.is_empty() {
-                    continue;
-                }
-                if !indirect.is_empty() {
-                    let nodes: Vec<_> = indirect.iter().map(|e| HalfPlanes::new(e, 1.0, None)).collect();
-                    by_few = Some((nodes, flats.indirect()));
-                    self.spare.keep(indirect.drain(..).flatten());
-                }
-                let mut incoming = flats.open();
-                for (n, &side) in self.sides.iter().enumerate() {
-                    // Each and, where there are two, the other.
-                    let b = [n, 1 - n].map(|n| now.light.b.get(n).map_or(&[][..], |b| &b[..]));
-                    let (e, all) =
-                        pass.gather(side, (lines, goes_on), b, now.light.unit, flats, &mut incoming, &mut ask);
-                    complete &= all;
-                    indirect.push(e);
-                }
-                if !complete {
-                    // Half a pass is not kept, and may be as large as what is.
-                    self.spare.keep(indirect.drain(..).flatten());
-                    self.saved.save(0, || state.bytes(Some(&now), flats));
-                    state.see(&now);
-                    return (Vec::new(), false);
-                }
-                flats.close(&incoming);
-            }
+            let goes_on = kind != Kind::Coarse;
+            let Some(received) = self.bounce(&pass, &now.light, (&lines, goes_on), flats, &mut ask) else {
+                self.stop(state, &now, flats);
+                return None;
+            };
             now.bounce = bounce;
             state.counts.families += total as u64;
             state.counts.gather_rays += state.counts.valid * total as u64;
@@ -246,34 +232,77 @@ impl Run<'_> {
                 flats.reflect(true);
             }
             if now.late == LATE || bounce == s.max_bounces {
+                indirect = received;
                 break;
             }
-            let mut light = vec![(NodeLight::Half(&state.total.direct), 1.0), (NodeLight::Full(&indirect), 1.0)];
-            if !now.defect.is_empty() {
-                light.push((NodeLight::Signed(&now.defect), 1.0));
-            }
-            if settles {
-                let memory = std::mem::take(&mut now.before);
-                // Where light is rough, along few directions, sharpening may make each bounce brighter than the last.
-                let sharpening = if now.settling.grows() { 0.0 } else { SHARPENING };
-                let relaxed = Some((&now.light, omega));
-                let (reflected, sums) = self.mirror.reflect(flats, &light, memory, relaxed, sharpening);
-                now.before = std::mem::replace(&mut now.light, reflected);
-                now.settling.push(sums);
-            } else {
-                now.before = Reflected::default();
-                let memory = std::mem::take(&mut now.light);
-                now.light = self.mirror.reflect(flats, &light, memory, None, SHARPENING).0;
-            }
+            self.reflect(state, &mut now, flats, &received, settles.then_some(omega));
             if let Some((nodes, flats_by_few)) = by_few {
                 // (T − T₁) x₁. [Stetter78]
-                now.defect = nodes.into_iter().zip(&indirect).map(|(few, all)| few.short_of(all)).collect();
+                now.defect = nodes.into_iter().zip(&received).map(|(few, all)| few.short_of(all)).collect();
                 flats.correct(flats_by_few);
                 (now.corrected, now.late) = (true, 0);
             }
-            self.spare.keep(indirect.drain(..).flatten());
+            self.spare.keep(received.into_iter().flatten());
         }
         state.see(&now);
-        (indirect, true)
+        Some(indirect)
+    }
+
+    /// Irradiance of each side's nodes by one bounce along all `lines`, beyond whose last ones it `goes_on` linearly or
+    /// not; the flats hold what they received. `None` if `ask` stopped it.
+    fn bounce(
+        &self,
+        pass: &Pass,
+        light: &Reflected,
+        (lines, goes_on): (&[Shear], bool),
+        flats: &mut Flats,
+        ask: &mut dyn FnMut() -> bool,
+    ) -> Option<Vec<Planes>> {
+        let bounce = Bounce { lines, goes_on, light, flats };
+        let mut incoming = flats.open();
+        let (received, complete): (Vec<_>, Vec<_>) =
+            (0..self.sides.len()).map(|n| pass.gather(&bounce, n, &mut incoming, ask)).unzip();
+        if complete.contains(&false) {
+            // Half a pass is not kept, and may be as large as what is.
+            self.spare.keep(received.into_iter().flatten());
+            return None;
+        }
+        flats.close(&incoming);
+        Some(received)
+    }
+
+    /// Keeps the passes that were done before one was stopped.
+    fn stop(&self, state: &mut State, now: &Passes, flats: &Flats) {
+        self.saved.save(0, || state.bytes(Some(now), flats));
+        state.see(now);
+    }
+
+    /// What nodes and flats reflect of direct light and what nodes `received`; while light settles, mixed with the
+    /// bounces before by Chebyshev's `omega`.
+    fn reflect(
+        &self,
+        state: &State,
+        now: &mut Passes,
+        flats: &mut Flats,
+        received: &[Planes],
+        omega: Option<[f32; 3]>,
+    ) {
+        let mut light = vec![(NodeLight::Half(&state.total.direct), 1.0), (NodeLight::Full(received), 1.0)];
+        if !now.defect.is_empty() {
+            light.push((NodeLight::Signed(&now.defect), 1.0));
+        }
+        if let Some(omega) = omega {
+            let memory = std::mem::take(&mut now.before);
+            // Where light is rough, along few directions, sharpening may make each bounce brighter than the last.
+            let sharpening = if now.settling.grows() { 0.0 } else { SHARPENING };
+            let relaxed = Some((&now.light, omega));
+            let (reflected, sums) = self.mirror.reflect(flats, &light, memory, relaxed, sharpening);
+            now.before = std::mem::replace(&mut now.light, reflected);
+            now.settling.push(sums);
+        } else {
+            now.before = Reflected::default();
+            let memory = std::mem::take(&mut now.light);
+            now.light = self.mirror.reflect(flats, &light, memory, None, SHARPENING).0;
+        }
     }
 }

@@ -1,0 +1,149 @@
+//! Direct light on flats: along segments from each of their texels.
+
+use super::Direct;
+use super::staircases::Staircases;
+use crate::flat;
+use crate::flattened::Side;
+use crate::luminaire::{point_term, unoccluded};
+use crate::rng::{Rng, Stage};
+use crate::sweep::blockers::Blockers;
+use crate::sweep::flats::{self, Flats, capped};
+use crate::sweep::open_share::OpenShare;
+use crate::sweep::pack::LANES;
+use crate::sweep::segments::Segments;
+use crate::sweep::solid::FREE;
+use glam::DVec3;
+use rayon::prelude::*;
+
+/// The random stream of a flat's texel for one luminaire (below 2¹⁶) and replicate (below 2⁸): of flats below 2¹⁵ and
+/// texels below 2²⁴ each has one of its own, which nodes do not use.
+fn stream(replicate: usize, luminaire: u32, flat: usize, texel: usize) -> u64 {
+    let [replicate, flat, texel] = [replicate, flat, texel].map(|n| n as u64);
+    let low = u64::from(luminaire) | (texel & 0xffff) << 16 | replicate << 32 | (texel >> 16) << 40;
+    low ^ flat << 48 ^ 1 << 63
+}
+
+impl Direct<'_> {
+    /// Direct light of one luminaire on all flats: every texel looks from a point of its own along the segment to each
+    /// luminaire point; it is lit at the isovalues above the greatest h there (and, inside solids, up to the least).
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the isovalues")]
+    pub(super) fn light_flats(&self, flats: &mut Flats, number: u32, share: &OpenShare) {
+        let (scene, geometry, clearance, sides, part) =
+            (self.scene, self.geometry, self.clearance, self.sides, self.points);
+        let lattice = scene.lattice();
+        let light = &scene.polygons()[number as usize];
+        let points = part.on(light, number);
+        let (nc, axis) = (flats.isovalues, flats.axis);
+        let corrections = [Side::Lower, Side::Higher]
+            .map(|side| flats.centres.iter().map(|&c| share.correction(side, c)).collect::<Vec<f64>>());
+        let caps = scene.polygons().len();
+        let [lower, higher] = [Side::Lower, Side::Higher].map(|s| sides.contains(&s));
+        let higher = higher && !capped(scene);
+        let far = lattice.far();
+        let h = |p: DVec3| {
+            if clearance.is_none() || geometry.reaches(p) { scene.field.value(p) as f32 } else { f32::NEG_INFINITY }
+        };
+        let (textures, others) = flats.textures.split_at_mut(flats.count);
+        for (id, texture) in textures.iter_mut().enumerate() {
+            let Some(texture) = texture else { continue };
+            // What the higher side sees, if the sides are kept apart.
+            let other = others.get_mut(id).and_then(Option::as_mut);
+            let mut others: Vec<_> = other.map_or(Vec::new(), |t| t.direct.chunks_mut(3 * nc).map(Some).collect());
+            others.resize_with(texture.direct.len() / (3 * nc), || None);
+            let solid = flats.solid.get(id).and_then(Option::as_ref);
+            let flat = flat::flat(scene, id).expect("textured flats exist");
+            let receiver = (id < caps).then(|| u32::try_from(id).expect("fewer than 2¹⁶ polygons"));
+            let corners: Vec<DVec3> = [[0., 0.], [1., 0.], [0., 1.], [1., 1.]].map(|uv| flat.at(uv)).to_vec();
+            let blockers = Blockers::new(scene, number, &corners);
+            let [nu, nv, _] = texture.dims;
+            let texels = texture.direct.par_chunks_mut(3 * nc).zip(others).enumerate().with_max_len(32);
+            texels.for_each(|(texel, (out, other))| {
+                let (i, j) = (texel % nu, texel / nu);
+                let place = |a: f64, b: f64| flat.at([(i as f64 + a) / nu as f64, (j as f64 + b) / nv as f64]);
+                let e = unoccluded(light, place(0.5, 0.5), flat.normal);
+                if e == 0.0 || light.is_left(number, flat.departure) {
+                    return;
+                }
+                let stream = stream(part.replicate, number, id, texel);
+                let mut rng = Rng::stream(part.seed, Stage::Sweep, stream);
+                // Number of isovalue texels at or below h.
+                let below = |h: f32| flats::below(&axis, nc, h);
+                // Σ g of what begins at each isovalue texel on the lower side, and of what ends before it on the higher
+                // one.
+                let (mut lit, mut all) = (Staircases::new(nc), Staircases::new(nc));
+                for points in points.chunks(LANES) {
+                    let mut segments = Segments::NONE;
+                    let mut seen = [(0.0, 0); LANES];
+                    for (lane, &y) in points.iter().enumerate() {
+                        let [a, b] = rng.unit2();
+                        let x = place(a, b);
+                        let g = point_term(x, flat.normal, y, light.normal());
+                        if g == 0.0 {
+                            continue;
+                        }
+                        let (lx, ly) = (lattice.to_index(x), lattice.to_index(y));
+                        let here = if lattice.holds(lx) && id < caps && !capped(scene) { below(h(lx)) } else { 0 };
+                        all.add(g, here, here);
+                        if blockers.block(number, receiver, ly, lx) {
+                            continue;
+                        }
+                        if id >= caps {
+                            lit.add(g, 0, 0);
+                            continue;
+                        }
+                        segments.set(lane, lattice, h, ly, lx);
+                        seen[lane] = (g, here);
+                    }
+                    let seen = seen.iter().enumerate().filter(|(_, s)| s.0 != 0.0);
+                    if geometry.has_gaps() {
+                        for (lane, &(g, here)) in seen {
+                            let y = lattice.to_index(points[lane]);
+                            let caps = [y.clamp(DVec3::ZERO, far) != y, true].map(|outside| outside && capped(scene));
+                            lit.add_beside(g, here, &segments.ranges(scene.field.samples(), lane, caps), below);
+                        }
+                        continue;
+                    }
+                    self.isa.extrema(scene.field.samples(), &mut segments, clearance);
+                    for (lane, &(g, here)) in seen {
+                        let open = below(segments.most[lane]).max(here);
+                        lit.add(g, open, below(segments.least[lane]).min(open));
+                    }
+                }
+                let even = [1.0; 2].map(|x| vec![x; nc]);
+                let rgb = (light.emission * e).to_array();
+                let add = |out: &mut [f32], [lower, higher]: [bool; 2]| {
+                    let lit = lit.sums(lower, higher, if id < caps { &corrections } else { &even });
+                    let all = all.sums(lower, higher, &even);
+                    for c in 0..3 {
+                        for t in (0..nc).filter(|&t| all[t] > 0.0) {
+                            out[c * nc + t] += (rgb[c] * lit[t].max(0.0) / all[t]) as f32;
+                        }
+                    }
+                };
+                let apart = solid.is_some_and(|solid| solid[texel] != FREE);
+                let [own, others] = if apart { [[true, false], [false, true]] } else { [[lower, higher]; 2] };
+                add(out, own);
+                other.into_iter().for_each(|out| add(out, others));
+            });
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn texels_have_streams_of_their_own() {
+        let all = [0, 1, 7].into_iter().flat_map(|replicate| {
+            [0, 1, 32_767].into_iter().flat_map(move |flat| {
+                let texels = [0, 1, 2, 65_535, 65_536, 65_537, 131_072, (1 << 22) - 1];
+                let of = move |texel| [0, 1, 300].map(|luminaire| stream(replicate, luminaire, flat, texel));
+                texels.into_iter().flat_map(of)
+            })
+        });
+        let all: Vec<u64> = all.collect();
+        let different: std::collections::BTreeSet<u64> = all.iter().copied().collect();
+        assert_eq!(different.len(), all.len());
+    }
+}
