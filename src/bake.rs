@@ -119,6 +119,7 @@ pub struct BakeReport {
 }
 
 /// A finished bake.
+#[derive(Clone, Debug)]
 pub struct Bake {
     /// The grid's lattice.
     pub lattice: Lattice,
@@ -176,8 +177,8 @@ fn stages(checkpoint: Option<&Checkpoint>, first: u32) -> [checkpoint::Stage<'_>
 /// Illuminates every isosurface of the sweep.
 ///
 /// # Errors
-/// `Invalid` if no level set of the sweep has a gradient anywhere, `NotSupported` for a scene the engine cannot light,
-/// `Embree`, or `Interrupted`.
+/// `Invalid` if no level set of the sweep has a gradient anywhere, and for values of settings, surfaces and polygons
+/// out of range, `NotSupported` for a scene the engine cannot light, `Embree`, or `Interrupted`.
 pub fn bake(scene: &Scene, settings: &BakeSettings, device: &Device, progress: Progress) -> Result<Bake> {
     bake_resumable(scene, settings, device, progress, None)
 }
@@ -212,6 +213,8 @@ pub fn bake_fields(
     progress: Progress,
     checkpoint: Option<&Checkpoint>,
 ) -> Result<Vec<Bake>> {
+    settings.check()?;
+    scene.check()?;
     supported(scene, settings)?;
     let digest = digest(&job(scene, settings, &device.version()));
     let job = |number: u32| -> Result<Job> {

@@ -79,7 +79,7 @@ pub(crate) const LEAST_UNANIMOUS: u32 = 64;
 fn budget(scene: &Scene, open: f64, shadow_rays: u32) -> u32 {
     let mut rays = shadow_rays;
     let mut full = 0.5 * scene.reference_irradiance();
-    while rays > LEAST_RAYS && rays > shadow_rays / 8 && open < full {
+    while rays / 2 >= LEAST_RAYS && rays > shadow_rays / 8 && open < full {
         (rays, full) = (rays / 2, full / 2.0);
     }
     rays

@@ -108,7 +108,10 @@ impl<'a, T: Tracer> FinalGather<'a, T> {
         let Self { baked, tracer, settings, .. } = *self;
         let scene = &baked.scene;
         let p = receiver.position.as_dvec3();
-        if scene.covers(scene.lattice().to_world(p)) {
+        // A luminaire's own front is what covers.
+        let shines = |id: u32| scene.polygons()[id as usize].emission != DVec3::ZERO;
+        let front = matches!(receiver.departure, Departure::Polygon(id) if shines(id));
+        if !front && scene.covers(scene.lattice().to_world(p)) {
             return Some(Estimate { mean: emission, ..Estimate::default() });
         }
         let (rest, gathered) = match settings.gather_rays {

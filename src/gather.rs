@@ -54,7 +54,7 @@ const CORNERS: usize = 4;
 /// One of so many of a receiver's rays that land so goes on, for all of them: it corrects what the cache says, which is
 /// the mean of the rays that it stands for but for a part that light in corners adds. \[Arvo90\]
 const SHARE: u64 = 8;
-/// Fewest rays that show a receiver to be sealed off from all that is far.
+/// A receiver's first rays, which show whether it is sealed off from all that is far.
 const PILOT: u32 = 16;
 /// A receiver whose first rays all end on level sets within this many cells is in a cavity, which may have closed or
 /// opened between the isovalues that its light is interpolated from: nothing nearer than they are is trusted there.

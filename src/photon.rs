@@ -131,7 +131,7 @@ pub struct Photons {
     pub emitted: u64,
     /// Rays traced.
     pub rays: u64,
-    /// Landings where ∇h vanishes, which were absorbed.
+    /// Landings where ∇h vanishes, or where nothing is lit, which ended their paths.
     pub flat_gradient: u64,
 }
 

@@ -29,7 +29,7 @@ pub struct EstimateSettings {
     pub estimator: Estimator,
     /// Photons per estimate: exactly, on average over the map, or at least.
     pub photons: usize,
-    /// Largest radius, as a fraction of Ω's diagonal.
+    /// Largest radius, as a fraction of Ω's diagonal; [`Estimator::Splat`] takes what its bins need.
     pub max_radius: f64,
     /// Largest difference in isovalue, in units of the sweep.
     pub tau: f64,

@@ -80,15 +80,9 @@ impl Polygon {
         if turns > 1.5 {
             return fail(format!("winds {turns:.0} times around; split it into triangles"));
         }
-        if !(albedo.cmpge(DVec3::ZERO).all() && albedo.cmple(DVec3::ONE).all()) {
-            return fail(format!("albedo {albedo} must lie in [0, 1]"));
-        }
-        if let Err(e) = emission::check(emission) {
-            return fail(e.to_string());
-        }
         let (corner, edges) = parametrise(&vertices, normal);
         let opaque_back = emission != DVec3::ZERO;
-        Ok(Self {
+        let polygon = Self {
             name: name.to_owned(),
             vertices,
             normal,
@@ -99,7 +93,22 @@ impl Polygon {
             emission,
             opaque_back,
             other_face: 0,
-        })
+        };
+        polygon.check()?;
+        Ok(polygon)
+    }
+
+    /// Whether it reflects no more than it receives, and f32 holds what it emits.
+    ///
+    /// # Errors
+    /// `Invalid` for an albedo or an emission out of range.
+    pub(crate) fn check(&self) -> Result<()> {
+        let fail = |what: String| Err(Error::Invalid(format!("polygon '{}': {what}", self.name)));
+        let albedo = self.albedo;
+        if !(albedo.cmpge(DVec3::ZERO).all() && albedo.cmple(DVec3::ONE).all()) {
+            return fail(format!("albedo {albedo} must lie in [0, 1]"));
+        }
+        emission::check(self.emission).or_else(|e| fail(e.to_string()))
     }
 
     /// The polygon as its two faces, one after the other: seen, lit and, if it emits, light from both sides. They must
@@ -113,6 +122,12 @@ impl Polygon {
         let name = format!("{}_back", front.name);
         let back = Self { name, vertices, normal, corner, edges, other_face: -1, ..front.clone() };
         [front, back]
+    }
+
+    /// Moves it.
+    pub(crate) fn translate(&mut self, by: DVec3) {
+        self.vertices.iter_mut().for_each(|x| *x += by);
+        self.corner += by;
     }
 
     /// Texture coordinates of the vertices, counter-clockwise.

@@ -1,4 +1,5 @@
-//! Progress of long work: a bar with an ETA on a terminal, plain lines otherwise, and the wish to stop.
+//! Progress of long work: a bar with an ETA on a terminal, plain lines otherwise, or whoever asks for it; and the wish
+//! to stop.
 
 use crate::error::{Error, Result};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -18,18 +19,19 @@ pub(crate) use say;
 
 static INTERRUPTED: AtomicBool = AtomicBool::new(false);
 
-/// Asks all running stages to stop; what a signal handler calls.
+/// Asks all work of this process to stop, now and later; what a signal handler calls. [`Observer::stops`] ends one
+/// piece of work alone.
 pub fn interrupt() {
     INTERRUPTED.store(true, Ordering::Relaxed);
 }
 
-/// Whether someone has asked to stop.
+/// Whether [`interrupt`] was called.
 #[inline]
 pub fn interrupted() -> bool {
     INTERRUPTED.load(Ordering::Relaxed)
 }
 
-/// Goes on unless someone has asked to stop.
+/// Goes on unless [`interrupt`] was called.
 ///
 /// # Errors
 /// `Interrupted`.
@@ -37,13 +39,56 @@ pub fn unless_interrupted() -> Result<()> {
     if interrupted() { Err(Error::Interrupted) } else { Ok(()) }
 }
 
+/// Watches work, from any of its threads, and may end it.
+///
+/// ```
+/// use isolume::progress::{Observer, Progress};
+/// use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+/// /// A window's button that ends the work.
+/// #[derive(Default)]
+/// struct Button(AtomicBool);
+/// impl Observer for Button {
+///     fn stops(&self) -> bool {
+///         self.0.load(Relaxed)
+///     }
+/// }
+/// let button = Button::default();
+/// let stage = Progress::Watched(&button).stage("work", 100);
+/// assert!(stage.tick(1));
+/// button.0.store(true, Relaxed);
+/// assert!(!stage.tick(1) && stage.end().is_err());
+/// ```
+pub trait Observer: Sync {
+    /// A stage begins that has `total` units of work.
+    fn begins(&self, stage: &str, total: u64) {
+        let _ = (stage, total);
+    }
+
+    /// So many more units of a stage are done.
+    fn advances(&self, stage: &str, units: u64) {
+        let _ = (stage, units);
+    }
+
+    /// A stage, or a part of one, took so long.
+    fn ends(&self, stage: &str, seconds: f64) {
+        let _ = (stage, seconds);
+    }
+
+    /// Whether the work is to end, with `Interrupted`. Asked many times a second, and once more when a stage ends.
+    fn stops(&self) -> bool {
+        false
+    }
+}
+
 /// Where progress goes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Progress {
+#[derive(Clone, Copy)]
+pub enum Progress<'a> {
     /// Nowhere.
     Quiet,
     /// To standard error: bars on a terminal, a line per stage otherwise.
     Shown,
+    /// To an observer, and nothing to standard error.
+    Watched(&'a dyn Observer),
 }
 
 /// Wall and processor seconds since it was started.
@@ -66,52 +111,68 @@ impl Clock {
 }
 
 /// One running stage.
-pub struct Stage {
+pub struct Stage<'a> {
+    progress: Progress<'a>,
     bar: Option<ProgressBar>,
     name: String,
-    shown: bool,
     begun: Instant,
 }
 
-impl Progress {
-    /// Prints how long a part of the work took.
+impl<'a> Progress<'a> {
+    /// Whether people read standard error.
+    #[inline]
+    pub fn is_shown(self) -> bool {
+        matches!(self, Self::Shown)
+    }
+
+    /// Whether the work is to end.
+    #[inline]
+    pub fn stops(self) -> bool {
+        interrupted() || matches!(self, Self::Watched(observer) if observer.stops())
+    }
+
+    /// Tells how long a part of the work took.
     pub fn line(self, name: &str, seconds: f64) {
-        if self == Self::Shown {
-            say!("{name:>14}  {seconds:.2} s");
+        match self {
+            Self::Quiet => {}
+            Self::Shown => say!("{name:>14}  {seconds:.2} s"),
+            Self::Watched(observer) => observer.ends(name, seconds),
         }
     }
 
     /// Begins a stage of `total` units of work.
-    pub fn stage(self, name: &str, total: u64) -> Stage {
-        let shown = self == Progress::Shown;
-        let bar = (shown && std::io::stderr().is_terminal()).then(|| {
+    pub fn stage(self, name: &str, total: u64) -> Stage<'a> {
+        if let Self::Watched(observer) = self {
+            observer.begins(name, total);
+        }
+        let bar = (self.is_shown() && std::io::stderr().is_terminal()).then(|| {
             let bar = ProgressBar::with_draw_target(Some(total), ProgressDrawTarget::stderr_with_hz(8));
             let template = "{prefix:>14} [{bar:30}] {percent:>3} %  {elapsed} elapsed, {eta} left";
             bar.set_style(ProgressStyle::with_template(template).expect("the template is fixed").progress_chars("=> "));
             bar.set_prefix(name.to_owned());
             bar
         });
-        Stage { bar, name: name.to_owned(), shown, begun: Instant::now() }
+        Stage { progress: self, bar, name: name.to_owned(), begun: Instant::now() }
     }
 }
 
-impl Stage {
+impl Stage<'_> {
     /// Reports `n` more units done; false if the work should stop.
     #[inline]
     pub fn tick(&self, n: u64) -> bool {
-        if n > 0
-            && let Some(bar) = &self.bar
-        {
-            bar.inc(n);
+        match (self.progress, &self.bar) {
+            (Progress::Watched(observer), _) if n > 0 => observer.advances(&self.name, n),
+            (_, Some(bar)) if n > 0 => bar.inc(n),
+            _ => {}
         }
-        !interrupted()
+        !self.progress.stops()
     }
 
     /// Prints a line without disturbing the bar.
     pub fn note(&self, label: &str, text: &str) {
         match &self.bar {
             Some(bar) => bar.suspend(|| say!("{label:>14}  {text}")),
-            None if self.shown => say!("{label:>14}  {text}"),
+            None if self.progress.is_shown() => say!("{label:>14}  {text}"),
             None => {}
         }
     }
@@ -119,16 +180,16 @@ impl Stage {
     /// Ends the stage; returns its wall seconds.
     ///
     /// # Errors
-    /// `Interrupted` if someone has asked to stop meanwhile.
+    /// `Interrupted` if the work is to end.
     pub fn end(self) -> Result<f64> {
         let seconds = self.begun.elapsed().as_secs_f64();
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
-        unless_interrupted()?;
-        if self.shown {
-            say!("{:>14}  {seconds:.2} s", self.name);
+        if self.progress.stops() {
+            return Err(Error::Interrupted);
         }
+        self.progress.line(&self.name, seconds);
         Ok(seconds)
     }
 }

@@ -178,6 +178,11 @@ impl Pyramid {
         Self { cells, far, rounding, slack, ranks, levels, children, roots, steps, capped, isa: Isa::current() }
     }
 
+    /// Cells along each axis of its lattice.
+    pub fn cells(&self) -> [usize; 3] {
+        self.cells
+    }
+
     /// The same with another instruction set: the same hits.
     #[cfg(test)]
     fn with(mut self, isa: Isa) -> Self {

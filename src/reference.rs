@@ -154,10 +154,10 @@ fn companion_meshes(scene: &Scene, isovalue: f32) -> Result<Vec<(Scene, SurfaceM
 }
 
 /// Outgoing radiance of the outside at the vertices of `mesh`, the isosurface at `isovalue` (units of the sweep).
-/// `tick(n)` reports n of batches × vertices done; returning false stops early.
+/// `tick(n)` reports n of batches × vertices done; returning false ends it.
 ///
 /// # Errors
-/// As [`Integrator::check`]; from the extraction of companions' isosurfaces.
+/// `Interrupted` if `tick` ends it; as [`Integrator::check`]; from the extraction of companions' isosurfaces.
 #[allow(clippy::cast_possible_truncation, reason = "batches are few")]
 pub fn reference<T: Tracer>(
     scene: &Scene,
@@ -218,6 +218,9 @@ pub fn reference<T: Tracer>(
                 radiance
             })
             .collect();
+        if !tick(0) {
+            return Err(Error::Interrupted);
+        }
         // Welford's update, all vertices side by side.
         for ((mean, square), x) in sums.iter_mut().zip(&mut squares).zip(estimates) {
             let d = x - *mean;

@@ -100,7 +100,7 @@ pub struct Rendered {
 /// Renders the isosurface at `isovalue` (source units) with `samples` rays per pixel.
 ///
 /// # Errors
-/// `Invalid` for an isovalue outside the sweep or an impossible camera; `Embree`; `Interrupted`; as
+/// `Invalid` for an isovalue outside the sweep, no samples, or an impossible camera; `Embree`; `Interrupted`; as
 /// [`FinalGather::new`].
 pub fn render(
     scene: &Scene,
@@ -117,6 +117,9 @@ pub fn render(
             "isovalue {} lies outside the sweep {sweep}; choose one inside, or bake a wider sweep",
             Shortest(isovalue)
         )));
+    }
+    if samples == 0 {
+        return Err(Error::Invalid("samples: at least one ray per pixel".into()));
     }
     let tracer = GraphTracer::new(device, scene)?;
     let c = sweep.isovalue(isovalue);

@@ -69,12 +69,12 @@ fn positions_in(field: &Field, strategy: &Strategy, count: u64, seed: u64, most:
             Ok(found)
         }
         Strategy::Planes(planes) => Ok(in_batches(count, most, |i| {
-            // (1,1,1) in units of Ω: each point of a slab goes straight to the plane in the slab's middle.
+            // Across (1,1,1) in units of Ω, all planes alike: as much of a plane's shadow on z = 0 lies in Ω as of
+            // itself.
             let p = uniform(i) / far;
-            let s = p.element_sum() / 3.0;
-            let plane = ((s * *planes as f64).floor() + 0.5) / *planes as f64;
-            let q = p + (plane - s);
-            let q = (q.cmpge(DVec3::ZERO).all() && q.cmple(DVec3::ONE).all()).then(|| (q * far).as_vec3())?;
+            let plane = ((p.z * *planes as f64).floor() + 0.5) / *planes as f64;
+            let q = DVec3::new(p.x, p.y, 3.0 * plane - p.x - p.y);
+            let q = (0.0..=1.0).contains(&q.z).then(|| (q * far).as_vec3())?;
             on_sweep(&q).then_some(q)
         })),
         Strategy::LevelSets(isovalues) => level_set_positions(field, isovalues, count, seed),

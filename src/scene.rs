@@ -132,6 +132,7 @@ fn check(surface: &Surface, boundary: Boundary, field: &Field, polygons: &[Polyg
     check_spacing(lattice)?;
     surface.check_albedo(field.sweep())?;
     surface.check_emission()?;
+    polygons.iter().try_for_each(Polygon::check)?;
     if boundary == Boundary::Capped {
         // A cap is a surface of its own: a wall in the same plane would hide it or be hidden.
         let far = lattice.far();
@@ -153,7 +154,8 @@ fn check(surface: &Surface, boundary: Boundary, field: &Field, polygons: &[Polyg
 }
 
 impl Scene {
-    /// Puts a scene together; polygons that emit are its luminaires. Luminaires are numbered first.
+    /// Puts a scene together; polygons that emit are its luminaires. Luminaires are numbered first; those that lie in
+    /// the plane of a wall are hung before it, by a twentieth of a voxel.
     ///
     /// # Errors
     /// `Invalid` for an albedo outside [0, 1], an emission out of range, too many polygons, capped faces that touch a
@@ -165,6 +167,11 @@ impl Scene {
         polygons: Vec<Polygon>,
     ) -> Result<Self> {
         let field = field.into();
+        let mut polygons = polygons;
+        // Whatever was made to emit, or no longer to.
+        for p in polygons.iter_mut().filter(|p| p.other_face == 0) {
+            p.opaque_back = p.emission != DVec3::ZERO;
+        }
         let (mut polygons, walls): (Vec<_>, Vec<_>) = polygons.into_iter().partition(|p| p.emission != DVec3::ZERO);
         let count = polygons.len();
         polygons.extend(walls);
@@ -176,6 +183,7 @@ impl Scene {
                 polygons.len()
             )));
         }
+        cover::hang(&mut polygons, count, lattice);
         let mut lo = DVec3::INFINITY;
         let mut hi = DVec3::NEG_INFINITY;
         let corners = lattice.corners().map(|p| lattice.to_world(p));
@@ -197,6 +205,14 @@ impl Scene {
         };
         scene.reference_irradiance = scene.find_reference_irradiance();
         Ok(scene)
+    }
+
+    /// Whether all that can be changed in a scene is still in range.
+    ///
+    /// # Errors
+    /// As [`Scene::new`].
+    pub(crate) fn check(&self) -> Result<()> {
+        check(&self.surface, self.boundary, &self.field, &self.polygons)
     }
 
     /// The same scene with its field on another lattice over the same Ω ([`Field::resampled`]).

@@ -270,6 +270,7 @@ impl SceneOptions {
 }
 
 /// A scene ready to bake, and the volume it came from.
+#[derive(Clone, Debug)]
 pub struct Loaded {
     /// The volume in source units; of several, the first.
     pub volume: Volume,
@@ -313,6 +314,7 @@ impl SceneFile {
 }
 
 /// A scene file's text, for messages that name the line of a key.
+#[derive(Clone, Debug)]
 struct Source {
     path: PathBuf,
     text: String,

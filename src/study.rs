@@ -77,30 +77,30 @@ pub enum Effort {
 }
 
 /// What all studies share.
-pub struct Study {
+pub struct Study<'a> {
     /// Where tables, plots and cached references go.
     pub folder: PathBuf,
     /// Embree.
     pub device: Device,
     /// Where progress goes.
-    pub progress: Progress,
+    pub progress: Progress<'a>,
     /// Small counts and few isovalues, to see that everything works.
     pub quick: bool,
 }
 
-impl Study {
+impl<'a> Study<'a> {
     /// Makes the folder.
     ///
     /// # Errors
     /// `Io`.
-    pub fn new(folder: PathBuf, device: Device, progress: Progress, quick: bool) -> Result<Self> {
+    pub fn new(folder: PathBuf, device: Device, progress: Progress<'a>, quick: bool) -> Result<Self> {
         let references = folder.join("references");
         std::fs::create_dir_all(&references).map_err(|e| Error::io(&references, e))?;
         Ok(Self { folder, device, progress, quick })
     }
 
     fn say(&self, text: &str) {
-        if self.progress == Progress::Shown {
+        if self.progress.is_shown() {
             say!("{text}");
         }
     }
@@ -266,7 +266,7 @@ mod tests {
         let settings = BakeSettings::new(&options, &subject.scene).unwrap();
         let bake = study.bake(&subject, &settings).unwrap().0;
         let found = accuracy_of(&subject.scene, &bake, &references).unwrap();
-        let baked = BakedVolume::new(subject.scene.resampled(&bake.lattice), bake);
+        let baked = BakedVolume::new(subject.scene.clone(), bake);
         let (side, grid) = &baked.sides[0];
         let of = |light: &dyn Fn(DVec3) -> DVec3| {
             let there = references[0].positions.iter().map(|&x| light(baked.lattice().to_index(x)));

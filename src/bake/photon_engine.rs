@@ -16,7 +16,7 @@ use crate::isovalue_axis::IsovalueAxis;
 use crate::mask::Mask;
 use crate::node_set::NodeSet;
 use crate::photon::trace_photons;
-use crate::progress::{Clock, Progress, interrupted};
+use crate::progress::{Clock, Progress};
 use crate::radiance::{BLOCK, Indirect, RadianceSample, Sampler, sample_places};
 use crate::radiance_cache::{NodeBand, NodePhotons, RadianceCache};
 use crate::sampling::{Strategy, positions};
@@ -105,7 +105,7 @@ pub(super) fn light(
             lit.count(counts);
         }
         lit.spend(clock, |s| &mut s.samples);
-        if bands.len() > 1 && !interrupted() {
+        if bands.len() > 1 && !progress.stops() {
             let name = format!("band {} of {}", band.number + 1, bands.len());
             stage.note(&name, &format!("{:.2} s", begun.elapsed().as_secs_f64()));
         }

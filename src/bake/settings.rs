@@ -433,9 +433,18 @@ impl BakeSettings {
             seed: o.seed.unwrap_or(1),
             bands: o.bands.unwrap_or(1),
         };
-        let s = &settings;
+        settings.check()?;
+        Ok(settings)
+    }
+
+    /// Whether all values are in their ranges, and go together.
+    ///
+    /// # Errors
+    /// `Invalid` if not; the message names the option.
+    pub fn check(&self) -> Result<()> {
+        let s = self;
         let samples = s.samples.unwrap_or(1);
-        let checks: [(&str, &dyn std::fmt::Display, bool, &str); 11] = [
+        let checks: [(&str, &dyn std::fmt::Display, bool, &str); 12] = [
             (
                 "directions",
                 &s.directions,
@@ -462,15 +471,16 @@ impl BakeSettings {
             ("bands", &s.bands, (1..=MOST_BANDS).contains(&s.bands), "1 to 256"),
             ("tau", &s.tau, s.tau > 0.0 && s.tau.is_finite(), "above 0 and finite"),
             ("wall-resolution", &s.wall_resolution, (2..=2048).contains(&s.wall_resolution), "2 to 2048"),
+            ("wall-isovalues", &s.wall_isovalues, (2..=512).contains(&s.wall_isovalues), "2 to 512"),
         ];
-        if settings.engine == Engine::Sweep && settings.bands > 1 {
+        if s.engine == Engine::Sweep && s.bands > 1 {
             return Err(Error::Invalid(
                 "bands: the lines of the sweep engine serve all isovalues at once; leave --bands out, or use the photon \
                  engine"
                     .into(),
             ));
         }
-        if settings.split && settings.engine == Engine::Photon && settings.strategy != StrategyName::Nodes {
+        if s.split && s.engine == Engine::Photon && s.strategy != StrategyName::Nodes {
             return Err(Error::Invalid(
                 "split: only light of the grid's own points can be split, not that of scattered samples; leave strategy and \
                  samples out, or split"
@@ -480,7 +490,7 @@ impl BakeSettings {
         if let Some((name, value, _, range)) = checks.into_iter().find(|(_, _, ok, _)| !ok) {
             return Err(Error::Invalid(format!("{name} {value}: must be {range}")));
         }
-        Ok(settings)
+        Ok(())
     }
 
     pub(super) fn sweep(&self) -> SweepSettings {

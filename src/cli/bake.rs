@@ -131,7 +131,7 @@ impl Bake {
         let mut scene = self.scene.clone();
         let (mut done, mut reports, mut said) = (Vec::new(), Vec::new(), BTreeSet::new());
         for (n, (&time, frame)) in series.times().iter().zip(frames).enumerate() {
-            if progress == Progress::Shown {
+            if progress.is_shown() {
                 say!("{:>14}  {} of {}, time {time}", "frame", n + 1, series.times().len());
             }
             scene.time = Some(time);
@@ -148,7 +148,7 @@ impl Bake {
             write_collection(&self.output.with_extension("pvd"), &done)?;
         }
         self.print(&reports.into());
-        if progress == Progress::Shown {
+        if progress.is_shown() {
             say!("{:>14}  {}", "written", self.output.with_extension("pvd").display());
         }
         Ok(())
@@ -193,7 +193,7 @@ impl Bake {
         let fits = plan.check_machine();
         let unfit = if self.dry_run { fits.err() } else { fits.map(|()| None)? };
         plan.warn(said)?;
-        if progress == Progress::Shown || self.dry_run {
+        if progress.is_shown() || self.dry_run {
             plan.announce();
         }
         if self.dry_run {
@@ -206,7 +206,7 @@ impl Bake {
             Begun::Whole(report) => report,
             Begun::At(checkpoint) => {
                 let reports = self.work(&plan, &checkpoint, (begun, load), progress)?;
-                if progress == Progress::Shown {
+                if progress.is_shown() {
                     self.summarise(plan.scene(), &reports);
                 }
                 warn_of_unsettled(&reports);
@@ -249,7 +249,7 @@ impl Bake {
         let same = |report: &serde_json::Value| report.get("job").and_then(|j| j.as_str()) == Some(&digest(&job));
         let another = match whole {
             Some(report) if same(&report) => {
-                if progress == Progress::Shown {
+                if progress.is_shown() {
                     say!("{:>14}  {} is complete", "resumed", self.output.display());
                 }
                 return Ok(Begun::Whole(report));
@@ -338,7 +338,7 @@ impl Bake {
     fn take_up(&self, checkpoint: &Checkpoint, progress: Progress) -> Result<()> {
         let path = checkpoint.path();
         let say = |label: &str, what: String| {
-            if progress == Progress::Shown {
+            if progress.is_shown() {
                 say!("{label:>14}  {what}");
             }
         };

@@ -122,7 +122,7 @@ impl Compare {
         }
         if let Some(output) = &self.output {
             write_errors(output, &references[0], &errors)?;
-            if progress == Progress::Shown {
+            if progress.is_shown() {
                 say!("{}: error-coloured mesh", output.display());
             }
         }
@@ -212,7 +212,10 @@ fn everywhere(s: &Survey, advice: Option<(&str, bool)>) -> String {
         .iter()
         .filter(|p| p.points > 0)
         .map(|p| {
-            format!("  isovalues        {:8.3}   ({}; {} points)\n", p.percent_rms, brief_span(p.isovalues), p.points)
+            // The noise of what it is compared with has been taken off.
+            let found =
+                if p.percent_rms > 0.0 { format!("{:8.3}", p.percent_rms) } else { format!("{:>8}", "< noise") };
+            format!("  isovalues        {found}   ({}; {} points)\n", brief_span(p.isovalues), p.points)
         })
         .collect();
     let at_points = match s.percent_rms_grid_points.zip(s.confidence_grid_points) {

@@ -47,7 +47,7 @@ impl ManualPages {
         let mut root = Cli::command().name("isolume");
         root.build();
         let count = write_pages(&self.output, &root, "isolume")?;
-        if progress == Progress::Shown {
+        if progress.is_shown() {
             say!("{}: {count} manual pages", self.output.display());
         }
         Ok(())

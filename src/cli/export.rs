@@ -89,7 +89,7 @@ impl Export {
                 .field_string(vti::SPACE, space.name())
                 .write(path)?,
         }
-        if progress == Progress::Shown {
+        if progress.is_shown() {
             let [x, y, z] = lattice.dims();
             say!("{}: `{name}`, {x}×{y}×{z} × {components} {}", path.display(), written.name());
         }

@@ -116,7 +116,7 @@ impl Extract {
                 "seconds": begun.elapsed().as_secs_f64(),
             });
             println!("{numbers:#}");
-        } else if progress == Progress::Shown {
+        } else if progress.is_shown() {
             say!(
                 "{}: {} vertices, {} triangles in {:.2} s",
                 self.output.display(),

@@ -78,7 +78,7 @@ impl Flatland {
                 ..SolveSettings::default()
             };
             let solution = Solution::new(&world, &settings)?;
-            if progress == Progress::Shown {
+            if progress.is_shown() {
                 say!(
                     "{transport:?}: {:.1} M rays, {} passes, {:.2} s so far",
                     solution.rays as f64 / 1e6,
@@ -91,7 +91,7 @@ impl Flatland {
         let settings =
             PictureSettings { width: self.width, gather: self.gather, paths: self.paths, ..PictureSettings::default() };
         let names = write_pictures(&self.output, &device, &worlds, &settings)?;
-        if progress == Progress::Shown {
+        if progress.is_shown() {
             let seconds = begun.elapsed().as_secs_f64();
             say!("{}: {} in {seconds:.2} s", self.output.display(), names.join(", "));
         }

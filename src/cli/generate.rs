@@ -97,7 +97,7 @@ impl Generate {
         writable(&self.output)?;
         let volume = generator.sample([self.size.unwrap_or(Generator::DIMS[0]); 3])?;
         volume.write(&self.output)?;
-        if progress == Progress::Shown {
+        if progress.is_shown() {
             say!("{}: {} of {} samples", self.output.display(), generator.name(), volume.samples().len());
         }
         Ok(())
@@ -188,7 +188,7 @@ impl Generate {
     }
 
     fn summary(&self, md: &MolecularDynamics, link: f64, unit: &str, progress: Progress) {
-        if progress == Progress::Shown {
+        if progress.is_shown() {
             let sizes = clusters(&md.bounds, &md.positions, link);
             say!(
                 "{:>14}  {} particles at {:.2} {unit}: {} clusters of 10 or more, the greatest of {}",
@@ -216,7 +216,7 @@ fn write(path: &Path, volume: &Volume, content: &str, command: &str, progress: P
         ("version".to_owned(), format!("isolume {} ({})", env!("CARGO_PKG_VERSION"), env!("ISOLUME_COMMIT"))),
     ];
     volume.write_with_notes(path, &notes)?;
-    if progress == Progress::Shown
+    if progress.is_shown()
         && let Some((lo, hi)) = volume.range()
     {
         say!("{}: {} density, {lo:.4} … {hi:.4}", path.display(), volume.name);

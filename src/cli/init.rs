@@ -45,7 +45,7 @@ impl Init {
         let mut file = AtomicFile::create(&output)?;
         file.write_all(text.as_bytes()).map_err(|e| Error::io(&output, e))?;
         file.commit()?;
-        if progress == Progress::Shown {
+        if progress.is_shown() {
             say!("{}: edit it, then: isolume bake {} -o lit.vti", output.display(), for_shell(&output));
         }
         Ok(())

@@ -122,7 +122,7 @@ impl ReferenceArgs {
                 "seconds": seconds,
             });
             println!("{numbers:#}");
-        } else if progress == Progress::Shown {
+        } else if progress.is_shown() {
             say!(
                 "{}: {count} of {} vertices in {seconds:.2} s ({:.0} vertices/s, {:.2} M rays/s), {inside} rays began inside",
                 self.output.display(),

@@ -147,7 +147,8 @@ impl Render {
         let exr = self.output.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr"));
         #[allow(clippy::cast_possible_truncation, reason = "a brightness")]
         let brightness = exposure as f32;
-        if !exr && !(brightness > 0.0 && brightness.is_finite()) {
+        let storable = exr || (brightness > 0.0 && brightness.is_finite());
+        if !storable {
             return Err(Error::Invalid(format!(
                 "--exposure {:?}: times {:?}, the exposure of {}, it is no brightness that a .png can have; give another",
                 self.exposure,
@@ -163,7 +164,7 @@ impl Render {
         } else {
             rendered.picture.write_png(&self.output, brightness)?;
         }
-        if progress == Progress::Shown {
+        if progress.is_shown() {
             let seconds = begun.elapsed().as_secs_f64();
             let rays = gather.map_or_else(String::new, |_| format!(", {:.1} M rays", rendered.rays as f64 / 1e6));
             say!("{}: {}×{} in {seconds:.2} s{rays}", self.output.display(), camera.size[0], camera.size[1]);

@@ -43,7 +43,7 @@ impl View {
         let name = || self.file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let title = self.title.clone().unwrap_or_else(name);
         let bytes = view::write(&self.output, &baked, &title).map_err(|e| e.in_file(&self.file))?;
-        if progress == Progress::Shown {
+        if progress.is_shown() {
             let [x, y, z] = baked.lattice().dims();
             say!("{}: {x}×{y}×{z} points in {:.1} MB; open it in a browser", self.output.display(), bytes as f64 / 1e6);
         }

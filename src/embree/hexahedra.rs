@@ -10,7 +10,7 @@ use super::{
     Device, INVALID_ID, Ray16, RayHit, RayHit16, RayView, Scene as Bvh, SceneBuilder, UserGeometry, UserHit,
     UserHits16, Valid16,
 };
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::field::Field;
 use crate::flattened::{FlattenedHit, FlattenedRay, Side, Target};
 use crate::pyramid::Pyramid;
@@ -45,16 +45,21 @@ impl<'a> GraphTracer<'a> {
     /// As [`GraphTracer::new`] with the [`pyramids`] of the same scene, seen from any of its fields.
     ///
     /// # Errors
-    /// `Embree` if the library refuses.
+    /// `Invalid` for pyramids of other lattices; `Embree` if the library refuses.
     pub fn with_pyramids(device: &Device, scene: &'a Scene, pyramids: &[Arc<Pyramid>]) -> Result<Self> {
         let mut builder = SceneBuilder::new(device)?;
-        let pyramid = |number: usize| pyramids[number].clone();
-        let graph = Graph { field: &scene.field, pyramid: pyramid(scene.number()) };
+        let graph = |number: usize, field: &'a Field| {
+            let pyramid = pyramids.get(number).filter(|p| p.cells() == field.lattice().cells());
+            let pyramid = pyramid.ok_or_else(|| Error::Invalid("these pyramids are of another scene".into()))?;
+            Ok(Graph { field, pyramid: pyramid.clone() })
+        };
         let companions = scene.companions().iter().map(|companion| {
-            let graph = Graph { field: &companion.member.field, pyramid: pyramid(companion.number) };
-            CompanionGraph { graph, companion }
+            let graph = graph(companion.number, &companion.member.field)?;
+            Ok(CompanionGraph { graph, companion })
         });
-        let (same, others): (Vec<_>, Vec<_>) = companions.partition(|c| c.companion.shares_lattice());
+        let companions = companions.collect::<Result<Vec<_>>>()?;
+        let graph = graph(scene.number(), &scene.field)?;
+        let (same, others): (Vec<_>, Vec<_>) = companions.into_iter().partition(|c| c.companion.shares_lattice());
         let mut last = if same.is_empty() {
             builder.user_shared(Arc::new(graph), u32::MAX)?
         } else {

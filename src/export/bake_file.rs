@@ -288,6 +288,7 @@ fn grid_size(report: &serde_json::Value) -> Option<GridSize> {
 }
 
 /// A bake read back.
+#[derive(Clone, Debug)]
 pub struct BakedVolume {
     /// The stored volume as a scene: its level sets on the grid's lattice, and the box.
     pub scene: Scene,
@@ -337,8 +338,9 @@ pub fn is_bake(file: &VtiFile) -> bool {
 }
 
 impl BakedVolume {
-    /// A bake as if it were read.
+    /// A bake of `scene` as if it were written and read.
     pub fn new(scene: Scene, bake: Bake) -> Self {
+        let scene = if *scene.lattice() == bake.lattice { scene } else { scene.resampled(&bake.lattice) };
         let report = serde_json::to_value(&bake.report).expect("the report is plain data");
         let (sides, flats, exposure) = (bake.sides, bake.flats, bake.exposure);
         Self { scene, sides, flats, exposure, report, companions: Vec::new(), independent: false, among_others: false }
@@ -485,6 +487,14 @@ impl BakedVolume {
     pub fn radiance(&self, side: Side, p: DVec3) -> Option<DVec3> {
         let (_, grid) = self.sides.iter().find(|(s, _)| *s == side)?;
         Some(grid.radiance_at(&self.scene, self.lattice(), p, side))
+    }
+
+    /// [`BakedVolume::radiance`] at a point of the world, of the isosurface through it; `None` outside the volume, too,
+    /// and where the bake holds nothing.
+    pub fn radiance_at(&self, side: Side, world: DVec3) -> Option<DVec3> {
+        let (_, grid) = self.sides.iter().find(|(s, _)| *s == side)?;
+        let p = Some(self.lattice().to_index(world)).filter(|p| self.lattice().holds(*p))?;
+        grid.known_at(&self.scene, self.lattice(), p, side)
     }
 }
 

@@ -241,7 +241,7 @@ pub fn flatland(folder: &Path, device: &Device, settings: &StudySettings, progre
     for placement in [Placement::LevelSets, Placement::Uniform] {
         for &count in counts.iter().filter(|&&n| n <= settings.most) {
             let (measured, positions, grid) = bench.measure(placement, count)?;
-            if progress == Progress::Shown {
+            if progress.is_shown() {
                 let (name, n) = (placement.name(), measured.samples);
                 say!("{name:>14}  {n:>8} samples: {:.2} % in {:.2} s", measured.percent_rms, measured.seconds);
             }
@@ -265,7 +265,7 @@ pub fn flatland(folder: &Path, device: &Device, settings: &StudySettings, progre
         figure = ", figure5.png";
     }
     write(&folder.join("study.md"), &text)?;
-    if progress == Progress::Shown {
+    if progress.is_shown() {
         say!("{}: study.csv, study.md, study.svg{figure}", folder.display());
     }
     Ok(())

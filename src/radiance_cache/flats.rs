@@ -226,7 +226,7 @@ impl<T: Tracer> Raster<'_, T> {
 }
 
 /// Direct irradiance of the texels that `estimate` knows, by `few` shadow rays, and by `many` beside those that see a
-/// luminaire in part. Those that are known are told to `tick`.
+/// luminaire in part. Each is told to `tick`.
 fn direct_light(
     [nu, nv, nc]: [usize; 3],
     estimate: impl Fn(usize, u32) -> Option<Estimate> + Sync,

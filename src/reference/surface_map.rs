@@ -221,10 +221,6 @@ impl SurfaceMap {
         let accept = |slot: u32| wall || share.photons[slot as usize].1.dot(normal) >= cone;
         share.grid.nearest(q, k, self.radius, accept, scratch);
         let found = scratch.found();
-        if found.is_empty() {
-            return Some((DVec3::ZERO, 0.0));
-        }
-        let farthest = found.iter().map(|e| e.0).fold(0.0, f32::max);
         let most = match at.departure {
             // Beyond a small polygon there is nothing to find.
             Departure::Polygon(id) => {
@@ -233,6 +229,8 @@ impl SurfaceMap {
             }
             _ => self.radius,
         };
+        // Nothing within reach: it is dark, as far as that.
+        let farthest = found.iter().map(|e| e.0).fold(0.0, f32::max);
         let radius = if found.len() < k { most } else { farthest.sqrt() };
         if radius == 0.0 {
             return Some((DVec3::ZERO, 0.0));

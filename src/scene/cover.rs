@@ -1,8 +1,9 @@
 //! Luminaires that hang so closely before a wall that nothing fits between: what they hide of it lights nothing, and is
-//! no part of what its texels show beside them.
+//! no part of what its texels show beside them. A luminaire in the plane of a wall is hung before it, so that the same
+//! is seen everywhere: which of the two a ray meets first would be up to rounding.
 
 use super::Scene;
-use crate::polygon::Polygon;
+use crate::polygon::{Polygon, clip, convex_area};
 use crate::volume::Lattice;
 use glam::DVec3;
 
@@ -10,6 +11,46 @@ use glam::DVec3;
 pub(crate) const SLIT: f64 = 0.25;
 /// A point this near to a wall, in voxels, lies on it.
 pub(crate) const ON: f64 = 1e-3;
+
+/// Such a share of a voxel before a wall a luminaire hangs that stood in its plane: within [`SLIT`] on grids four times
+/// as fine, too, and farther than positions are rounded.
+const HUNG: f64 = 0.05;
+
+/// Moves the luminaires, the first `emitting` of `polygons`, out of the planes of walls that face where they face and
+/// that they hide a part of.
+pub(super) fn hang(polygons: &mut [Polygon], emitting: usize, lattice: &Lattice) {
+    let before = |light: &Polygon| {
+        let wall = polygons[emitting..].iter().find(|wall| lies_on(light, wall, lattice))?;
+        Some(HUNG * voxel_along(lattice, light).1 * wall.normal())
+    };
+    let moves: Vec<Option<DVec3>> = polygons[..emitting].iter().map(before).collect();
+    for (n, light) in polygons[..emitting].iter_mut().enumerate() {
+        // Both faces of one go together.
+        let other = n.wrapping_add_signed(light.other_face as isize);
+        if let Some(by) = moves[n].or(moves.get(other).copied().flatten()) {
+            light.translate(by);
+        }
+    }
+}
+
+/// Whether `light` lies in the plane of `wall`, faces where that faces, and hides a part of it.
+fn lies_on(light: &Polygon, wall: &Polygon, lattice: &Lattice) -> bool {
+    let normal = wall.normal();
+    let height = |x: DVec3| (x - wall.vertices()[0]).dot(normal);
+    let near = || ON * voxel_along(lattice, light).1;
+    if light.normal().dot(normal) <= 0.0 || light.vertices().iter().any(|x| height(*x).abs() > near()) {
+        return false;
+    }
+    // What is left of the luminaire within all of the wall's edges.
+    let mut shared = light.vertices().to_vec();
+    let corners = wall.vertices();
+    for (i, &a) in corners.iter().enumerate() {
+        let inwards = normal.cross(corners[(i + 1) % corners.len()] - a);
+        let whole = std::mem::take(&mut shared);
+        clip(whole.len(), |n| whole[n], |x| (x - a).dot(inwards), |x| shared.push(x));
+    }
+    convex_area(&shared) > 1e-6 * light.area()
+}
 
 /// The lattice's axis that is nearest to the normal of a polygon, and how far apart its slices are along that.
 pub(crate) fn voxel_along(lattice: &Lattice, polygon: &Polygon) -> (usize, f64) {
@@ -54,5 +95,53 @@ impl Scene {
                 && light.contains(x)
                 && self.covered_wall(l).is_some()
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A square of the ceiling's plane z = 1, facing down unless `up`.
+    fn square(x: [f64; 2], y: [f64; 2], z: f64, up: bool, emission: f64) -> Polygon {
+        let mut v: Vec<DVec3> =
+            [(0, 0), (1, 0), (1, 1), (0, 1)].map(|(i, j): (usize, usize)| DVec3::new(x[i], y[j], z)).to_vec();
+        if !up {
+            v.reverse();
+        }
+        Polygon::new("square", v, DVec3::ZERO, DVec3::splat(emission)).unwrap()
+    }
+
+    #[test]
+    fn luminaires_are_hung_before_what_they_hide() {
+        let lattice = Lattice::aligned([11; 3], DVec3::ZERO, DVec3::splat(0.1)).unwrap();
+        let lamp = |z: f64, up: bool| square([0.4, 0.6], [0.4, 0.6], z, up, 1.0);
+        let height = |lights: &[Polygon], walls: &[Polygon]| {
+            let mut all = [lights, walls].concat();
+            hang(&mut all, lights.len(), &lattice);
+            assert!(all[lights.len()..] == *walls);
+            all[..lights.len()].iter().map(|p| p.at([0.5; 2]).z).collect::<Vec<_>>()
+        };
+        let hung = 1.0 - HUNG * 0.1;
+        let ceiling = square([0.0, 1.0], [0.0, 1.0], 1.0, false, 0.0);
+        let of = |light: Polygon| height(&[light], std::slice::from_ref(&ceiling))[0];
+        // Rounded to either side of the plane; at a distance; facing away; beside the ceiling; in part before it.
+        for (z, expected) in [(1.0, hung), (1.00005, hung + 5e-5), (0.99995, hung - 5e-5), (0.99, 0.99), (1.01, 1.01)] {
+            assert!((of(lamp(z, false)) - expected).abs() < 1e-12, "{z}");
+        }
+        assert_eq!(of(lamp(1.0, true)), 1.0);
+        assert_eq!(of(square([1.0, 1.2], [0.4, 0.6], 1.0, false, 1.0)), 1.0);
+        assert!((of(square([0.9, 1.2], [0.4, 0.6], 1.0, false, 1.0)) - hung).abs() < 1e-12);
+        // Fitted into a hole between four walls.
+        let hole = [
+            square([0.0, 0.4], [0.0, 1.0], 1.0, false, 0.0),
+            square([0.6, 1.0], [0.0, 1.0], 1.0, false, 0.0),
+            square([0.4, 0.6], [0.0, 0.4], 1.0, false, 0.0),
+            square([0.4, 0.6], [0.6, 1.0], 1.0, false, 0.0),
+        ];
+        assert_eq!(height(&[lamp(1.0, false)], &hole), [1.0]);
+        // Both faces go.
+        let both = height(&lamp(1.0, true).both_faces(), std::slice::from_ref(&ceiling));
+        assert!(both.iter().all(|z| (z - hung).abs() < 1e-12), "{both:?}");
     }
 }

@@ -24,7 +24,7 @@ const DRAWN: u64 = 40_000;
 /// As rendering; `Io`.
 pub(super) fn figure6(study: &Study, subject: &Subject, name: &str, strategy: StrategyName, bake: Bake) -> Result<()> {
     let seed = bake.report.seed;
-    let baked = BakedVolume::new(subject.scene.resampled(&bake.lattice), bake);
+    let baked = BakedVolume::new(subject.scene.clone(), bake);
     let panels = [
         samples(&baked, strategy, seed)?,
         slice(&baked, 0.4),

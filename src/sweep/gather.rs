@@ -120,8 +120,8 @@ impl Family<'_> {
 }
 
 impl Pass<'_> {
-    /// Irradiance of every node of side `n` of [`Pass::sides`] by a bounce; the flats' is added to `incoming`. `tick` is
-    /// asked before every family; false stops with what is done, and is returned beside it.
+    /// Irradiance of every node of side `n` of [`Pass::sides`] by a bounce; the flats' is added to `incoming`. `tick`
+    /// is asked before every family; false stops with what is done, and is returned beside it.
     pub(super) fn gather(
         &self,
         bounce: &Bounce,

@@ -172,7 +172,7 @@ impl Run<'_> {
             geometry: self.geometry,
             standing: self.slits.standing(),
             touching: Touching::new(self.scene, self.geometry, flats),
-            sides: &self.sides,
+            sides: self.sides,
             isa: self.isa,
             spare: self.spare,
             workspaces: Mutex::default(),

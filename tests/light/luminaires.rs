@@ -112,6 +112,41 @@ fn a_lamp_with_two_faces_does_not_light_itself() {
     assert!(behind.iter().all(|&n| n > 500), "{behind:?}");
 }
 
+/// In the ceiling's plane a ray would meet lamp and ceiling at once. By shadow rays and lines, with and without a
+/// margin between the ceiling and Ω, such a lamp lights what one just before the ceiling does; paths agree.
+#[test]
+fn a_lamp_in_the_plane_of_the_ceiling_shines() {
+    let planes = field(lattice([9; 3], DVec3::ZERO, DVec3::ONE), 0.05, 0.95, |x| x.z);
+    for margin in [0.0, 0.1] {
+        let top = 1.0 + margin;
+        let found = [top, top - 0.004].map(|z| {
+            let lamp = square("lamp", 0.2, z, false, 0.5, DVec3::ONE);
+            let ceiling = square("ceiling", 0.5 + margin, top, false, 0.5, DVec3::ZERO);
+            let scene = scene(planes.clone(), grey(0.5, Side::Higher), vec![ceiling, lamp]);
+            let tracer = GraphTracer::new(&Device::new(0).unwrap(), &scene).unwrap();
+            [Engine::Photon, Engine::Sweep].map(|engine| {
+                let bake = run(&scene, &BakeSettings { engine, gather_rays: 32, photons: 1 << 14, ..at_nodes(1) });
+                let lit = valid(&bake, &scene);
+                let paths = lit.iter().step_by(5).map(|&(o, x, h, ..)| {
+                    let p = scene.lattice().to_index(x);
+                    let receiver = Receiver::on_level_set(&scene, p, h as f32, Side::Higher).unwrap();
+                    PathTracer::new(&scene, &tracer).outgoing(&receiver, 64, Stage::Path.key(1, o as u64)).x
+                });
+                let paths = paths.sum::<f64>() / lit.iter().step_by(5).len() as f64;
+                [lit.iter().map(|v| v.3).sum::<f64>() / lit.len() as f64, paths]
+            })
+        });
+        println!("margin {margin}: {found:.4?}");
+        let [within, before] = found.map(|engines| engines.concat());
+        for (a, b) in within.iter().zip(&before) {
+            assert!(
+                *a > 0.01 && (a / b - 1.0).abs() < 0.02,
+                "margin {margin}: {within:?} in the plane, {before:?} before"
+            );
+        }
+    }
+}
+
 /// A wall with one face between luminaire and volume: from its front nothing is seen of what is behind, from behind the
 /// wall is not there. By lines, shadow rays, and photons, which would light the floor behind the wall.
 #[test]

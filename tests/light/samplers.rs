@@ -87,6 +87,21 @@ fn samplers_agree_with_their_densities() {
         counts[(bin(x.x, 8) * 8 + bin(2.0 * x.y - 0.5, 8)) * 8 + bin(x.z, 8)] += 1;
     }
     family.push(("uniform on the sweep", even(&counts)));
+    // Diagonal planes: by area. Of each the squares of 1/16 that lie in Ω as a whole, in the shadow on z = 0.
+    let mut counts = vec![0u32; 5 * 16 * 16];
+    for p in positions(&all, &Strategy::Planes(5), 400_000, 15).unwrap() {
+        let x = p.as_dvec3() / all.lattice().far();
+        let plane = 5.0 * x.element_sum() / 3.0 - 0.5;
+        assert!((plane - plane.round()).abs() < 1e-5);
+        counts[(plane.round() as usize * 16 + bin(x.x, 16)) * 16 + bin(x.y, 16)] += 1;
+    }
+    let whole = |n: &usize| {
+        let (sum, x, y) = (3.0 * ((n / 256) as f64 + 0.5) / 5.0, (n / 16 % 16) as f64, (n % 16) as f64);
+        let [z0, z1] = [0.0, 2.0].map(|corner| sum - (x + y + corner) / 16.0);
+        z1 >= 0.0 && z0 <= 1.0
+    };
+    let counts: Vec<u32> = (0..counts.len()).filter(whole).map(|n| counts[n]).collect();
+    family.push(("planes", even(&counts)));
     // Level sets: by area. Planes y = .3 and y = .7 of a box twice as wide as deep.
     let mut counts = vec![0u32; 2 * 16 * 8];
     for p in positions(&all, &Strategy::LevelSets(vec![0.3, 0.7]), 200_000, 14).unwrap() {

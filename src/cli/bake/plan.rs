@@ -40,7 +40,7 @@ impl Plan {
         let options = flags.clone().or(&loaded.bake);
         let settings = BakeSettings::new(&options, &loaded.scene).map_err(|e| loaded.blame_bake(flags, e))?;
         supported(&loaded.scene, &settings).map_err(|e| e.in_file(input))?;
-        if progress == Progress::Shown {
+        if progress.is_shown() {
             introduce(&loaded.scene, input);
         }
         let device = device()?;
