@@ -1,9 +1,7 @@
 //! What Embree itself costs: a user geometry that never hits, against triangles.
 //! One thread; the best of seven interleaved runs, in nanoseconds per ray.
 
-use isolume::embree::{
-    Device, Ray, Ray16, RayHit, RayHit16, RayView, Scene, SceneBuilder, UserGeometry, UserHit, Valid16,
-};
+use isolume::embree::{Bvh, BvhBuilder, Device, Ray, Ray16, RayHit, RayHit16, RayView, UserGeometry, UserHit, Valid16};
 use isolume::isa::Isa;
 use std::hint::black_box;
 use std::time::Instant;
@@ -33,7 +31,7 @@ impl UserGeometry for Null {
 fn main() {
     let device = Device::new(1).expect("Embree starts");
     // Two scenes: a mask hides triangles, but their hierarchy would still be walked.
-    let mut builder = SceneBuilder::new(&device).expect("a scene");
+    let mut builder = BvhBuilder::new(&device).expect("a scene");
     builder.user(&Null, u32::MAX).expect("a user geometry");
     let null = builder.commit().expect("a built scene");
     // A 64×64 grid of squares in the plane z = 0.5, tilted a little.
@@ -41,7 +39,7 @@ fn main() {
     let vertices: Vec<_> = (0..65 * 65).map(at).collect();
     let corners = (0..64 * 64_u32).map(|i| i % 64 + i / 64 * 65);
     let indices: Vec<_> = corners.flat_map(|c| [[c, c + 1, c + 66], [c, c + 66, c + 65]]).collect();
-    let mut builder = SceneBuilder::new(&device).expect("a scene");
+    let mut builder = BvhBuilder::new(&device).expect("a scene");
     builder.triangles(&vertices, &indices, u32::MAX).expect("triangles");
     let mesh = builder.commit().expect("a built scene");
 
@@ -58,7 +56,7 @@ fn main() {
         })
         .collect();
     let rays = &rays[..];
-    let singly = |scene: &Scene, rays: &[Ray]| {
+    let singly = |scene: &Bvh, rays: &[Ray]| {
         rays.iter()
             .filter(|&&ray| {
                 let mut rayhit = RayHit::new(ray);
@@ -67,8 +65,8 @@ fn main() {
             })
             .count()
     };
-    let shadows = |scene: &Scene, rays: &[Ray]| rays.iter().filter(|&&ray| scene.occluded1(&mut ray.clone())).count();
-    let packets = |scene: &Scene, rays: &[Ray]| {
+    let shadows = |scene: &Bvh, rays: &[Ray]| rays.iter().filter(|&&ray| scene.occluded1(&mut ray.clone())).count();
+    let packets = |scene: &Bvh, rays: &[Ray]| {
         let mut hits = 0;
         for sixteen in rays.as_chunks::<16>().0 {
             let mut rayhit = RayHit16::new(Ray16::new(sixteen));
@@ -77,9 +75,9 @@ fn main() {
         }
         hits
     };
-    let copied = |_: &Scene, rays: &[Ray]| rays.iter().filter(|&&ray| black_box(&RayHit::new(ray)).is_hit()).count();
+    let copied = |_: &Bvh, rays: &[Ray]| rays.iter().filter(|&&ray| black_box(&RayHit::new(ray)).is_hit()).count();
 
-    type Run<'r> = (&'r str, &'r Scene<'r>, &'r [Ray], &'r dyn Fn(&Scene, &[Ray]) -> usize, usize);
+    type Run<'r> = (&'r str, &'r Bvh<'r>, &'r [Ray], &'r dyn Fn(&Bvh, &[Ray]) -> usize, usize);
     let runs: [Run; 6] = [
         ("no Embree: the ray is set up", &null, rays, &copied, 0),
         ("intersect1, null callback", &null, rays, &singly, 0),

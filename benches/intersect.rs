@@ -13,7 +13,7 @@
 
 use glam::DVec3;
 use isolume::embree::{
-    Device, GraphTracer, INVALID_ID, Quality, Ray, Ray16, RayHit, RayHit16, Scene as Bvh, SceneBuilder, Valid16,
+    Bvh, BvhBuilder, Device, GraphTracer, INVALID_ID, Quality, Ray, Ray16, RayHit, RayHit16, Valid16,
 };
 use isolume::field::{Field, Sweep};
 use isolume::flattened::{Departure, FlattenedRay, Side};
@@ -238,7 +238,7 @@ fn run(case: &Case, device: &Device, count: usize, repetitions: usize, summary: 
     let tracer = GraphTracer::new(device, &scene).expect("a tracer");
 
     let commit = || {
-        let mut builder = SceneBuilder::new(device).expect("a scene").quality(Quality::High).robust(false);
+        let mut builder = BvhBuilder::new(device).expect("a scene").quality(Quality::High).robust(false);
         builder.triangles(&vertices, &surface.triangles, u32::MAX).expect("triangles");
         builder.commit().expect("a built scene")
     };

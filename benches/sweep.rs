@@ -6,7 +6,7 @@
 //! files that are not there are left out. `--full` adds the growth with the lattice.
 
 use glam::{DVec3, Vec3};
-use isolume::embree::{Device, Ray, RayHit, Scene as Bvh, SceneBuilder};
+use isolume::embree::{Bvh, BvhBuilder, Device, Ray, RayHit};
 use isolume::field::{Field, Sweep};
 use isolume::isa::Isa;
 use isolume::isosurface::extract;
@@ -77,7 +77,7 @@ fn bounces<'d>(device: &'d Device, scene: &Scene, c: f32, count: usize) -> (Bvh<
             Ray::new((Vec3::from_array(vertices[at]) + step * n.as_vec3()).to_array(), d.to_array(), 0.0, f32::INFINITY)
         })
         .collect();
-    let mut builder = SceneBuilder::new(device).expect("a scene");
+    let mut builder = BvhBuilder::new(device).expect("a scene");
     builder.triangles(&vertices, &surface.triangles, u32::MAX).expect("triangles");
     (builder.commit().expect("a built scene"), surface.triangles.len(), rays)
 }

@@ -2,7 +2,7 @@
 //! (`isa`, and the SIMD modules of the pyramid and of sweeps).
 //!
 //! Three layers: `abi`, the structs that are handed to the library, generated from `wrapper/embree_abi.h`; [`Device`],
-//! the library itself and its errors; [`Scene`], a committed set of triangles and of user geometries that borrows or
+//! the library itself and its errors; [`Bvh`], a committed set of triangles and of user geometries that borrows or
 //! shares whatever its callbacks read.
 //!
 //! Wrapped: `rtcNewDevice`, `rtcReleaseDevice`, `rtcGetDeviceProperty`, `rtcGetDeviceError`,
@@ -26,7 +26,7 @@ mod hexahedra;
 mod triangles;
 
 pub use abi::{Hit, Hit16, INVALID_ID, Ray, Ray16, RayHit, RayHit16, RayView, Valid16};
-pub use bvh::{Quality, Scene, SceneBuilder};
+pub use bvh::{Bvh, BvhBuilder, Quality};
 pub use device::Device;
 pub use hexahedra::{GraphTracer, pyramids};
 pub use triangles::SurfaceTracer;

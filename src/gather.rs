@@ -77,7 +77,6 @@ pub fn gathered_irradiance<T: Tracer, L: KnownLight>(
     let mut sums = [DVec3::ZERO; 2];
     let first = rays / 2;
     let mut moments = Moments::default();
-    let (mut misses, mut traced) = (0, 0);
     // Rays that landed, and of them those that found any light.
     let (mut landed, mut lit) = (0, 0);
     let turn = key.nth(0xF_FFFF).bits();
@@ -99,18 +98,18 @@ pub fn gathered_irradiance<T: Tracer, L: KnownLight>(
             least_distance = least_distance.max(farthest);
         }
     }
-    let mut corners = Corners { scene, tracer, light, least_distance, turn };
+    let mut corners = Corners { scene, tracer, light, least_distance, turn, rays: 0, misses: 0 };
     for i in 0..rays {
         if trusted && i == LEAST_UNANIMOUS.max(rays / 4) && landed == i && lit == 0 {
             break;
         }
-        traced += 1;
+        corners.rays += 1;
         let ray = ray(i);
         let hit = if trusted || i >= PILOT { tracer.intersect(&ray) } else { pilot[i as usize] };
         let radiance = hit.map_or(DVec3::ZERO, |hit| {
             landed += 1;
             let mut rng = || key.nth(i);
-            corners.radiance(ray, hit, &mut rng, &mut misses, &mut traced)
+            corners.radiance(ray, hit, &mut rng)
         });
         lit += u32::from(radiance != DVec3::ZERO);
         sums[usize::from(i >= first)] += radiance;
@@ -119,6 +118,7 @@ pub fn gathered_irradiance<T: Tracer, L: KnownLight>(
     let n = f64::from(rays.max(1));
     let mean = (sums[0] + sums[1]) * (PI / n);
     let half = |sum: DVec3, count: u32| if first > 0 { sum * (PI / f64::from(count)) } else { mean };
+    let Corners { rays: traced, misses, .. } = corners;
     // Corrections by a few rays may take more than there is.
     let estimate =
         Estimate { mean: mean.max(DVec3::ZERO), variance: PI * PI * moments.variance() / n, rays: traced, misses };
@@ -157,35 +157,6 @@ fn is_cap_from_within(hit: FlattenedHit) -> bool {
     matches!(hit.target, Target::Cap(_, Side::Higher))
 }
 
-/// What is known where a ray landed; `None` if nothing is, or it is too near to be trusted.
-#[inline]
-fn found(
-    scene: &Scene,
-    (light, least_distance): (&impl KnownLight, f32),
-    ray: &FlattenedRay,
-    hit: FlattenedHit,
-    misses: &mut u64,
-) -> Option<DVec3> {
-    let near = least_distance > 0.0 && hit.t * ray.direction.length() < least_distance;
-    if near || is_cap_from_within(hit) {
-        return None;
-    }
-    // What is known of a luminaire is its front's.
-    if let Target::Polygon(id) = hit.target
-        && scene.polygons()[id as usize].opaque_back
-        && !scene.sees_front(ray, id)
-    {
-        return Some(DVec3::ZERO);
-    }
-    let within = match (ray.departure, hit.target) {
-        // Walls may stand in and out of solids.
-        (Departure::Polygon(_) | Departure::Cap(..), Target::Polygon(_)) => scene.solid_holds(ray, hit.t),
-        _ => scene.leaves_within(ray.departure),
-    };
-    let landed = SurfacePoint { target: hit.target, within, position: ray.at(hit.t), isovalue: ray.isovalue };
-    light.radiance(scene, landed, misses)
-}
-
 /// What gathers in corners know.
 struct Corners<'a, T, L> {
     scene: &'a Scene,
@@ -195,22 +166,18 @@ struct Corners<'a, T, L> {
     least_distance: f32,
     /// Counts the rays that landed near.
     turn: u64,
+    /// Rays traced, and those that landed where the cache holds nothing.
+    rays: u64,
+    misses: u64,
 }
 
 impl<T: Tracer, L: KnownLight> Corners<'_, T, L> {
     /// Radiance that arrives along `ray` from its `hit`: what is known if it is far away or nothing around it is lit,
     /// else on a path until it is. `rng` makes the random numbers of the path.
     #[inline]
-    fn radiance(
-        &mut self,
-        ray: FlattenedRay,
-        hit: FlattenedHit,
-        rng: &mut dyn FnMut() -> Rng,
-        misses: &mut u64,
-        rays: &mut u64,
-    ) -> DVec3 {
-        let known = found(self.scene, (self.light, self.least_distance), &ray, hit, misses);
-        let Some(there) = known else { return self.path(ray, hit, known, &mut rng(), misses, rays) };
+    fn radiance(&mut self, ray: FlattenedRay, hit: FlattenedHit, rng: &mut dyn FnMut() -> Rng) -> DVec3 {
+        let known = self.found(&ray, hit);
+        let Some(there) = known else { return self.path(ray, hit, known, &mut rng()) };
         if there == DVec3::ZERO || !near(self.scene, &ray, hit) {
             return there;
         }
@@ -218,22 +185,38 @@ impl<T: Tracer, L: KnownLight> Corners<'_, T, L> {
         if !self.turn.is_multiple_of(SHARE) {
             return there;
         }
-        there + (self.path(ray, hit, known, &mut rng(), misses, rays) - there) * SHARE as f64
+        there + (self.path(ray, hit, known, &mut rng()) - there) * SHARE as f64
+    }
+
+    /// What is known where a ray landed; `None` if nothing is, or it is too near to be trusted.
+    #[inline]
+    fn found(&mut self, ray: &FlattenedRay, hit: FlattenedHit) -> Option<DVec3> {
+        let Self { scene, light, least_distance, .. } = *self;
+        let near = least_distance > 0.0 && hit.t * ray.direction.length() < least_distance;
+        if near || is_cap_from_within(hit) {
+            return None;
+        }
+        // What is known of a luminaire is its front's.
+        if let Target::Polygon(id) = hit.target
+            && scene.polygons()[id as usize].opaque_back
+            && !scene.sees_front(ray, id)
+        {
+            return Some(DVec3::ZERO);
+        }
+        let within = match (ray.departure, hit.target) {
+            // Walls may stand in and out of solids.
+            (Departure::Polygon(_) | Departure::Cap(..), Target::Polygon(_)) => scene.solid_holds(ray, hit.t),
+            _ => scene.leaves_within(ray.departure),
+        };
+        let landed = SurfacePoint { target: hit.target, within, position: ray.at(hit.t), isovalue: ray.isovalue };
+        light.radiance(scene, landed, &mut self.misses)
     }
 
     /// The same along a path from a `hit` that is near, or of which nothing is `known`. Russian roulette ends what goes
     /// on and on unknown. \[Arvo90\]
     #[cold]
-    fn path(
-        &self,
-        mut ray: FlattenedRay,
-        mut hit: FlattenedHit,
-        mut known: Option<DVec3>,
-        rng: &mut Rng,
-        misses: &mut u64,
-        rays: &mut u64,
-    ) -> DVec3 {
-        let Self { scene, tracer, light, least_distance, .. } = *self;
+    fn path(&mut self, mut ray: FlattenedRay, mut hit: FlattenedHit, mut known: Option<DVec3>, rng: &mut Rng) -> DVec3 {
+        let Self { scene, tracer, .. } = *self;
         let (mut total, mut weight) = (DVec3::ZERO, DVec3::ONE);
         let mut corners = 0;
         for _ in 0..MOST_LANDINGS {
@@ -249,7 +232,7 @@ impl<T: Tracer, L: KnownLight> Corners<'_, T, L> {
                 return total;
             }
             weight *= albedo;
-            total += weight * direct_once(scene, tracer, &receiver, rng, rays) / PI;
+            total += weight * direct_once(scene, tracer, &receiver, rng, &mut self.rays) / PI;
             if known.is_none() {
                 let survival = weight.max_element();
                 if rng.unit() >= survival {
@@ -259,10 +242,10 @@ impl<T: Tracer, L: KnownLight> Corners<'_, T, L> {
             }
             let direction = Frame::new(receiver.normal).to_world(cosine_hemisphere(rng.unit2()));
             ray = scene.ray(receiver.position, direction, ray.isovalue, receiver.departure);
-            *rays += 1;
+            self.rays += 1;
             let Some(next) = tracer.intersect(&ray) else { return total };
             hit = next;
-            known = found(scene, (light, least_distance), &ray, hit, misses);
+            known = self.found(&ray, hit);
         }
         total
     }

@@ -10,7 +10,7 @@ use crate::brdf::reflected;
 use crate::direct::{luminance, open_irradiance};
 use crate::flattened::Side;
 use crate::illumination_grid::{IlluminationGrid, from_nearest, point_grid};
-use crate::linear_fit::{Moments, Sums};
+use crate::linear_fit::{NormalMatrix, Sums};
 use crate::mask::{Mask, local_position};
 use crate::radiance::RadianceSample;
 use crate::scene::Scene;
@@ -124,16 +124,16 @@ impl<'a> Around<'a> {
 
     /// The linear function fitted to `value` of the samples by `weight`, at the point; 0 if all weights are 0.
     fn fit(&self, weight: impl Fn(&Known) -> f32, value: impl Fn(&Known) -> Vec3) -> DVec3 {
-        let (mut moments, mut sums) = (Moments::default(), Sums::default());
+        let (mut matrix, mut sums) = (NormalMatrix::default(), Sums::default());
         for (d, kernel, k) in self.each() {
             let w = kernel * weight(k);
-            moments.add(w, d);
+            matrix.add(w, d);
             sums.add(w * value(k), d);
         }
-        if moments.weight() <= 0.0 {
+        if matrix.weight() <= 0.0 {
             return DVec3::ZERO;
         }
-        sums.fitted(moments.at_origin())
+        sums.fitted(matrix.at_origin())
     }
 
     /// The visible share of direct light, by channel: samples count by the light they could get.

@@ -7,7 +7,7 @@ const RIDGE: f64 = 0.05;
 
 /// Σ w (1, d)(1, d)ᵀ over places d in the unit ball, by column.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Moments([Vec4; 4]);
+pub struct NormalMatrix([Vec4; 4]);
 
 /// Σ w v (1, d) of values v there, by channel.
 #[derive(Clone, Copy, Debug, Default)]
@@ -19,7 +19,7 @@ fn terms(d: Vec3) -> Vec4 {
     Vec4::new(1.0, d.x, d.y, d.z)
 }
 
-impl Moments {
+impl NormalMatrix {
     /// Adds a place of weight `w`.
     #[inline(always)]
     pub fn add(&mut self, w: f32, d: Vec3) {
@@ -43,14 +43,14 @@ impl Moments {
     }
 
     /// The symmetric matrix whose product with [`Sums`] is the fit's value at d = 0 and its slope; of no use if
-    /// [`Moments::weight`] is 0.
+    /// [`NormalMatrix::weight`] is 0.
     pub fn inverse(&self) -> DMat4 {
         // ∫K d_x² / ∫K over the ball is 1/7 for Epanechnikov's kernel. [Silverman86]
         let ridge = DVec4::new(0.0, 1.0, 1.0, 1.0) * (RIDGE / 7.0 * f64::from(self.weight()));
         (self.matrix() + DMat4::from_diagonal(ridge)).inverse()
     }
 
-    /// The first row of [`Moments::inverse`]: the value at d = 0.
+    /// The first row of [`NormalMatrix::inverse`]: the value at d = 0.
     pub fn at_origin(&self) -> DVec4 {
         self.inverse().x_axis
     }
@@ -69,7 +69,7 @@ impl Sums {
         Vec3::from_array(self.0.map(|sum| sum.x))
     }
 
-    /// What a row `g` of [`Moments::inverse`] makes of them: the fit's value, or one of its slopes.
+    /// What a row `g` of [`NormalMatrix::inverse`] makes of them: the fit's value, or one of its slopes.
     #[inline]
     pub fn fitted(&self, g: DVec4) -> DVec3 {
         DVec3::from_array(self.0.map(|sum| g.dot(sum.as_dvec4())))
@@ -83,17 +83,17 @@ mod tests {
     #[test]
     fn a_linear_function_is_found_from_one_side_of_it() {
         let f = |d: Vec3| 2.0 + d.x - 0.5 * d.y + 3.0 * d.z;
-        let (mut moments, mut sums) = (Moments::default(), Sums::default());
+        let (mut matrix, mut sums) = (NormalMatrix::default(), Sums::default());
         for i in 0..1000 {
             // Places in one octant only.
             let d = Vec3::new((i % 10) as f32, (i / 10 % 10) as f32, (i / 100) as f32) / 16.0;
             let w = 1.0 - d.length_squared();
-            moments.add(w, d);
+            matrix.add(w, d);
             sums.add(w * Vec3::new(f(d), 1.0, 0.0), d);
         }
-        let fitted = sums.fitted(moments.at_origin());
+        let fitted = sums.fitted(matrix.at_origin());
         assert!((fitted.y - 1.0).abs() < 1e-5 && fitted.z == 0.0, "{fitted}");
-        let (fitted, mean) = (fitted.x as f32, sums.total().x / moments.weight());
+        let (fitted, mean) = (fitted.x as f32, sums.total().x / matrix.weight());
         // The prior, strong for places so close together, leaves a fifth of what the mean is off.
         assert!((mean - 2.0).abs() > 0.5 && (fitted - 2.0).abs() < 0.2 * (mean - 2.0).abs(), "{fitted}, {mean}");
     }

@@ -1,17 +1,19 @@
 //! Photons in the flattened scene: emission over luminaires and isovalues, scattering inside one hyperplane, energy
 //! kept to the last bit. \[BB09 §2.3; Jensen01\]
 
+mod emitter;
+
 use crate::flat;
-use crate::flattened::{Departure, FlattenedRay, Side, Target};
+use crate::flattened::{FlattenedRay, Side, Target};
 use crate::isovalue_axis::IsovalueAxis;
 use crate::landing::{Landing, MOST_LANDINGS, landing};
-use crate::rng::{Rng, Sobol, Stage};
+use crate::rng::{Rng, Stage};
 use crate::scene::Scene;
 use crate::tracer::Tracer;
 use crate::warp::{Frame, cosine_hemisphere};
+use emitter::{Emitter, Flight};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
-use std::f64::consts::PI;
 use std::ops::AddAssign;
 
 /// A photon that landed on a level set.
@@ -215,22 +217,6 @@ const CHUNK: u64 = 1 << 14;
 /// Chunks whose parts are joined at once.
 const ROUND: usize = 32;
 
-/// One source of photons with its total power × isovalue per channel.
-enum Source {
-    /// A luminaire, by polygon number.
-    Luminaire(u32, DVec3),
-    /// The emitting level sets of a field, by its number.
-    Field(usize, DVec3),
-}
-
-impl Source {
-    fn power(&self) -> DVec3 {
-        match self {
-            Source::Luminaire(_, p) | Source::Field(_, p) => *p,
-        }
-    }
-}
-
 /// Emits and traces `settings.count` photons. `tick` is called with the number of photons done, from any thread;
 /// returning false stops the work early with what is done.
 pub fn trace_photons<T: Tracer>(
@@ -239,9 +225,8 @@ pub fn trace_photons<T: Tracer>(
     settings: &PhotonSettings,
     tick: &(dyn Fn(u64) -> bool + Sync),
 ) -> Photons {
-    let sources = sources(scene);
-    let total: f64 = sources.iter().map(|s| s.power().max_element()).sum();
-    if total == 0.0 || settings.count == 0 {
+    let photons = PhotonTracer { emitter: Emitter::new(scene, settings), tracer };
+    if !photons.emitter.shines() || settings.count == 0 {
         return Photons::default();
     }
     let mut all = Photons::default();
@@ -255,7 +240,7 @@ pub fn trace_photons<T: Tracer>(
                 let range = chunk as u64 * CHUNK..((chunk as u64 + 1) * CHUNK).min(settings.count);
                 let n = range.end - range.start;
                 if tick(0) {
-                    range.for_each(|i| trace_photon(scene, tracer, settings, &sources, total, i, &mut out));
+                    range.for_each(|i| photons.trace(i, &mut out));
                     tick(n);
                 }
                 out
@@ -272,78 +257,56 @@ pub fn trace_photons<T: Tracer>(
     all
 }
 
-/// Luminaires at flux Φ = π L_e A per hyperplane (times the sweep's length 1), and the level sets if they emit.
-fn sources(scene: &Scene) -> Vec<Source> {
-    let mut sources: Vec<Source> =
-        (0..).zip(scene.luminaires()).map(|(l, p)| Source::Luminaire(l, PI * p.area() * p.emission)).collect();
-    for (number, member) in scene.members().iter().enumerate().filter(|(_, m)| m.surface.emission != DVec3::ZERO) {
-        // Both sides emit π L_e |∇h| per volume; |∇h| multiplies the single photon. The mean slope of the sweep across
-        // Ω's diagonal only balances this source against luminaires.
-        let lattice = member.field.lattice();
-        let diagonal = lattice.diagonal();
-        sources.push(Source::Field(number, 2.0 * PI * member.surface.emission * lattice.world_volume() / diagonal));
-    }
-    sources
+/// Traces single photons.
+struct PhotonTracer<'a, T> {
+    emitter: Emitter<'a>,
+    tracer: &'a T,
 }
 
-/// A photon about to fly.
-struct Flight {
-    origin: Vec3,
-    direction: DVec3,
-    isovalue: f32,
-    departure: Departure,
-    power: DVec3,
-    /// What the first landing counts as.
-    bounces: u16,
-}
-
-#[allow(clippy::cast_possible_truncation, reason = "storage is f32; indices below 2³²")]
-fn trace_photon<T: Tracer>(
-    scene: &Scene,
-    tracer: &T,
-    settings: &PhotonSettings,
-    sources: &[Source],
-    total: f64,
-    index: u64,
-    out: &mut Photons,
-) {
-    let mut rng = Rng::stream(settings.seed, Stage::Photon, index);
-    out.emitted += 1;
-    let Some(mut photon) = emit(scene, settings, sources, total, index) else { return };
-    let bin = ((photon.isovalue * ENERGY_BINS as f32) as usize).min(ENERGY_BINS - 1);
-    out.energy[bin].emitted += photon.power.element_sum();
-    let first = photon.bounces;
-    for bounces in first..=MOST_LANDINGS {
-        let ray = scene.ray(photon.origin, photon.direction, photon.isovalue, photon.departure);
-        let ray = FlattenedRay { with_light: true, ..ray };
-        out.rays += 1;
-        let Some(hit) = tracer.intersect(&ray) else {
-            out.energy[bin].escaped += photon.power.element_sum();
-            return;
-        };
-        let landed = landing(scene, &ray, hit);
-        out.store(scene, (&photon, bounces), (hit.target, ray.at(hit.t)), landed.as_ref());
-        let energy = &mut out.energy[bin];
-        let Some(Landing { receiver, albedo, .. }) = landed else {
-            out.flat_gradient += 1;
-            energy.terminated += photon.power.element_sum();
-            return;
-        };
-        // Russian roulette keeps the largest channel's power. [Arvo90]
-        let reflected = photon.power * albedo;
-        let survival = (reflected.max_element() / photon.power.max_element()).min(1.0);
-        if rng.unit() >= survival {
-            energy.absorbed += photon.power.element_sum();
-            return;
+impl<T: Tracer> PhotonTracer<'_, T> {
+    /// Emits photon `index` and follows it to its end; `out` keeps what it brings where it lands.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "bins of [0, 1]")]
+    fn trace(&self, index: u64, out: &mut Photons) {
+        let scene = self.emitter.scene;
+        let mut rng = Rng::stream(self.emitter.settings.seed, Stage::Photon, index);
+        out.emitted += 1;
+        let Some(mut photon) = self.emitter.emit(index) else { return };
+        let bin = ((photon.isovalue * ENERGY_BINS as f32) as usize).min(ENERGY_BINS - 1);
+        out.energy[bin].emitted += photon.power.element_sum();
+        let first = photon.bounces;
+        for bounces in first..=MOST_LANDINGS {
+            let ray = scene.ray(photon.origin, photon.direction, photon.isovalue, photon.departure);
+            let ray = FlattenedRay { with_light: true, ..ray };
+            out.rays += 1;
+            let Some(hit) = self.tracer.intersect(&ray) else {
+                out.energy[bin].escaped += photon.power.element_sum();
+                return;
+            };
+            let landed = landing(scene, &ray, hit);
+            out.store(scene, (&photon, bounces), (hit.target, ray.at(hit.t)), landed.as_ref());
+            let energy = &mut out.energy[bin];
+            let Some(Landing { receiver, albedo, .. }) = landed else {
+                out.flat_gradient += 1;
+                energy.terminated += photon.power.element_sum();
+                return;
+            };
+            // Russian roulette keeps the largest channel's power. [Arvo90]
+            let reflected = photon.power * albedo;
+            let survival = (reflected.max_element() / photon.power.max_element()).min(1.0);
+            if rng.unit() >= survival {
+                energy.absorbed += photon.power.element_sum();
+                return;
+            }
+            let next = reflected / survival;
+            energy.absorbed += (photon.power - next).element_sum();
+            if bounces - first >= self.emitter.settings.max_bounces || bounces == MOST_LANDINGS {
+                energy.terminated += next.element_sum();
+                return;
+            }
+            let direction = Frame::new(receiver.normal).to_world(cosine_hemisphere(rng.unit2()));
+            photon =
+                Flight { origin: receiver.position, direction, departure: receiver.departure, power: next, ..photon };
         }
-        let next = reflected / survival;
-        energy.absorbed += (photon.power - next).element_sum();
-        if bounces - first >= settings.max_bounces || bounces == MOST_LANDINGS {
-            energy.terminated += next.element_sum();
-            return;
-        }
-        let direction = Frame::new(receiver.normal).to_world(cosine_hemisphere(rng.unit2()));
-        photon = Flight { origin: receiver.position, direction, departure: receiver.departure, power: next, ..photon };
     }
 }
 
@@ -363,87 +326,11 @@ fn foreshortening(receiver: Option<DVec3>, gradient: DVec3, direction: DVec3) ->
     (receiver / (own * share).max(1e-6)).min(4.0) as f32
 }
 
-/// Photon `index`: source by power, point uniform over the area, direction by the cosine, isovalue along the
-/// axis. All from one scrambled Sobol point, so that any power-of-two prefix is stratified in isovalue, source, place
-/// and direction.
-#[allow(clippy::cast_possible_truncation, reason = "storage is f32; indices below 2³²")]
-fn emit(scene: &Scene, settings: &PhotonSettings, sources: &[Source], total: f64, index: u64) -> Option<Flight> {
-    let set = Sobol::set(settings.seed, Stage::Photon, index >> 32);
-    let i = index as u32;
-    let mut pick = set.coordinate(i, 5) * total;
-    let last = sources.len() - 1;
-    let source = sources
-        .iter()
-        .enumerate()
-        .find(|(k, s)| {
-            pick -= s.power().max_element();
-            pick < 0.0 || *k == last
-        })
-        .map(|(_, s)| s)?;
-    let probability = source.power().max_element() / total;
-    let share = source.power() / (probability * settings.count as f64);
-    let direction = cosine_hemisphere(set.point2(i, 3));
-    match *source {
-        Source::Luminaire(id, _) => {
-            let drawn = || settings.axis.isovalue(set.coordinate(i, 0)) as f32;
-            let isovalue = settings.fixed_isovalue.unwrap_or_else(drawn);
-            let density = if settings.fixed_isovalue.is_none() { settings.axis.density(isovalue) } else { 1.0 };
-            let p = &scene.polygons()[id as usize];
-            let y = p.sample(set.point2(i, 1));
-            Some(Flight {
-                origin: scene.lattice().to_index(y).as_vec3(),
-                direction: Frame::new(p.normal()).to_world(direction),
-                isovalue,
-                departure: Departure::Polygon(id),
-                power: share / f64::from(density),
-                bounces: 0,
-            })
-        }
-        Source::Field(number, _) => {
-            // By the field's own lattice, from whatever field the scene is seen.
-            let companion = scene.companions().iter().position(|c| c.number == number);
-            let other = companion.map(|n| &scene.companions()[n]);
-            let field = other.map_or(&scene.field, |c| &c.member.field);
-            let lattice = field.lattice();
-            let [v, w] = set.point2(i, 1);
-            let origin = (lattice.far() * DVec3::new(set.coordinate(i, 0), v, w)).as_vec3();
-            let h = field.value(origin.as_dvec3());
-            if !(0.0..=1.0).contains(&h) {
-                return None;
-            }
-            // Half of the photons leave into each side; the low bits of an independent stream decide.
-            let side = if Rng::stream(settings.seed, Stage::Photon, !index).bits() & 1 == 0 {
-                Side::Lower
-            } else {
-                Side::Higher
-            };
-            let falling = field.falling_normal(origin.as_dvec3())?;
-            let normal = side.facing(falling);
-            let diagonal = lattice.diagonal();
-            // On a plateau beside a slope there is a normal, and nothing to emit.
-            let power = share * field.gradient(origin.as_dvec3()).length() * diagonal;
-            if power == DVec3::ZERO {
-                return None;
-            }
-            let (origin, departure) = match (companion, other) {
-                (Some(n), Some(c)) => (c.to_local(origin.as_dvec3()).as_vec3(), Departure::Companion(n as u8, side)),
-                _ => (origin, Departure::Surface(side)),
-            };
-            Some(Flight {
-                origin,
-                direction: Frame::new(normal).to_world(direction),
-                isovalue: h as f32,
-                departure,
-                power,
-                bounces: 1,
-            })
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::flattened::Departure;
+    use crate::rng::Sobol;
     use crate::warp::{Frame, cosine_hemisphere};
 
     /// Light from everywhere, as an inclined receiver normal takes it up. With σ = (1 + cos θ)/2, the bound at 4 costs

@@ -211,7 +211,7 @@ pub fn reference<T: Tracer>(
                 let mut paths = PathTracer::new(scene, tracer);
                 let radiance = match &map {
                     None => paths.outgoing(receiver, samples, key),
-                    Some(map) => map.outgoing(scene, tracer, receiver, samples, key, &mut paths.rays),
+                    Some(map) => map.outgoing(&mut paths, receiver, samples, key),
                 };
                 rays.fetch_add(paths.rays, Ordering::Relaxed);
                 tick(1);

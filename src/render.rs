@@ -29,6 +29,8 @@ pub struct Camera {
     pub fov: f64,
     /// Pixels across and down.
     pub size: [usize; 2],
+    /// Rays per pixel.
+    pub samples: u32,
 }
 
 impl Camera {
@@ -37,7 +39,7 @@ impl Camera {
 
     /// The default view: on the box's axis, looking along +y with z up, vertical field of view 40°, as far out as lets
     /// the front face just fill the frame; `height` pixels tall, aspect Lx : Lz, which may be wider than
-    /// [`Camera::MOST`].
+    /// [`Camera::MOST`]; 16 rays per pixel.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "pixel counts")]
     pub fn facing(scene: &Scene, height: usize) -> Self {
         let [lo, hi] = scene.bounds();
@@ -46,15 +48,15 @@ impl Camera {
         let distance = 0.5 * size.z / f64::to_radians(0.5 * fov).tan();
         let eye = DVec3::new(centre.x, lo.y - distance, centre.z);
         let width = ((height as f64 * size.x / size.z).round() as usize).max(1);
-        Self { eye, target: centre, up: DVec3::Z, fov, size: [width, height] }
+        Self { eye, target: centre, up: DVec3::Z, fov, size: [width, height], samples: 16 }
     }
 
     /// The unit direction of the view, and the steps of a pixel to the right and up on the plane one unit before the
     /// eye. Sums of these are directions of rays, of no unit length.
     ///
     /// # Errors
-    /// `Invalid` if eye and target coincide or the view runs along up, for an impossible field of view, and for a
-    /// picture that is empty or larger than [`Camera::MOST`].
+    /// `Invalid` if eye and target coincide or the view runs along up, for an impossible field of view, for a picture
+    /// that is empty or larger than [`Camera::MOST`], and for no rays.
     fn basis(&self) -> Result<[DVec3; 3]> {
         let fail = || Error::Invalid("camera: the eye, the target and up must span a plane".into());
         let forward = (self.target - self.eye).try_normalize().ok_or_else(fail)?;
@@ -71,6 +73,9 @@ impl Camera {
                 self.size[1],
                 Self::MOST
             )));
+        }
+        if self.samples == 0 {
+            return Err(Error::Invalid("camera: 0 samples; a pixel needs one ray at least".into()));
         }
         let scale = f64::to_radians(0.5 * self.fov).tan() * 2.0 / self.size[1] as f64;
         Ok([forward, right * scale, right.cross(forward) * scale])
@@ -97,17 +102,16 @@ pub struct Rendered {
     pub rays: u64,
 }
 
-/// Renders the isosurface at `isovalue` (source units) with `samples` rays per pixel.
+/// Renders the isosurface at `isovalue` (source units).
 ///
 /// # Errors
-/// `Invalid` for an isovalue outside the sweep, no samples, or an impossible camera; `Embree`; `Interrupted`; as
+/// `Invalid` for an isovalue outside the sweep or an impossible camera; `Embree`; `Interrupted`; as
 /// [`FinalGather::new`].
 pub fn render(
     scene: &Scene,
     isovalue: f64,
     camera: &Camera,
     shading: Shading<'_>,
-    samples: u32,
     device: &Device,
     progress: Progress,
 ) -> Result<Rendered> {
@@ -117,9 +121,6 @@ pub fn render(
             "isovalue {} lies outside the sweep {sweep}; choose one inside, or bake a wider sweep",
             Shortest(isovalue)
         )));
-    }
-    if samples == 0 {
-        return Err(Error::Invalid("samples: at least one ray per pixel".into()));
     }
     let tracer = GraphTracer::new(device, scene)?;
     let c = sweep.isovalue(isovalue);
@@ -139,8 +140,8 @@ pub fn render(
             DVec3::ZERO
         })
     };
-    let picture = trace_picture(scene, &tracer, c, camera, samples, &shade, progress)?;
-    let total = (camera.size[0] * camera.size[1]) as f64 * f64::from(samples);
+    let picture = trace_picture(scene, &tracer, c, camera, &shade, progress)?;
+    let total = (camera.size[0] * camera.size[1]) as f64 * f64::from(camera.samples);
     let rays = gather.map_or(0, |g| g.rays());
     Ok(Rendered { picture, unbaked: unbaked.into_inner() as f64 / total, rays })
 }
@@ -149,7 +150,7 @@ pub fn render(
 /// the picture.
 pub type Shade<'a> = dyn Fn(&FlattenedRay, FlattenedHit, DVec3, u64) -> DVec3 + Sync + 'a;
 
-/// Sends `samples` stratified rays through each pixel of hyperplane `c` and averages what `shade` makes of the hits;
+/// Sends stratified rays through each pixel of hyperplane `c` and averages what `shade` makes of the hits;
 /// misses are black.
 ///
 /// # Errors
@@ -159,12 +160,11 @@ pub fn trace_picture<T: Tracer>(
     tracer: &T,
     c: f32,
     camera: &Camera,
-    samples: u32,
     shade: &Shade<'_>,
     progress: Progress,
 ) -> Result<Picture> {
     let [forward, right, down] = camera.basis().map(|[f, r, u]| [f, r, -u])?;
-    let [width, height] = camera.size;
+    let ([width, height], samples) = (camera.size, camera.samples);
     let eye = scene.lattice().to_index(camera.eye).as_vec3();
     let mut picture = Picture::new(width, height);
     let stage = progress.stage("picture", (width * height) as u64);

@@ -13,7 +13,7 @@ pub use scattered::{Scattered, smooth_scattered};
 use crate::direct::luminance;
 use crate::field::Field;
 use crate::flattened::Side;
-use crate::linear_fit::{Moments, Sums};
+use crate::linear_fit::{NormalMatrix, Sums};
 use crate::mask::local_position;
 use crate::scene::Scene;
 use crate::volume::Lattice;
@@ -56,14 +56,14 @@ trait Surroundings {
 
     /// What a linear fit of `values` around a place says there.
     fn fit(&self, at: Self::Place, values: impl Fn(Self::Place) -> Halves) -> Halves {
-        let mut moments = Moments::default();
+        let mut matrix = NormalMatrix::default();
         let mut sums = [Sums::default(); 2];
         self.around(at, |n, d, d2| {
             let w = 1.0 - d2;
-            moments.add(w, d);
+            matrix.add(w, d);
             sums.iter_mut().zip(values(n)).for_each(|(sums, v)| sums.add(w * v, d));
         });
-        let g = moments.at_origin();
+        let g = matrix.at_origin();
         sums.map(|sums| sums.fitted(g).as_vec3())
     }
 

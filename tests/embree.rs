@@ -1,7 +1,7 @@
 //! The fence around Embree: layout, callbacks, errors. Every expected distance is known without Embree.
 
 use isolume::embree::{
-    Device, INVALID_ID, Ray, Ray16, RayHit, RayHit16, RayView, Scene, SceneBuilder, UserGeometry, UserHit, UserHits16,
+    Bvh, BvhBuilder, Device, INVALID_ID, Ray, Ray16, RayHit, RayHit16, RayView, UserGeometry, UserHit, UserHits16,
     Valid16,
 };
 use isolume::error::Error;
@@ -24,8 +24,8 @@ fn device() -> Device {
     Device::new(1).unwrap()
 }
 
-fn square(device: &Device) -> Scene<'static> {
-    let mut builder = SceneBuilder::new(device).unwrap();
+fn square(device: &Device) -> Bvh<'static> {
+    let mut builder = BvhBuilder::new(device).unwrap();
     builder.triangles(&CORNERS, &SQUARE, u32::MAX).unwrap();
     builder.commit().unwrap()
 }
@@ -119,7 +119,7 @@ fn embree_writes_nothing_behind_our_structs() {
 
     let spheres = Spheres::new(1);
     let device = device();
-    let mut builder = SceneBuilder::new(&device).unwrap();
+    let mut builder = BvhBuilder::new(&device).unwrap();
     let triangles = builder.triangles(&CORNERS.map(|c| [c[0] + 10.0, c[1], c[2]]), &SQUARE, u32::MAX).unwrap();
     let sphere = builder.user(&spheres, u32::MAX).unwrap();
     let scene = builder.commit().unwrap();
@@ -153,7 +153,7 @@ fn embree_writes_nothing_behind_our_structs() {
 fn a_user_sphere_is_hit_where_it_is() {
     let spheres = Spheres::new(3);
     let device = device();
-    let mut builder = SceneBuilder::new(&device).unwrap();
+    let mut builder = BvhBuilder::new(&device).unwrap();
     let id = builder.user(&spheres, u32::MAX).unwrap();
     let scene = builder.commit().unwrap();
     // Straight down on each; along the row from both ends; from inside.
@@ -179,7 +179,7 @@ fn a_user_sphere_is_hit_where_it_is() {
 fn id_and_time_arrive_bit_for_bit() {
     let spheres = Spheres::new(1);
     let device = device();
-    let mut builder = SceneBuilder::new(&device).unwrap();
+    let mut builder = BvhBuilder::new(&device).unwrap();
     builder.user(&spheres, u32::MAX).unwrap();
     let scene = builder.commit().unwrap();
     // Zeros, denormals, ones, infinities, quiet and signalling NaNs with payloads, all bits.
@@ -199,7 +199,7 @@ fn id_and_time_arrive_bit_for_bit() {
 fn occluded_and_packets_agree_with_intersect() {
     let spheres = Arc::new(Spheres::new(5));
     let device = device();
-    let mut builder = SceneBuilder::new(&device).unwrap();
+    let mut builder = BvhBuilder::new(&device).unwrap();
     builder.user_shared(Arc::clone(&spheres), u32::MAX).unwrap();
     builder.triangles(&CORNERS.map(|c| [20.0 * c[0] - 2.0, 8.0 * c[1] - 4.0, -0.5]), &SQUARE, u32::MAX).unwrap();
     let scene = builder.commit().unwrap();
@@ -277,7 +277,7 @@ fn packets_arrive_as_packets() {
         return;
     }
     let (device, counter) = (device(), Counter::default());
-    let mut builder = SceneBuilder::new(&device).unwrap();
+    let mut builder = BvhBuilder::new(&device).unwrap();
     builder.user(&counter, u32::MAX).unwrap();
     let scene = builder.commit().unwrap();
     let rays = Ray16::new(&[Ray::new([0.0, 0.0, 5.0], [0.0, 0.0, -1.0], 0.0, FAR); 16]);
@@ -312,7 +312,7 @@ impl UserGeometry for Liar {
 fn hits_outside_the_ray_are_ignored() {
     for (t, counts) in [(1.0, true), (4.0, true), (8.0, true), (0.5, false), (8.5, false), (f32::NAN, false)] {
         let liar = Liar(t);
-        let mut builder = SceneBuilder::new(&device()).unwrap();
+        let mut builder = BvhBuilder::new(&device()).unwrap();
         builder.user(&liar, u32::MAX).unwrap();
         let scene = builder.commit().unwrap();
         let mut rayhit = RayHit::new(Ray::new([0.0, 0.0, 5.0], [0.0, 0.0, -1.0], 1.0, 8.0));
@@ -324,7 +324,7 @@ fn hits_outside_the_ray_are_ignored() {
 #[test]
 fn masks_select_geometries() {
     let spheres = Spheres::new(1);
-    let mut builder = SceneBuilder::new(&device()).unwrap();
+    let mut builder = BvhBuilder::new(&device()).unwrap();
     let sphere = builder.user(&spheres, 0b01).unwrap();
     let floor = builder.triangles(&CORNERS.map(|c| [c[0] - 0.5, c[1] - 0.5, -2.0]), &SQUARE, 0b10).unwrap();
     let scene = builder.commit().unwrap();
@@ -353,10 +353,10 @@ fn a_ray_that_starts_on_a_wall_sees_it() {
 #[test]
 fn empty_geometries_and_scenes_are_fine() {
     let (device, nothing) = (device(), Spheres::new(0));
-    let mut builder = SceneBuilder::new(&device).unwrap();
+    let mut builder = BvhBuilder::new(&device).unwrap();
     assert_eq!(builder.triangles(&[], &[], u32::MAX).unwrap(), 0);
     assert_eq!(builder.user(&nothing, u32::MAX).unwrap(), 1);
-    for scene in [builder.commit().unwrap(), SceneBuilder::new(&device).unwrap().commit().unwrap()] {
+    for scene in [builder.commit().unwrap(), BvhBuilder::new(&device).unwrap().commit().unwrap()] {
         let ray = Ray::new([0.5, 0.5, 1.0], [0.0, 0.0, -1.0], 0.0, FAR);
         let mut rayhit = RayHit::new(ray);
         scene.intersect1(&mut rayhit);
@@ -391,7 +391,7 @@ fn what_embree_would_swallow_is_refused() {
         Box([1.0; 3], [0.0; 3]),
         Box([-1.9e18; 3], [0.0; 3]),
     ];
-    let mut builder = SceneBuilder::new(&device()).unwrap();
+    let mut builder = BvhBuilder::new(&device()).unwrap();
     for geometry in &bad {
         invalid(builder.user(geometry, u32::MAX), "user primitive 0 has the bounds");
     }

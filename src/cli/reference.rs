@@ -172,15 +172,14 @@ pub(super) fn picture(
     scene: &Scene,
     isovalue: f64,
     camera: &Camera,
-    samples: u32,
     trilinear: bool,
     device: &Device,
     progress: Progress,
 ) -> Result<Picture> {
     let isovalue = unit_isovalue(&scene.field, isovalue)?;
     if trilinear {
-        path_picture(scene, &GraphTracer::new(device, scene)?, isovalue, camera, samples, progress)
+        path_picture(scene, &GraphTracer::new(device, scene)?, isovalue, camera, progress)
     } else {
-        path_picture(scene, &SurfaceTracer::new(device, scene, isovalue, 1)?, isovalue, camera, samples, progress)
+        path_picture(scene, &SurfaceTracer::new(device, scene, isovalue, 1)?, isovalue, camera, progress)
     }
 }

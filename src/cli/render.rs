@@ -204,7 +204,7 @@ impl Render {
 
     fn camera(&self, scene: &Scene) -> Result<Camera> {
         let mut camera = Camera::facing(scene, self.height);
-        camera.fov = self.fov;
+        (camera.fov, camera.samples) = (self.fov, self.samples);
         if let Some(width) = self.width {
             camera.size[0] = width;
         }
@@ -243,7 +243,7 @@ impl Render {
                 Source::Bake(baked) if !self.local => Shading::Baked(baked, gather),
                 _ => Shading::Local(source.exposure()),
             };
-            return render(scene, isovalue, camera, shading, self.samples, &device()?, progress);
+            return render(scene, isovalue, camera, shading, &device()?, progress);
         }
         if scene.fields() > 1 && scene.policy() == Policy::Independent {
             return Err(Error::not_supported(
@@ -252,7 +252,7 @@ impl Render {
             ));
         }
         source.baked().map_or(Ok(()), BakedVolume::whole).map_err(|e| e.in_file(&self.file))?;
-        let picture = picture(scene, isovalue, camera, self.samples, self.trilinear, &device()?, progress)?;
+        let picture = picture(scene, isovalue, camera, self.trilinear, &device()?, progress)?;
         Ok(Rendered { picture, unbaked: 0.0, rays: 0 })
     }
 

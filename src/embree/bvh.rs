@@ -34,29 +34,29 @@ impl Quality {
     }
 }
 
-/// Collects geometries; [`SceneBuilder::commit`] makes a [`Scene`] of them.
+/// Collects geometries; [`BvhBuilder::commit`] makes a [`Bvh`] of them.
 ///
 /// ```
-/// use isolume::embree::{Device, Ray, RayHit, SceneBuilder};
+/// use isolume::embree::{Device, Ray, RayHit, BvhBuilder};
 /// let device = Device::new(1)?;
-/// let mut builder = SceneBuilder::new(&device)?;
+/// let mut builder = BvhBuilder::new(&device)?;
 /// let floor = builder.triangles(&[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], &[[0, 1, 2]], u32::MAX)?;
-/// let scene = builder.commit()?;
+/// let bvh = builder.commit()?;
 /// let mut rayhit = RayHit::new(Ray::new([0.25, 0.25, 2.0], [0.0, 0.0, -1.0], 0.0, f32::INFINITY));
-/// scene.intersect1(&mut rayhit);
+/// bvh.intersect1(&mut rayhit);
 /// assert!(rayhit.hit.geometry == floor && (rayhit.ray.tfar - 2.0).abs() < 1e-6);
 /// # Ok::<(), isolume::error::Error>(())
 /// ```
-pub struct SceneBuilder<'a> {
-    scene: Scene<'a>,
+pub struct BvhBuilder<'a> {
+    bvh: Bvh<'a>,
     quality: Quality,
     robust: bool,
 }
 
-/// A committed scene. Any number of threads may query it at once.
+/// A committed bounding volume hierarchy, which Embree calls a scene. Any number of threads may query it at once.
 ///
 /// It borrows (`'a`) or shares what its user geometries read, and keeps its [`Device`] alive.
-pub struct Scene<'a> {
+pub struct Bvh<'a> {
     handle: embree4_sys::RTCScene,
     device: Device,
     /// Whether packets go to Embree in halves: it takes sixteen rays apart, one by one, where its own vectors are eight
@@ -70,12 +70,12 @@ pub struct Scene<'a> {
 
 // SAFETY: the handle belongs to no thread. What its callbacks read is either borrowed, `&'a G` with `G: Sync`, or
 // shared, `Arc<G>` with `G: Send + Sync`: both may move to another thread.
-unsafe impl Send for Scene<'_> {}
-// SAFETY: `&Scene` allows queries only, which Embree documents as safe to run concurrently on a committed scene; the
-// callbacks that they run take `&G` with `G: Sync`. (`SceneBuilder`, which can change a scene, needs `&mut`.)
-unsafe impl Sync for Scene<'_> {}
+unsafe impl Send for Bvh<'_> {}
+// SAFETY: `&Bvh` allows queries only, which Embree documents as safe to run concurrently on a committed scene; the
+// callbacks that they run take `&G` with `G: Sync`. (`BvhBuilder`, which can change a scene, needs `&mut`.)
+unsafe impl Sync for Bvh<'_> {}
 
-impl Drop for Scene<'_> {
+impl Drop for Bvh<'_> {
     fn drop(&mut self) {
         // SAFETY: the handle came from rtcNewScene and is released once, here, before `_shared` and `device` go, and
         // within `'a`: no callback can run afterwards.
@@ -103,7 +103,7 @@ impl Drop for Geometry {
     }
 }
 
-impl<'a> SceneBuilder<'a> {
+impl<'a> BvhBuilder<'a> {
     /// An empty scene: ROBUST, of medium quality.
     ///
     /// # Errors
@@ -116,9 +116,9 @@ impl<'a> SceneBuilder<'a> {
             return Err(Error::Embree("no scene could be made".into()));
         }
         let halves = device.packet_width() == 8;
-        let scene = Scene { handle, device: device.clone(), halves, _shared: Vec::new(), _borrowed: PhantomData };
+        let bvh = Bvh { handle, device: device.clone(), halves, _shared: Vec::new(), _borrowed: PhantomData };
         device.check()?;
-        Ok(Self { scene, quality: Quality::default(), robust: true })
+        Ok(Self { bvh, quality: Quality::default(), robust: true })
     }
 
     /// Sets the build quality of the scene and of the geometries added from here on.
@@ -158,7 +158,7 @@ impl<'a> SceneBuilder<'a> {
             let n = vertices.len();
             return Err(Error::Invalid(format!("triangle {i} has the vertices {t:?}, but there are only {n}")));
         }
-        let geometry = Geometry::new(&self.scene.device, embree4_sys::RTCGeometryType::TRIANGLE)?;
+        let geometry = Geometry::new(&self.bvh.device, embree4_sys::RTCGeometryType::TRIANGLE)?;
         if !indices.is_empty() {
             self.fill(&geometry, embree4_sys::RTCBufferType::VERTEX, embree4_sys::RTCFormat::FLOAT3, vertices)?;
             self.fill(&geometry, embree4_sys::RTCBufferType::INDEX, embree4_sys::RTCFormat::UINT3, indices)?;
@@ -181,7 +181,7 @@ impl<'a> SceneBuilder<'a> {
         let target = unsafe {
             embree4_sys::rtcSetNewGeometryBuffer(geometry.0, buffer, 0, format, stride as _, items.len() as _)
         };
-        self.scene.device.check()?;
+        self.bvh.device.check()?;
         if target.is_null() {
             return Err(Error::Embree(format!("no buffer for {} items of {stride} bytes", items.len())));
         }
@@ -197,19 +197,19 @@ impl<'a> SceneBuilder<'a> {
     /// `Invalid` if a primitive's bounds are not finite, inverted, or beyond 1.844e18 (Embree would drop it silently);
     /// `Embree` if the library refuses.
     pub fn user<G: UserGeometry + 'a>(&mut self, geometry: &'a G, mask: u32) -> Result<u32> {
-        // SAFETY: `Scene<'a>` borrows `geometry` for `'a`, so the pointer outlives every callback.
+        // SAFETY: `Bvh<'a>` borrows `geometry` for `'a`, so the pointer outlives every callback.
         unsafe { self.register::<G>(geometry, mask) }
     }
 
-    /// [`SceneBuilder::user`] for a geometry that the scene shares, so that it needs to borrow nothing.
+    /// [`BvhBuilder::user`] for a geometry that the scene shares, so that it needs to borrow nothing.
     ///
     /// # Errors
-    /// As [`SceneBuilder::user`].
+    /// As [`BvhBuilder::user`].
     pub fn user_shared<G: UserGeometry + Send + 'a>(&mut self, geometry: Arc<G>, mask: u32) -> Result<u32> {
         let pointer = Arc::as_ptr(&geometry);
         // Kept first: should `register` fail half-way, the pointer is still good for the life of the scene.
-        self.scene._shared.push(geometry);
-        // SAFETY: `_shared` keeps the Arc until `Scene::drop` has released the scene, so the pointer outlives every
+        self.bvh._shared.push(geometry);
+        // SAFETY: `_shared` keeps the Arc until `Bvh::drop` has released the scene, so the pointer outlives every
         // callback.
         unsafe { self.register::<G>(pointer, mask) }
     }
@@ -231,7 +231,7 @@ impl<'a> SceneBuilder<'a> {
                 )));
             }
         }
-        let handle = Geometry::new(&self.scene.device, embree4_sys::RTCGeometryType::USER)?;
+        let handle = Geometry::new(&self.bvh.device, embree4_sys::RTCGeometryType::USER)?;
         // SAFETY: the handle is live; the pointer is what the callbacks of the same `G` expect, and the caller
         // promises that it outlives the scene. Embree never writes through it, and neither do they.
         unsafe {
@@ -250,9 +250,9 @@ impl<'a> SceneBuilder<'a> {
             embree4_sys::rtcSetGeometryMask(geometry.0, mask);
             embree4_sys::rtcSetGeometryBuildQuality(geometry.0, self.quality.raw());
             embree4_sys::rtcCommitGeometry(geometry.0);
-            embree4_sys::rtcAttachGeometry(self.scene.handle, geometry.0)
+            embree4_sys::rtcAttachGeometry(self.bvh.handle, geometry.0)
         };
-        self.scene.device.check()?;
+        self.bvh.device.check()?;
         Ok(id)
     }
 
@@ -260,22 +260,22 @@ impl<'a> SceneBuilder<'a> {
     ///
     /// # Errors
     /// `Embree` with what the library reported, such as a lack of memory.
-    pub fn commit(self) -> Result<Scene<'a>> {
+    pub fn commit(self) -> Result<Bvh<'a>> {
         let flags =
             if self.robust { embree4_sys::RTCSceneFlags::ROBUST } else { embree4_sys::RTCSceneFlags::default() };
         // SAFETY: the scene is live and nobody else has its handle. Bounds callbacks run now, on Embree's threads
         // too: `G` is Sync.
         unsafe {
-            embree4_sys::rtcSetSceneFlags(self.scene.handle, flags);
-            embree4_sys::rtcSetSceneBuildQuality(self.scene.handle, self.quality.raw());
-            embree4_sys::rtcCommitScene(self.scene.handle);
+            embree4_sys::rtcSetSceneFlags(self.bvh.handle, flags);
+            embree4_sys::rtcSetSceneBuildQuality(self.bvh.handle, self.quality.raw());
+            embree4_sys::rtcCommitScene(self.bvh.handle);
         }
-        self.scene.device.check()?;
-        Ok(self.scene)
+        self.bvh.device.check()?;
+        Ok(self.bvh)
     }
 }
 
-impl Scene<'_> {
+impl Bvh<'_> {
     /// Finds the nearest hit of one ray: writes it, and its distance into the ray's `tfar`. A miss changes nothing.
     ///
     /// The ray must be finite but for `tfar`; otherwise what it hits is not specified.
@@ -298,7 +298,7 @@ impl Scene<'_> {
         ray.tfar == f32::NEG_INFINITY
     }
 
-    /// [`Scene::intersect1`] for the rays of `rayhit` that take part.
+    /// [`Bvh::intersect1`] for the rays of `rayhit` that take part.
     #[inline]
     pub fn intersect16(&self, valid: &Valid16, rayhit: &mut RayHit16) {
         if self.halves {
@@ -315,7 +315,7 @@ impl Scene<'_> {
         unsafe { raw::rtcIntersect16(valid.as_ptr(), self.handle, rayhit, std::ptr::null_mut()) }
     }
 
-    /// [`Scene::occluded1`] for the rays that take part: `tfar` of the occluded ones becomes −∞.
+    /// [`Bvh::occluded1`] for the rays that take part: `tfar` of the occluded ones becomes −∞.
     #[inline]
     pub fn occluded16(&self, valid: &Valid16, rays: &mut Ray16) {
         if self.halves {

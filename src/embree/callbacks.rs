@@ -20,7 +20,7 @@ const INSTANCE: usize = HIT + std::mem::offset_of!(Hit, instance) / 4;
 /// # Safety
 /// Embree calls it with the arguments and the user pointer that it was registered with.
 pub(super) unsafe extern "C" fn bounds<G: UserGeometry>(args: *const RTCBoundsFunctionArguments) {
-    // SAFETY: Embree passes a valid struct; `geometryUserPtr` is the `*const G` that `SceneBuilder` stored, live
+    // SAFETY: Embree passes a valid struct; `geometryUserPtr` is the `*const G` that `BvhBuilder` stored, live
     // and shared by its contract; `bounds_o` is Embree's own room for one RTCBounds.
     unsafe {
         let args = &*args;
@@ -44,7 +44,7 @@ pub(super) unsafe extern "C" fn bounds<G: UserGeometry>(args: *const RTCBoundsFu
 /// As `bounds`.
 pub(super) unsafe extern "C" fn intersect<G: UserGeometry>(args: *const RTCIntersectFunctionNArguments) {
     // SAFETY: Embree passes a valid struct, the same in 4.0 to 4.4; `geometryUserPtr` is the `*const G` that
-    // `SceneBuilder` stored, live and shared by its contract.
+    // `BvhBuilder` stored, live and shared by its contract.
     let (args, data) = unsafe { (&*args, &*(*args).geometryUserPtr.cast::<G>()) };
     let (n, base) = (args.N as usize, args.rayhit.cast::<u32>());
     let mut room = None;

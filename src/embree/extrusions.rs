@@ -1,6 +1,6 @@
 //! Walls and luminaires as Embree user geometry, and rays as Embree carries them: what both tracers share.
 
-use super::{Ray, RayView, SceneBuilder, UserGeometry, UserHit};
+use super::{BvhBuilder, Ray, RayView, UserGeometry, UserHit};
 use crate::error::Result;
 use crate::flattened::{Ends, FlattenedRay};
 use crate::polygon::LocalPolygon;
@@ -53,7 +53,7 @@ impl Extrusions {
     ///
     /// # Errors
     /// `Embree` if the library refuses.
-    pub(super) fn attach(builder: &mut SceneBuilder<'_>, scene: &Scene, mask: u32) -> Result<Arc<Self>> {
+    pub(super) fn attach(builder: &mut BvhBuilder<'_>, scene: &Scene, mask: u32) -> Result<Arc<Self>> {
         let polygons = scene.polygons().iter().map(|p| LocalPolygon::new(p, scene.lattice())).collect();
         let this = Arc::new(Self { polygons });
         if !scene.polygons().is_empty() {

@@ -7,8 +7,7 @@
 
 use super::extrusions::{Extrusions, embree_ray, flattened_ray, padded};
 use super::{
-    Device, INVALID_ID, Ray16, RayHit, RayHit16, RayView, Scene as Bvh, SceneBuilder, UserGeometry, UserHit,
-    UserHits16, Valid16,
+    Bvh, BvhBuilder, Device, INVALID_ID, Ray16, RayHit, RayHit16, RayView, UserGeometry, UserHit, UserHits16, Valid16,
 };
 use crate::error::{Error, Result};
 use crate::field::Field;
@@ -47,7 +46,7 @@ impl<'a> GraphTracer<'a> {
     /// # Errors
     /// `Invalid` for pyramids of other lattices; `Embree` if the library refuses.
     pub fn with_pyramids(device: &Device, scene: &'a Scene, pyramids: &[Arc<Pyramid>]) -> Result<Self> {
-        let mut builder = SceneBuilder::new(device)?;
+        let mut builder = BvhBuilder::new(device)?;
         let graph = |number: usize, field: &'a Field| {
             let pyramid = pyramids.get(number).filter(|p| p.cells() == field.lattice().cells());
             let pyramid = pyramid.ok_or_else(|| Error::Invalid("these pyramids are of another scene".into()))?;

@@ -13,7 +13,7 @@
 //!   does not count, unless what follows shows that the ray went inside.
 
 use super::extrusions::{Extrusions, embree_ray};
-use super::{Device, RayHit, Scene as Bvh, SceneBuilder};
+use super::{Bvh, BvhBuilder, Device, RayHit};
 use crate::error::{Error, Result};
 use crate::field::Field;
 use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side, Target};
@@ -109,7 +109,7 @@ impl<'a> SurfaceTracer<'a> {
             }
             meshes.push(mesh);
         }
-        let mut builder = SceneBuilder::new(device)?;
+        let mut builder = BvhBuilder::new(device)?;
         for (n, mesh) in meshes.iter().enumerate() {
             let vertices: Vec<[f32; 3]> = mesh.vertices.iter().map(|v| v.as_vec3().to_array()).collect();
             builder.triangles(&vertices, &mesh.triangles, bit(n))?;

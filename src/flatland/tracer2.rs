@@ -10,7 +10,7 @@
 
 use super::{FlatScene, HeightField, Segment};
 use crate::cubic::Cubic;
-use crate::embree::{Device, Ray, RayHit, RayView, Scene as Bvh, SceneBuilder, UserGeometry, UserHit};
+use crate::embree::{Bvh, BvhBuilder, Device, Ray, RayHit, RayView, UserGeometry, UserHit};
 use crate::error::Result;
 use crate::flattened::{Departure, Ends, FlattenedHit, FlattenedRay, Side, Target};
 use crate::tracer::Tracer;
@@ -336,7 +336,7 @@ impl LevelCurves {
     /// # Errors
     /// `Embree` if the library refuses.
     pub fn new(device: &Device, scene: &FlatScene) -> Result<Self> {
-        let mut builder = SceneBuilder::new(device)?;
+        let mut builder = BvhBuilder::new(device)?;
         let curves = builder.user_shared(Arc::new(Curves::new(scene.field.clone())), u32::MAX)?;
         if !scene.segments.is_empty() {
             builder.user_shared(Arc::new(Extrusions::new(&scene.field, &scene.segments, None)), u32::MAX)?;
@@ -409,7 +409,7 @@ impl GraphSurface {
                 triangles.extend([2 * o, 2 * o + 1]);
             }
         }
-        let mut builder = SceneBuilder::new(device)?;
+        let mut builder = BvhBuilder::new(device)?;
         let graph = builder.triangles(&vertices, &indices, u32::MAX)?;
         if !scene.segments.is_empty() {
             let walls = Extrusions::new(&field, &scene.segments, Some(heights));

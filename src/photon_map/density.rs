@@ -17,7 +17,7 @@ use super::{EstimateSettings, Irradiance};
 use crate::direct::luminance;
 use crate::field::Field;
 use crate::isa::{Isa, Work};
-use crate::linear_fit::{Moments, Sums};
+use crate::linear_fit::{NormalMatrix, Sums};
 use crate::photon::{SurfacePhoton, octant};
 use crate::scene::Scene;
 use glam::{DVec3, DVec4, Vec3, Vec4};
@@ -356,7 +356,7 @@ const FAR_ABOVE: f32 = 4.0;
 #[derive(Default)]
 struct Fit {
     /// Weighted by K D.
-    measure: Moments,
+    measure: NormalMatrix,
     /// Of the bins' power, weighted by K.
     power: Sums,
 }

@@ -66,16 +66,16 @@ pub(super) struct Piece<'a> {
 /// One way to compute it. All ways give the same bits.
 pub(super) trait Kernel: Copy {
     /// What of a ray [`Kernel::children`] asks for again and again.
-    type Ray;
+    type Constants;
     /// The 8 samples of a cell, as in [`crate::cell::Cell`].
     type Corners: Copy;
 
-    fn ray(self, line: &Line) -> Self::Ray;
+    fn constants(self, line: &Line) -> Self::Constants;
 
     /// The children of the node of `tile`, whose first cell is `base` and whose children are `size` cells wide, that
     /// may hold the isovalue and whose closed box the ray meets at a time above 0, up to its end. Bit n stands for
     /// child n ^ flip, so that they are in the ray's order.
-    fn children(self, line: &Line, ray: &Self::Ray, tile: &Tile, base: Vec4, size: f32) -> u64;
+    fn children(self, line: &Line, ray: &Self::Constants, tile: &Tile, base: Vec4, size: f32) -> u64;
 
     /// The samples at `at`, one step along x, y or z further, and so on.
     fn corners(self, samples: &[f32], at: usize, steps: [usize; 2]) -> Self::Corners;
@@ -120,11 +120,11 @@ pub(super) trait Kernel: Copy {
 pub(super) struct Scalar;
 
 impl Kernel for Scalar {
-    type Ray = ();
+    type Constants = ();
     type Corners = [f32; 8];
 
     #[inline(always)]
-    fn ray(self, _: &Line) {}
+    fn constants(self, _: &Line) {}
 
     #[inline(never)]
     fn outlined<T>(self, f: impl FnOnce() -> T) -> T {

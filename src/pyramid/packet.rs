@@ -51,7 +51,7 @@ impl Round {
         kernel: K,
         pyramid: &Pyramid,
         memory: &[*const u8; 5],
-        lane: &mut Lane<K::Ray>,
+        lane: &mut Lane<K::Constants>,
         number: u8,
     ) -> Child {
         let more = lane.stack.live != 0;
@@ -101,7 +101,7 @@ impl Pyramid {
         for n in (0..WIDTH).filter(|n| active >> n & 1 == 1) {
             self.ask(kernel, &memory, &self.start(ray(n).origin));
         }
-        let mut lanes: [Option<Lane<K::Ray>>; WIDTH] = std::array::from_fn(|_| None);
+        let mut lanes: [Option<Lane<K::Constants>>; WIDTH] = std::array::from_fn(|_| None);
         let mut next = [Child::default(); WIDTH];
         let mut round = Round::default();
         for n in (0..WIDTH as u8).filter(|n| active >> n & 1 == 1) {

@@ -53,9 +53,9 @@ impl Isa {
     pub(super) fn children(self, line: &Line, tile: &Tile, base: Vec4, size: f32) -> u64 {
         #[cfg(target_arch = "x86_64")]
         if let Some(kernel) = avx512::Avx512::of(self) {
-            return kernel.children(line, &kernel.ray(line), tile, base, size);
+            return kernel.children(line, &kernel.constants(line), tile, base, size);
         } else if let Some(kernel) = avx2::Avx2::of(self) {
-            return kernel.children(line, &kernel.ray(line), tile, base, size);
+            return kernel.children(line, &kernel.constants(line), tile, base, size);
         }
         Scalar.children(line, &(), tile, base, size)
     }

@@ -58,7 +58,7 @@ pub(super) struct Ray<'a> {
 pub(super) struct Lane<'a, R> {
     pub(super) ray: Ray<'a>,
     line: Line,
-    /// [`Kernel::ray`].
+    /// [`Kernel::constants`].
     constants: R,
     pub(super) stack: Stack,
     /// The start among the children of its nodes, six bits for each level.
@@ -208,7 +208,7 @@ impl Pyramid {
     /// Looks around the start: opens the nodes that hold it on the next two levels, but for the children that hold it
     /// and are done. What they give comes first on the path, and neither node waits for the other.
     #[inline(always)]
-    pub(super) fn climb<K: Kernel>(&self, kernel: K, lane: &mut Lane<K::Ray>) {
+    pub(super) fn climb<K: Kernel>(&self, kernel: K, lane: &mut Lane<K::Constants>) {
         if lane.climbed == 0 {
             self.look_around::<0, K>(kernel, lane);
             self.look_around::<1, K>(kernel, lane);
@@ -221,7 +221,7 @@ impl Pyramid {
 
     /// Opens the node that holds the start on a level, but for the child that holds it and is done.
     #[inline(always)]
-    fn look_around<const LEVEL: usize, K: Kernel>(&self, kernel: K, lane: &mut Lane<K::Ray>) {
+    fn look_around<const LEVEL: usize, K: Kernel>(&self, kernel: K, lane: &mut Lane<K::Constants>) {
         if LEVEL >= self.levels.len() {
             return;
         }
@@ -243,7 +243,7 @@ impl Pyramid {
     /// larger than 256³ cells are taken in turn; mostly there is one.
     #[cold]
     #[allow(clippy::cast_possible_truncation, reason = "node numbers are small")]
-    fn next_root<K: Kernel>(&self, kernel: K, lane: &mut Lane<K::Ray>, turn: &mut usize) -> bool {
+    fn next_root<K: Kernel>(&self, kernel: K, lane: &mut Lane<K::Constants>, turn: &mut usize) -> bool {
         let top = self.levels.len() - 1;
         let (width, roots) = (size(top + 1), self.levels[top].dims);
         while *turn < self.roots {
@@ -301,7 +301,7 @@ impl Pyramid {
 
     /// Pushes the active children of a node that was popped.
     #[inline(always)]
-    pub(super) fn open<K: Kernel>(&self, kernel: K, lane: &mut Lane<K::Ray>, node: Child) {
+    pub(super) fn open<K: Kernel>(&self, kernel: K, lane: &mut Lane<K::Constants>, node: Child) {
         let level = (node.level - 1) % LEVELS;
         let found = self.look(kernel, lane, level, node.at);
         lane.stack.push(level, found);
@@ -309,7 +309,7 @@ impl Pyramid {
 
     /// The active children of a level's node, whose tile stands `at`.
     #[inline(always)]
-    fn look<K: Kernel>(&self, kernel: K, lane: &Lane<K::Ray>, level: usize, at: usize) -> u64 {
+    fn look<K: Kernel>(&self, kernel: K, lane: &Lane<K::Constants>, level: usize, at: usize) -> u64 {
         let tile = &self.levels[level].tiles[at];
         kernel.children(&lane.line, &lane.constants, tile, lane.stack.places[level + 1].corner, size(level))
     }

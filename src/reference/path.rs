@@ -17,8 +17,8 @@ use glam::DVec3;
 
 /// A path tracer that counts its rays.
 pub struct PathTracer<'a, T> {
-    scene: &'a Scene,
-    tracer: &'a T,
+    pub(super) scene: &'a Scene,
+    pub(super) tracer: &'a T,
     /// Rays traced.
     pub rays: u64,
 }
@@ -127,7 +127,7 @@ impl<'a, T: Tracer> PathTracer<'a, T> {
     }
 }
 
-/// A picture of hyperplane `isovalue` by `samples` paths per pixel; luminaires are seen.
+/// A picture of hyperplane `isovalue` (units of the sweep) by a path for every ray of the camera; luminaires are seen.
 ///
 /// # Errors
 /// `Invalid` for an impossible camera; `Interrupted`.
@@ -136,15 +136,12 @@ pub fn path_picture<T: Tracer>(
     tracer: &T,
     isovalue: f32,
     camera: &Camera,
-    samples: u32,
     progress: Progress,
 ) -> Result<Picture> {
-    // Paths are told apart by their ray: the same picture on any number of threads.
-    let shade = |ray: &FlattenedRay, hit, direction: DVec3, _| {
-        let key = direction.to_array().iter().fold(0u64, |k, x| (k ^ x.to_bits()).wrapping_mul(0x9e37_79b9_7f4a_7c15));
-        path_radiance(scene, tracer, ray, hit, &mut Rng::stream(1, Stage::Path, key))
+    let shade = |ray: &FlattenedRay, hit, _, index| {
+        path_radiance(scene, tracer, ray, hit, &mut Rng::stream(1, Stage::Path, index))
     };
-    trace_picture(scene, tracer, isovalue, camera, samples, &shade, progress)
+    trace_picture(scene, tracer, isovalue, camera, &shade, progress)
 }
 
 /// Radiance seen along `ray` of a picture, from one path; what a luminaire emits is seen.

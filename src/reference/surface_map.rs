@@ -163,14 +163,12 @@ impl SurfaceMap {
     /// and so do those that land on caps.
     pub fn outgoing<T: Tracer>(
         &self,
-        scene: &Scene,
-        tracer: &T,
+        paths: &mut PathTracer<'_, T>,
         receiver: &Receiver,
         samples: u32,
         key: Key,
-        rays: &mut u64,
     ) -> DVec3 {
-        let mut paths = PathTracer::new(scene, tracer);
+        let (scene, tracer) = (paths.scene, paths.tracer);
         let direct = paths.direct(receiver, samples, key);
         let frame = Frame::new(receiver.normal);
         let set = key.set();
@@ -193,7 +191,6 @@ impl SurfaceMap {
                 sum += reflected(albedo, paths.direct_once(&landed, &mut rng) + indirect);
             }
         }
-        *rays += paths.rays;
         let indirect = sum * (std::f64::consts::PI / f64::from(samples.max(1)));
         reflected(scene.surface.albedo.at(f64::from(receiver.isovalue)), direct + indirect) + scene.surface.emission
     }

@@ -149,9 +149,9 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
 fn reference_picture(study: &Study, scene: &Scene, isovalue: f32) -> Result<f64> {
     let begun = Instant::now();
     let tracer = SurfaceTracer::new(&study.device, scene, isovalue, 1)?;
-    let camera = Camera { size: [400; 2], ..Camera::facing(scene, 400) };
     let samples = if study.quick { 4 } else { 64 };
-    path_picture(scene, &tracer, isovalue, &camera, samples, Progress::Quiet)?;
+    let camera = Camera { size: [400; 2], samples, ..Camera::facing(scene, 400) };
+    path_picture(scene, &tracer, isovalue, &camera, Progress::Quiet)?;
     Ok(begun.elapsed().as_secs_f64())
 }
 

@@ -33,7 +33,6 @@ pub(super) fn figure6(study: &Study, subject: &Subject, name: &str, strategy: St
             subject.main_isovalue(),
             &square(&baked),
             Shading::Baked(&baked, None),
-            8,
             &study.device,
             Progress::Quiet,
         )?
@@ -56,7 +55,7 @@ pub(super) fn figure6_path(study: &Study, subject: &Subject, name: &str) -> Path
 }
 
 fn square(baked: &BakedVolume) -> Camera {
-    Camera { size: [PANEL; 2], ..Camera::facing(&baked.scene, PANEL) }
+    Camera { size: [PANEL; 2], samples: 8, ..Camera::facing(&baked.scene, PANEL) }
 }
 
 /// Samples as the strategy places them, projected along y; the nearest to the viewer covers the others.

@@ -59,6 +59,11 @@ impl<'a> Cursor<'a> {
         }
     }
 
+    /// Passes over what `METADATA` says of an array, up to an empty line.
+    fn skip_notes(&mut self) {
+        while self.line().is_some_and(|l| !l.is_empty()) {}
+    }
+
     /// The values that begin here: exactly `count` words of text, or their bytes.
     fn array(&mut self, name: &str, kind: &str, count: usize) -> Result<Array<'a>> {
         let element = element(kind)
@@ -185,6 +190,14 @@ impl Section {
 
 fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
     let mut cursor = Cursor { bytes, at: 0, binary: false };
+    begin(&mut cursor)?;
+    let (lattice, part) = geometry(&mut cursor)?;
+    let samples = attributes(&mut cursor, &lattice, part)?;
+    Ok((lattice, samples))
+}
+
+/// Reads up to the kind of data set, which must be one of points in a lattice.
+fn begin(cursor: &mut Cursor) -> Result<()> {
     if !cursor.line().is_some_and(|l| l.starts_with("# vtk DataFile Version")) {
         return invalid("does not begin with `# vtk DataFile Version`, so it is no legacy VTK file".into());
     }
@@ -204,16 +217,23 @@ fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
             "holds a {kind}; only STRUCTURED_POINTS are read (resample it to an image)"
         )));
     }
+    Ok(())
+}
 
+/// What attributes belong to, and how many tuples each has.
+type Part = (Section, usize);
+
+/// The lattice, and what the first attributes belong to.
+fn geometry(cursor: &mut Cursor) -> Result<(Lattice, Part)> {
     let (mut dims, mut spacing, mut origin): (Option<[usize; 3]>, [f64; 3], [f64; 3]) = (None, [1.0; 3], [0.0; 3]);
-    let (mut section, mut tuples) = loop {
+    let (section, tuples) = loop {
         let Some(words) = cursor.words() else { return invalid("has no POINT_DATA".into()) };
         match words[0].to_ascii_uppercase().as_str() {
             "DIMENSIONS" => dims = Some(numbers(&words)?),
             "SPACING" | "ASPECT_RATIO" => spacing = numbers(&words)?,
             "ORIGIN" => origin = numbers(&words)?,
-            "FIELD" => skip_field(&mut cursor, &words)?,
-            "METADATA" => while cursor.line().is_some_and(|l| !l.is_empty()) {},
+            "FIELD" => skip_field(cursor, &words)?,
+            "METADATA" => cursor.skip_notes(),
             "POINT_DATA" => break (Section::Points, numbers::<usize, 1>(&words)?[0]),
             "CELL_DATA" => break (Section::Cells, numbers::<usize, 1>(&words)?[0]),
             _ => return invalid(format!("`{}`: no keyword of STRUCTURED_POINTS", words.join(" "))),
@@ -222,6 +242,11 @@ fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
     let dims = dims.ok_or_else(|| Error::Invalid("has no DIMENSIONS".into()))?;
     let lattice = Lattice::aligned(dims, DVec3::from_array(origin), DVec3::from_array(spacing))?;
     section.check(tuples, &lattice)?;
+    Ok((lattice, (section, tuples)))
+}
+
+/// The first scalars of the points, or else the first fitting array of their `FIELD`.
+fn attributes(cursor: &mut Cursor, lattice: &Lattice, (mut section, mut tuples): Part) -> Result<Samples> {
     let mut field: Option<Array> = None;
     while let Some(words) = cursor.words() {
         let count = |n: usize| {
@@ -242,7 +267,7 @@ fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
                 }
                 let array = cursor.array(word(1)?, word(2)?, count(n)?)?;
                 if wanted(n) {
-                    return Ok((lattice, cursor.samples(&array)?));
+                    return cursor.samples(&array);
                 }
             }
             // A table of colours, 4 per entry.
@@ -259,7 +284,7 @@ fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
                         Samples::F32(v) => Samples::U8(v.into_iter().map(|v| (v * 255.0).round() as u8).collect()),
                         samples => samples,
                     };
-                    return Ok((lattice, samples));
+                    return Ok(samples);
                 }
             }
             "VECTORS" | "NORMALS" => pass_over(3)?,
@@ -273,23 +298,23 @@ fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
             }
             "FIELD" => {
                 for _ in 0..components(&words, 2)? {
-                    let Some((array, n)) = field_array(&mut cursor)? else { continue };
+                    let Some((array, n)) = field_array(cursor)? else { continue };
                     if wanted(n) && array.count == tuples && field.is_none() {
                         field = Some(array);
                     }
                 }
             }
-            "METADATA" => while cursor.line().is_some_and(|l| !l.is_empty()) {},
+            "METADATA" => cursor.skip_notes(),
             "POINT_DATA" if section == Section::Cells => {
                 (section, tuples) = (Section::Points, numbers::<usize, 1>(&words)?[0]);
-                section.check(tuples, &lattice)?;
+                section.check(tuples, lattice)?;
             }
             "CELL_DATA" if section == Section::Points => break,
             _ => return invalid(format!("`{}`: no keyword of {}", words.join(" "), section.keyword())),
         }
     }
     match field {
-        Some(array) => Ok((lattice, cursor.samples(&array)?)),
+        Some(array) => cursor.samples(&array),
         None => Err(cells()),
     }
 }
@@ -305,7 +330,7 @@ fn field_array<'a>(cursor: &mut Cursor<'a>) -> Result<Option<(Array<'a>, usize)>
     let mut words = cursor.words().unwrap_or_default();
     // Behind each array there may be notes about it.
     if words.first().is_some_and(|w| w.eq_ignore_ascii_case("METADATA")) {
-        while cursor.line().is_some_and(|l| !l.is_empty()) {}
+        cursor.skip_notes();
         words = cursor.words().unwrap_or_default();
     }
     let number = |at: usize| words.get(at).and_then(|w| w.parse::<usize>().ok());

@@ -13,7 +13,7 @@ use std::arch::x86_64::*;
 pub(super) struct Avx2(());
 
 /// What depends on the ray only.
-pub(in crate::pyramid) struct Ray {
+pub(in crate::pyramid) struct Constants {
     /// Plane numbers within a node before and behind its children along x and y, in the ray's order, twice.
     before: [__m256; 2],
     behind: [__m256; 2],
@@ -54,18 +54,18 @@ impl Avx2 {
 walks!(Avx2, "avx2,fma,bmi1,bmi2");
 
 impl Kernel for Avx2 {
-    type Ray = Ray;
+    type Constants = Constants;
 
     shared!("avx2,fma,bmi1,bmi2");
 
     #[inline(always)]
-    fn ray(self, line: &Line) -> Ray {
+    fn constants(self, line: &Line) -> Constants {
         // SAFETY: `self` exists, so the machine has the features.
-        unsafe { ray(line) }
+        unsafe { constants(line) }
     }
 
     #[inline(always)]
-    fn children(self, line: &Line, ray: &Ray, tile: &Tile, base: Vec4, size: f32) -> u64 {
+    fn children(self, line: &Line, ray: &Constants, tile: &Tile, base: Vec4, size: f32) -> u64 {
         // SAFETY: `self` exists, so the machine has the features.
         unsafe { children(line, ray, tile, base, size) }
     }
@@ -108,10 +108,10 @@ fn mask(x: __m256) -> u8 {
 
 #[inline]
 #[target_feature(enable = "avx2,fma,bmi1,bmi2")]
-fn ray(line: &Line) -> Ray {
+fn constants(line: &Line) -> Constants {
     let back = [0, 1, 2].map(|a| usize::from(line.negative(a)));
     let number = |x: &[[f32; 8]; 2], a: usize| _mm256_castsi256_ps(load(&x[back[a]]));
-    Ray {
+    Constants {
         before: [number(&BEFORE, 0), number(&BEFORE, 1)],
         behind: [number(&BEHIND, 0), number(&BEHIND, 1)],
         layers: number(&LAYERS, 2),
@@ -125,7 +125,7 @@ fn ray(line: &Line) -> Ray {
 
 #[inline]
 #[target_feature(enable = "avx2,fma,bmi1,bmi2")]
-fn children(line: &Line, ray: &Ray, tile: &Tile, base: Vec4, size: f32) -> u64 {
+fn children(line: &Line, ray: &Constants, tile: &Tile, base: Vec4, size: f32) -> u64 {
     // Line::time of all planes. `size` is a power of 2 and the numbers are small: planes are exact.
     let (size, base) = (_mm256_set1_ps(size), _mm256_set_m128(base.into(), base.into()));
     let corner = [_mm256_permute_ps::<0x00>(base), _mm256_permute_ps::<0x55>(base), _mm256_permute_ps::<0xaa>(base)];

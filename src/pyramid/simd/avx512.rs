@@ -14,7 +14,7 @@ use std::arch::x86_64::*;
 pub(super) struct Avx512(&'static [[i32; 16]; 5]);
 
 /// What depends on the ray only. Lanes 0–4 belong to the planes of x, 5–9 of y, 10–14 of z.
-pub(in crate::pyramid) struct Ray {
+pub(in crate::pyramid) struct Constants {
     o: __m512,
     inv: __m512,
     /// Plane numbers within a node in the order in which the ray meets them.
@@ -60,18 +60,18 @@ impl Avx512 {
 walks!(Avx512, "avx512f,avx512bw,avx512dq,avx512vl,bmi1,bmi2");
 
 impl Kernel for Avx512 {
-    type Ray = Ray;
+    type Constants = Constants;
 
     shared!("avx512f,avx512bw,avx512dq,avx512vl,bmi1,bmi2");
 
     #[inline(always)]
-    fn ray(self, line: &Line) -> Ray {
+    fn constants(self, line: &Line) -> Constants {
         // SAFETY: `self` exists, so the machine has the features.
-        unsafe { ray(line) }
+        unsafe { constants(line) }
     }
 
     #[inline(always)]
-    fn children(self, _: &Line, ray: &Ray, tile: &Tile, base: Vec4, size: f32) -> u64 {
+    fn children(self, _: &Line, ray: &Constants, tile: &Tile, base: Vec4, size: f32) -> u64 {
         // SAFETY: `self` exists, so the machine has the features.
         unsafe { children(self.0, ray, tile, base, size) }
     }
@@ -106,11 +106,11 @@ fn load<T: Copy, const N: usize>(x: &[T; N]) -> __m512i {
 
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,bmi1,bmi2")]
-fn ray(line: &Line) -> Ray {
+fn constants(line: &Line) -> Constants {
     let per_axis = |v: Vec4| _mm512_permutexvar_ps(load(&AXES), _mm512_castps128_ps512(v.into()));
     let backward = (0..3).filter(|&a| line.negative(a)).fold(0, |m, a| m | 0x1f << (5 * a));
     let number = |x: &[f32; 16]| _mm512_castsi512_ps(load(x));
-    Ray {
+    Constants {
         o: per_axis(line.o),
         inv: per_axis(line.inv),
         planes: _mm512_mask_blend_ps(backward, number(&FORWARD), number(&BACKWARD)),
@@ -124,7 +124,7 @@ fn ray(line: &Line) -> Ray {
 
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,bmi1,bmi2")]
-fn children(lanes: &[[i32; 16]; 5], ray: &Ray, tile: &Tile, base: Vec4, size: f32) -> u64 {
+fn children(lanes: &[[i32; 16]; 5], ray: &Constants, tile: &Tile, base: Vec4, size: f32) -> u64 {
     // Line::time of all planes. `size` is a power of 2 and the numbers are small: planes are exact.
     let corner = _mm512_permutexvar_ps(load(&AXES), _mm512_castps128_ps512(base.into()));
     let planes = _mm512_fmadd_ps(ray.planes, _mm512_set1_ps(size), corner);

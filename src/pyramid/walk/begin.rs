@@ -16,7 +16,7 @@ impl Pyramid {
         field: &'a Field,
         ray: &FlattenedRay,
         reach: f64,
-        lane: &mut Option<Lane<'a, K::Ray>>,
+        lane: &mut Option<Lane<'a, K::Constants>>,
     ) -> Begun {
         match self.begin_within(kernel, field, ray, reach, lane) {
             Begun::Otherwise => kernel.outlined(|| self.begin_anywhere::<ANY, K>(kernel, field, ray, reach, lane)),
@@ -34,7 +34,7 @@ impl Pyramid {
         field: &'a Field,
         ray: &FlattenedRay,
         reach: f64,
-        lane: &mut Option<Lane<'a, K::Ray>>,
+        lane: &mut Option<Lane<'a, K::Constants>>,
     ) -> Begun {
         let (origin, direction) = (ray.origin.extend(0.5), ray.direction.extend(0.0));
         let size = direction.abs();
@@ -99,7 +99,7 @@ impl Pyramid {
         }
         line.hold(&self.ranks, c32);
         let ray = Ray { samples: field.samples(), steps: self.steps, o, d, inv, c, c32, t: 0.0, reach, within: true };
-        *lane = Some(Lane::new(kernel.ray(&line), ray, line, start, departing, self.capped));
+        *lane = Some(Lane::new(kernel.constants(&line), ray, line, start, departing, self.capped));
         Begun::On
     }
 
@@ -134,90 +134,15 @@ impl Pyramid {
         field: &'a Field,
         ray: &FlattenedRay,
         reach: f64,
-        lane: &mut Option<Lane<'a, K::Ray>>,
+        lane: &mut Option<Lane<'a, K::Constants>>,
     ) -> Begun {
-        let n = self.cells;
-        let mut o = ray.origin.as_dvec3().to_array();
-        let d = ray.direction.as_dvec3().to_array();
-        // What leaves a level set or a cap starts in Ω, whatever its f32 coordinates: an edge is no way out. Faces from
-        // 6 on are another field's.
-        if matches!(ray.departure, Departure::Surface(_) | Departure::Cap(0..6, _)) {
-            (0..3).for_each(|a| o[a] = o[a].clamp(0.0, n[a] as f64));
-        }
-        if let Departure::Cap(face @ 0..6, side) = ray.departure {
-            let (axis, far) = (usize::from(face % 3), face >= 3);
-            let inward = if far { d[axis] < 0.0 } else { d[axis] > 0.0 };
-            if inward != (side == Side::Higher) && d[axis] != 0.0 {
-                return Begun::Done(Some(FlattenedHit { t: 0.0, target: cap(axis, far, side) }));
-            }
-            if side == Side::Lower {
-                // Ω is convex: what leaves it never comes back.
-                return Begun::Done(None);
-            }
-            o[axis] = if far { n[axis] as f64 } else { 0.0 };
-        }
-        if let Departure::Surface(side) = ray.departure {
-            let outwards = |a: usize| (o[a] == 0.0 && d[a] < 0.0) || (o[a] == n[a] as f64 && d[a] > 0.0);
-            if let Some(axis) = (0..3).find(|&a| outwards(a)) {
-                // It leaves Ω where it starts. There h = c counts as inside, which must not end a ray from the lower
-                // side.
-                let closed = self.capped && side == Side::Higher;
-                let target = cap(axis, d[axis] > 0.0, side);
-                return Begun::Done(closed.then_some(FlattenedHit { t: 0.0, target }));
-            }
+        let (mut o, d) = (ray.origin.as_dvec3().to_array(), ray.direction.as_dvec3().to_array());
+        if let Some(hit) = self.ends_at_once(ray.departure, &mut o, d) {
+            return Begun::Done(hit);
         }
         let inv = d.map(|x| 1.0 / x);
-        // Clip to Ω. A component 0 (or −0) never crosses a plane: its slab holds the whole line or nothing of it.
-        let (mut t, mut t_out, mut entry) = (0f64, reach, None);
-        if !(0..3).all(|a| o[a] >= 0.0 && o[a] <= n[a] as f64) {
-            for a in 0..3 {
-                let far = n[a] as f64;
-                if d[a] == 0.0 {
-                    if !(o[a] >= 0.0 && o[a] <= far) {
-                        return Begun::Done(None);
-                    }
-                    continue;
-                }
-                let (near_plane, far_plane) = if d[a] > 0.0 { (0.0, far) } else { (far, 0.0) };
-                let t0 = (near_plane - o[a]) * inv[a];
-                if t0 > t {
-                    (t, entry) = (t0, Some(a));
-                }
-                t_out = t_out.min((far_plane - o[a]) * inv[a]);
-            }
-        }
-        let scale = d[0].abs().max(d[1].abs()).max(d[2].abs());
-        if !(t <= t_out) || scale == 0.0 {
-            return Begun::Done(None);
-        }
-        // The cell of the start, and the line from there.
-        let mut cell = [0u32; 3];
-        let mut line = Line {
-            start: Vec4::ZERO,
-            d: Vec4::ZERO,
-            o: Vec4::ZERO,
-            inv: Vec4::splat(1e30),
-            far: Vec4::ONE,
-            flip: 0,
-            // Roughly: the cells decide.
-            end: ((reach - t) * scale * (1.0 + 1e-5) + 1e-3) as f32,
-            most_lo: 0,
-            least_hi: 0,
-        };
-        for a in 0..3 {
-            let p = o[a] + t * d[a];
-            (line.start[a], line.d[a]) = (p as f32, (d[a] / scale) as f32);
-            // On a shared plane the ray is in the cell it goes to.
-            let below = d[a] < 0.0 && p == p.floor();
-            cell[a] = (p.floor() as i32 - i32::from(below)).clamp(0, n[a] as i32 - 1).cast_unsigned();
-            if d[a].abs() > f64::from(PARALLEL) * scale {
-                (line.o[a], line.inv[a]) = (p as f32, (scale * inv[a]) as f32);
-                line.flip |= (u32::from(d[a] < 0.0) * 3) << (2 * a);
-                line.far[a] = if d[a] < 0.0 { 0.0 } else { 1.0 };
-            } else {
-                line.o[a] = cell[a] as f32 + 0.5;
-            }
-        }
+        let Some(Entry { t, axis: entry }) = self.enter(o, d, inv, reach) else { return Begun::Done(None) };
+        let (cell, mut line) = self.line([o, d, inv], t, reach);
         let start = self.nodes(cell);
         self.prefetch(kernel, &start);
 
@@ -252,7 +177,111 @@ impl Pyramid {
             }
         }
 
-        *lane = Some(Lane::new(kernel.ray(&line), ray, line, start, departing.is_some(), self.capped));
+        *lane = Some(Lane::new(kernel.constants(&line), ray, line, start, departing.is_some(), self.capped));
         Begun::On
     }
+
+    /// Moves the start `o` of a ray that leaves a level set or a cap into Ω, where it is whatever its f32 coordinates;
+    /// what it meets, if it ends there: at a cap, or without a hit.
+    #[inline(always)]
+    #[allow(clippy::option_option, reason = "the outer one goes on")]
+    fn ends_at_once(&self, departure: Departure, o: &mut [f64; 3], d: [f64; 3]) -> Option<Option<FlattenedHit>> {
+        let n = self.cells;
+        // An edge is no way out. Faces from 6 on are another field's.
+        if matches!(departure, Departure::Surface(_) | Departure::Cap(0..6, _)) {
+            (0..3).for_each(|a| o[a] = o[a].clamp(0.0, n[a] as f64));
+        }
+        if let Departure::Cap(face @ 0..6, side) = departure {
+            let (axis, far) = (usize::from(face % 3), face >= 3);
+            let inward = if far { d[axis] < 0.0 } else { d[axis] > 0.0 };
+            if inward != (side == Side::Higher) && d[axis] != 0.0 {
+                return Some(Some(FlattenedHit { t: 0.0, target: cap(axis, far, side) }));
+            }
+            if side == Side::Lower {
+                // Ω is convex: what leaves it never comes back.
+                return Some(None);
+            }
+            o[axis] = if far { n[axis] as f64 } else { 0.0 };
+        }
+        if let Departure::Surface(side) = departure {
+            let outwards = |a: usize| (o[a] == 0.0 && d[a] < 0.0) || (o[a] == n[a] as f64 && d[a] > 0.0);
+            if let Some(axis) = (0..3).find(|&a| outwards(a)) {
+                // It leaves Ω where it starts. There h = c counts as inside, which must not end a ray from the lower
+                // side.
+                let closed = self.capped && side == Side::Higher;
+                let target = cap(axis, d[axis] > 0.0, side);
+                return Some(closed.then_some(FlattenedHit { t: 0.0, target }));
+            }
+        }
+        None
+    }
+
+    /// Where a ray enters Ω, within its reach. A component 0 (or −0) never crosses a plane: its slab holds the whole
+    /// line or nothing of it.
+    #[inline(always)]
+    fn enter(&self, o: [f64; 3], d: [f64; 3], inv: [f64; 3], reach: f64) -> Option<Entry> {
+        let n = self.cells;
+        let (mut t, mut t_out, mut axis) = (0f64, reach, None);
+        if !(0..3).all(|a| o[a] >= 0.0 && o[a] <= n[a] as f64) {
+            for a in 0..3 {
+                let far = n[a] as f64;
+                if d[a] == 0.0 {
+                    if !(o[a] >= 0.0 && o[a] <= far) {
+                        return None;
+                    }
+                    continue;
+                }
+                let (near_plane, far_plane) = if d[a] > 0.0 { (0.0, far) } else { (far, 0.0) };
+                let t0 = (near_plane - o[a]) * inv[a];
+                if t0 > t {
+                    (t, axis) = (t0, Some(a));
+                }
+                t_out = t_out.min((far_plane - o[a]) * inv[a]);
+            }
+        }
+        let moves = d[0].abs().max(d[1].abs()).max(d[2].abs()) != 0.0;
+        (t <= t_out && moves).then_some(Entry { t, axis })
+    }
+
+    /// The cell of a ray (start, direction and its reciprocals) at `t`, and the line from there.
+    #[inline(always)]
+    #[allow(clippy::cast_possible_truncation, reason = "clamped cell numbers; lines are f32")]
+    fn line(&self, [o, d, inv]: [[f64; 3]; 3], t: f64, reach: f64) -> ([u32; 3], Line) {
+        let scale = d[0].abs().max(d[1].abs()).max(d[2].abs());
+        let mut cell = [0u32; 3];
+        let mut line = Line {
+            start: Vec4::ZERO,
+            d: Vec4::ZERO,
+            o: Vec4::ZERO,
+            inv: Vec4::splat(1e30),
+            far: Vec4::ONE,
+            flip: 0,
+            // Roughly: the cells decide.
+            end: ((reach - t) * scale * (1.0 + 1e-5) + 1e-3) as f32,
+            most_lo: 0,
+            least_hi: 0,
+        };
+        for a in 0..3 {
+            let p = o[a] + t * d[a];
+            (line.start[a], line.d[a]) = (p as f32, (d[a] / scale) as f32);
+            // On a shared plane the ray is in the cell it goes to.
+            let below = d[a] < 0.0 && p == p.floor();
+            cell[a] = (p.floor() as i32 - i32::from(below)).clamp(0, self.cells[a] as i32 - 1).cast_unsigned();
+            if d[a].abs() > f64::from(PARALLEL) * scale {
+                (line.o[a], line.inv[a]) = (p as f32, (scale * inv[a]) as f32);
+                line.flip |= (u32::from(d[a] < 0.0) * 3) << (2 * a);
+                line.far[a] = if d[a] < 0.0 { 0.0 } else { 1.0 };
+            } else {
+                line.o[a] = cell[a] as f32 + 0.5;
+            }
+        }
+        (cell, line)
+    }
+}
+
+/// Where a ray enters Ω.
+struct Entry {
+    t: f64,
+    /// The axis of the face that it comes through; `None` if it starts in Ω.
+    axis: Option<usize>,
 }

@@ -2,9 +2,11 @@
 
 use super::Direct;
 use super::staircases::Staircases;
-use crate::flat;
+use crate::flat::{self, Flat};
 use crate::flattened::Side;
+use crate::isovalue_axis::IsovalueAxis;
 use crate::luminaire::{point_term, unoccluded};
+use crate::polygon::Polygon;
 use crate::rng::{Rng, Stage};
 use crate::sweep::blockers::Blockers;
 use crate::sweep::flats::{self, Flats, capped};
@@ -26,23 +28,16 @@ fn stream(replicate: usize, luminaire: u32, flat: usize, texel: usize) -> u64 {
 impl Direct<'_> {
     /// Direct light of one luminaire on all flats: every texel looks from a point of its own along the segment to each
     /// luminaire point; it is lit at the isovalues above the greatest h there (and, inside solids, up to the least).
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the isovalues")]
     pub(super) fn light_flats(&self, flats: &mut Flats, number: u32, share: &OpenShare) {
-        let (scene, geometry, clearance, sides, part) =
-            (self.scene, self.geometry, self.clearance, self.sides, self.points);
-        let lattice = scene.lattice();
+        let scene = self.scene;
         let light = &scene.polygons()[number as usize];
-        let points = part.on(light, number);
+        let points = self.points.on(light, number);
         let (nc, axis) = (flats.isovalues, flats.axis);
         let corrections = [Side::Lower, Side::Higher]
             .map(|side| flats.centres.iter().map(|&c| share.correction(side, c)).collect::<Vec<f64>>());
-        let caps = scene.polygons().len();
-        let [lower, higher] = [Side::Lower, Side::Higher].map(|s| sides.contains(&s));
+        let even = [1.0; 2].map(|x| vec![x; nc]);
+        let [lower, higher] = [Side::Lower, Side::Higher].map(|s| self.sides.contains(&s));
         let higher = higher && !capped(scene);
-        let far = lattice.far();
-        let h = |p: DVec3| {
-            if clearance.is_none() || geometry.reaches(p) { scene.field.value(p) as f32 } else { f32::NEG_INFINITY }
-        };
         let (textures, others) = flats.textures.split_at_mut(flats.count);
         for (id, texture) in textures.iter_mut().enumerate() {
             let Some(texture) = texture else { continue };
@@ -52,67 +47,23 @@ impl Direct<'_> {
             others.resize_with(texture.direct.len() / (3 * nc), || None);
             let solid = flats.solid.get(id).and_then(Option::as_ref);
             let flat = flat::flat(scene, id).expect("textured flats exist");
-            let receiver = (id < caps).then(|| u32::try_from(id).expect("fewer than 2¹⁶ polygons"));
             let corners: Vec<DVec3> = [[0., 0.], [1., 0.], [0., 1.], [1., 1.]].map(|uv| flat.at(uv)).to_vec();
             let blockers = Blockers::new(scene, number, &corners);
+            let seer = Seer { direct: self, number, light, points: &points, blockers, axis, isovalues: nc, id, flat };
+            let factors = if seer.is_cap() { &even } else { &corrections };
             let [nu, nv, _] = texture.dims;
             let texels = texture.direct.par_chunks_mut(3 * nc).zip(others).enumerate().with_max_len(32);
             texels.for_each(|(texel, (out, other))| {
                 let (i, j) = (texel % nu, texel / nu);
-                let place = |a: f64, b: f64| flat.at([(i as f64 + a) / nu as f64, (j as f64 + b) / nv as f64]);
-                let e = unoccluded(light, place(0.5, 0.5), flat.normal);
-                if e == 0.0 || light.is_left(number, flat.departure) {
+                let place = |a: f64, b: f64| seer.flat.at([(i as f64 + a) / nu as f64, (j as f64 + b) / nv as f64]);
+                let e = unoccluded(light, place(0.5, 0.5), seer.flat.normal);
+                if e == 0.0 || light.is_left(number, seer.flat.departure) {
                     return;
                 }
-                let stream = stream(part.replicate, number, id, texel);
-                let mut rng = Rng::stream(part.seed, Stage::Sweep, stream);
-                // Number of isovalue texels at or below h.
-                let below = |h: f32| flats::below(&axis, nc, h);
-                // Σ g of what begins at each isovalue texel on the lower side, and of what ends before it on the higher
-                // one.
-                let (mut lit, mut all) = (Staircases::new(nc), Staircases::new(nc));
-                for points in points.chunks(LANES) {
-                    let mut segments = Segments::NONE;
-                    let mut seen = [(0.0, 0); LANES];
-                    for (lane, &y) in points.iter().enumerate() {
-                        let [a, b] = rng.unit2();
-                        let x = place(a, b);
-                        let g = point_term(x, flat.normal, y, light.normal());
-                        if g == 0.0 {
-                            continue;
-                        }
-                        let (lx, ly) = (lattice.to_index(x), lattice.to_index(y));
-                        let here = if lattice.holds(lx) && id < caps && !capped(scene) { below(h(lx)) } else { 0 };
-                        all.add(g, here, here);
-                        if blockers.block(number, receiver, ly, lx) {
-                            continue;
-                        }
-                        if id >= caps {
-                            lit.add(g, 0, 0);
-                            continue;
-                        }
-                        segments.set(lane, lattice, h, ly, lx);
-                        seen[lane] = (g, here);
-                    }
-                    let seen = seen.iter().enumerate().filter(|(_, s)| s.0 != 0.0);
-                    if geometry.has_gaps() {
-                        for (lane, &(g, here)) in seen {
-                            let y = lattice.to_index(points[lane]);
-                            let caps = [y.clamp(DVec3::ZERO, far) != y, true].map(|outside| outside && capped(scene));
-                            lit.add_beside(g, here, &segments.ranges(scene.field.samples(), lane, caps), below);
-                        }
-                        continue;
-                    }
-                    self.isa.extrema(scene.field.samples(), &mut segments, clearance);
-                    for (lane, &(g, here)) in seen {
-                        let open = below(segments.most[lane]).max(here);
-                        lit.add(g, open, below(segments.least[lane]).min(open));
-                    }
-                }
-                let even = [1.0; 2].map(|x| vec![x; nc]);
+                let [lit, all] = seer.looks(texel, place);
                 let rgb = (light.emission * e).to_array();
                 let add = |out: &mut [f32], [lower, higher]: [bool; 2]| {
-                    let lit = lit.sums(lower, higher, if id < caps { &corrections } else { &even });
+                    let lit = lit.sums(lower, higher, factors);
                     let all = all.sums(lower, higher, &even);
                     for c in 0..3 {
                         for t in (0..nc).filter(|&t| all[t] > 0.0) {
@@ -126,6 +77,81 @@ impl Direct<'_> {
                 other.into_iter().for_each(|out| add(out, others));
             });
         }
+    }
+}
+
+/// A flat, and the luminaire that its texels look at.
+struct Seer<'a> {
+    direct: &'a Direct<'a>,
+    number: u32,
+    light: &'a Polygon,
+    points: &'a [DVec3],
+    blockers: Blockers,
+    axis: IsovalueAxis,
+    isovalues: usize,
+    id: usize,
+    flat: Flat,
+}
+
+impl Seer<'_> {
+    fn is_cap(&self) -> bool {
+        self.id >= self.direct.scene.polygons().len()
+    }
+
+    /// What a texel sees of the luminaire, and what it would without obstacles: Σ g of what begins at each isovalue
+    /// texel on the lower side, and of what ends before it on the higher one. `place` is a place of the texel.
+    fn looks(&self, texel: usize, place: impl Fn(f64, f64) -> DVec3) -> [Staircases; 2] {
+        let Self { direct, number, points, blockers, .. } = self;
+        let Direct { scene, geometry, clearance, .. } = **direct;
+        let (lattice, far) = (scene.lattice(), scene.lattice().far());
+        let receiver = (!self.is_cap()).then(|| u32::try_from(self.id).expect("fewer than 2¹⁶ polygons"));
+        let h = |p: DVec3| {
+            if clearance.is_none() || geometry.reaches(p) { scene.field.value(p) as f32 } else { f32::NEG_INFINITY }
+        };
+        // Number of isovalue texels at or below h.
+        let below = |h: f32| flats::below(&self.axis, self.isovalues, h);
+        let stream = stream(direct.points.replicate, *number, self.id, texel);
+        let mut rng = Rng::stream(direct.points.seed, Stage::Sweep, stream);
+        let (mut lit, mut all) = (Staircases::new(self.isovalues), Staircases::new(self.isovalues));
+        for points in points.chunks(LANES) {
+            let mut segments = Segments::NONE;
+            let mut seen = [(0.0, 0); LANES];
+            for (lane, &y) in points.iter().enumerate() {
+                let [a, b] = rng.unit2();
+                let x = place(a, b);
+                let g = point_term(x, self.flat.normal, y, self.light.normal());
+                if g == 0.0 {
+                    continue;
+                }
+                let (lx, ly) = (lattice.to_index(x), lattice.to_index(y));
+                let here = if lattice.holds(lx) && !self.is_cap() && !capped(scene) { below(h(lx)) } else { 0 };
+                all.add(g, here, here);
+                if blockers.block(*number, receiver, ly, lx) {
+                    continue;
+                }
+                if self.is_cap() {
+                    lit.add(g, 0, 0);
+                    continue;
+                }
+                segments.set(lane, lattice, h, ly, lx);
+                seen[lane] = (g, here);
+            }
+            let seen = seen.iter().enumerate().filter(|(_, s)| s.0 != 0.0);
+            if geometry.has_gaps() {
+                for (lane, &(g, here)) in seen {
+                    let y = lattice.to_index(points[lane]);
+                    let caps = [y.clamp(DVec3::ZERO, far) != y, true].map(|outside| outside && capped(scene));
+                    lit.add_beside(g, here, &segments.ranges(scene.field.samples(), lane, caps), below);
+                }
+                continue;
+            }
+            direct.isa.extrema(scene.field.samples(), &mut segments, clearance);
+            for (lane, &(g, here)) in seen {
+                let open = below(segments.most[lane]).max(here);
+                lit.add(g, open, below(segments.least[lane]).min(open));
+            }
+        }
+        [lit, all]
     }
 }
 
