@@ -121,11 +121,14 @@ fn library_in(folder: &Path) -> Option<PathBuf> {
     library.exists().then_some(library)
 }
 
-/// Links `library` and makes every binary, test, bench and example of this package find it again at run time.
+/// Links `library` and makes every binary, test, bench and example of this package find it again at run time. Cargo hands
+/// link arguments to a package's own binaries only: build scripts of those that depend on it are told the folder, as
+/// `DEP_ISOLUME_EMBREE`.
 fn link(library: &Path, out: &Path) -> Result<(), String> {
     let library = library.canonicalize().map_err(|e| format!("{}: {e}", library.display()))?;
     let folder = library.parent().expect("a file has a folder");
     println!("cargo:rerun-if-changed={}", library.display());
+    println!("cargo::metadata=embree={}", folder.display());
     // embree4-sys asks the linker for -lembree4: give the library that name, whatever its own is.
     #[cfg(unix)]
     {

@@ -35,6 +35,12 @@
 //! # Ok::<(), isolume::error::Error>(())
 //! ```
 //!
+//! A program of another package finds Embree at run time if its `build.rs` says where that is:
+//!
+//! ```no_run
+//! println!("cargo:rustc-link-arg=-Wl,-rpath,{}", std::env::var("DEP_ISOLUME_EMBREE").unwrap());
+//! ```
+//!
 //! Positions are in the world (the volume's own unit of length) or, where a function says *local*, in units of voxels;
 //! isovalues are in the volume's units where a [`field::Sweep`] turns them over (`f64`), and in units of the sweep, [0,
 //! 1], in rays, meshes and references (`f32`). Long work takes a [`progress::Progress`], whose observer may end it.

@@ -379,6 +379,9 @@ pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
     };
     let isovalues = match (options.isovalues.as_deref(), file.isovalues, &series) {
         (Some(&[lo, hi]), ..) => [lo, hi],
+        (Some(other), ..) => {
+            return Err(Error::Invalid(format!("--isovalues: two numbers, the lower first; found {}", other.len())));
+        }
         (_, Some(range), _) => range,
         (.., Some(series)) => series
             .check(read)?

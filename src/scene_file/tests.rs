@@ -27,6 +27,8 @@ fn a_whole_scene() {
     assert_eq!(loaded.scene.field.sweep().hi(), 95.0);
     let options = SceneOptions { isovalues: Some(vec![10.0, 20.0]), ..SceneOptions::default() };
     assert_eq!(load(&path, &options).unwrap().scene.field.sweep().lo(), 10.0, "flags win");
+    let options = SceneOptions { isovalues: Some(vec![10.0]), ..SceneOptions::default() };
+    assert!(load(&path, &options).unwrap_err().to_string().contains("two numbers"));
 }
 
 #[test]
