@@ -121,9 +121,9 @@ fn library_in(folder: &Path) -> Option<PathBuf> {
     library.exists().then_some(library)
 }
 
-/// Links `library` and makes every binary, test, bench and example of this package find it again at run time. Cargo hands
-/// link arguments to a package's own binaries only: build scripts of those that depend on it are told the folder, as
-/// `DEP_ISOLUME_EMBREE`.
+/// Links `library` and makes every binary, test, bench and example of this package find it again at run time. Cargo
+/// hands link arguments to a package's own binaries only: build scripts of those that depend on it are told the folder,
+/// as `DEP_ISOLUME_EMBREE`.
 fn link(library: &Path, out: &Path) -> Result<(), String> {
     let library = library.canonicalize().map_err(|e| format!("{}: {e}", library.display()))?;
     let folder = library.parent().expect("a file has a folder");

@@ -76,9 +76,9 @@ pub(crate) const LEAST_UNANIMOUS: u32 = 64;
 
 /// Shadow rays for a receiver that may get the irradiance `open` (luminance), of at most `shadow_rays`: all from half
 /// the scene's E₀ on, and down to an eighth where there is less to get, so that light is equally certain everywhere.
-fn budget(scene: &Scene, open: f64, shadow_rays: u32) -> u32 {
+fn budget(reference_irradiance: f64, open: f64, shadow_rays: u32) -> u32 {
     let mut rays = shadow_rays;
-    let mut full = 0.5 * scene.reference_irradiance();
+    let mut full = 0.5 * reference_irradiance;
     while rays / 2 >= LEAST_RAYS && rays > shadow_rays / 8 && open < full {
         (rays, full) = (rays / 2, full / 2.0);
     }
@@ -112,7 +112,7 @@ pub fn direct_irradiance<T: Tracer>(
             continue;
         }
         let Some(aim) = Aim::best(light, x, receiver.normal) else { continue };
-        let budget = budget(scene, luminance(light.emission) * open, shadow_rays);
+        let budget = budget(scene.reference_irradiance(), luminance(light.emission) * open, shadow_rays);
         let pilot = (budget / 4).max(LEAST_UNANIMOUS);
         let index = key.index.wrapping_mul(scene.luminaires().len() as u64).wrapping_add(u64::from(l));
         let set = Key { index, ..key }.set();
@@ -193,6 +193,15 @@ mod tests {
 
     /// Slivers of light and of shadow, in the mean over receivers' point sets, however many rays: what ended where the
     /// first rays agreed lost half of the narrowest.
+    #[test]
+    fn budgets_fall_with_what_there_is_to_get_but_not_below_eight_rays() {
+        for (open, rays, expected) in
+            [(0.6, 256, 256), (0.4, 256, 128), (0.0, 256, 32), (0.0, 32, 8), (0.0, 12, 12), (0.0, 18, 9), (0.0, 4, 4)]
+        {
+            assert_eq!(budget(1.0, open, rays), expected, "{open}, {rays}");
+        }
+    }
+
     #[test]
     fn slivers_of_light_and_shadow_are_found_in_the_mean() {
         let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::splat(0.125)).unwrap();

@@ -42,8 +42,9 @@
 //! ```
 //!
 //! Positions are in the world (the volume's own unit of length) or, where a function says *local*, in units of voxels;
-//! isovalues are in the volume's units where a [`field::Sweep`] turns them over (`f64`), and in units of the sweep, [0,
-//! 1], in rays, meshes and references (`f32`). Long work takes a [`progress::Progress`], whose observer may end it.
+//! isovalues are in the volume's units where a [`field::Sweep`] converts them (`f64`), and in units of the sweep, [0,
+//! 1], in rays, meshes and references (`f32`). Bakes and pictures take a [`progress::Progress`], whose observer may end
+//! them; sweeps and references a function that may.
 //!
 //! Modules stand in pipeline order: a file uses only what stands above it here. Formulas carry the tag of their
 //! source on the line that implements them: `[BB09 Eq. 2]` is Banks & Beason, "Decoupling Illumination from

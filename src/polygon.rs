@@ -26,7 +26,8 @@ pub struct Polygon {
     pub albedo: DVec3,
     /// Emitted radiance L_e per channel.
     pub emission: DVec3,
-    /// Whether the back blocks light.
+    /// Whether the back blocks light: that of luminaires with one face, says [`crate::scene::Scene::new`], and of no
+    /// others.
     pub opaque_back: bool,
     /// What to add to this polygon's number in a scene for that of its other face; 0 if it has none.
     pub other_face: i32,

@@ -69,8 +69,7 @@ fn positions_in(field: &Field, strategy: &Strategy, count: u64, seed: u64, most:
             Ok(found)
         }
         Strategy::Planes(planes) => Ok(in_batches(count, most, |i| {
-            // Across (1,1,1) in units of Ω, all planes alike: as much of a plane's shadow on z = 0 lies in Ω as of
-            // itself.
+            // Across (1,1,1) in units of Ω, all planes alike: their projection onto z = 0 scales all areas alike.
             let p = uniform(i) / far;
             let plane = ((p.z * *planes as f64).floor() + 0.5) / *planes as f64;
             let q = DVec3::new(p.x, p.y, 3.0 * plane - p.x - p.y);

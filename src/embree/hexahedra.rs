@@ -44,7 +44,7 @@ impl<'a> GraphTracer<'a> {
     /// As [`GraphTracer::new`] with the [`pyramids`] of the same scene, seen from any of its fields.
     ///
     /// # Errors
-    /// `Invalid` for pyramids of other lattices; `Embree` if the library refuses.
+    /// `Invalid` for pyramids of other dimensions; `Embree` if the library refuses.
     pub fn with_pyramids(device: &Device, scene: &'a Scene, pyramids: &[Arc<Pyramid>]) -> Result<Self> {
         let mut builder = BvhBuilder::new(device)?;
         let graph = |number: usize, field: &'a Field| {

@@ -338,7 +338,7 @@ pub fn is_bake(file: &VtiFile) -> bool {
 }
 
 impl BakedVolume {
-    /// A bake of `scene` as if it were written and read.
+    /// A bake of `scene` (of several fields, of [`Scene::lit`] by it) as if it were written and read.
     pub fn new(scene: Scene, bake: Bake) -> Self {
         let scene = if *scene.lattice() == bake.lattice { scene } else { scene.resampled(&bake.lattice) };
         let report = serde_json::to_value(&bake.report).expect("the report is plain data");

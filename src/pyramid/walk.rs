@@ -337,7 +337,7 @@ impl Pyramid {
             }
         }
         let t = t.max(ray.t);
-        if t > ray.reach {
+        if t >= ray.reach {
             return None;
         }
         let far = ray.d[axis] > 0.0;

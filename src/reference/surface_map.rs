@@ -226,7 +226,10 @@ impl SurfaceMap {
             }
             _ => self.radius,
         };
-        // Nothing within reach: it is dark, as far as that.
+        // It is dark, as far as that.
+        if found.is_empty() {
+            return Some((DVec3::ZERO, f64::from(most)));
+        }
         let farthest = found.iter().map(|e| e.0).fold(0.0, f32::max);
         let radius = if found.len() < k { most } else { farthest.sqrt() };
         if radius == 0.0 {

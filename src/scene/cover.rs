@@ -12,23 +12,27 @@ pub(crate) const SLIT: f64 = 0.25;
 /// A point this near to a wall, in voxels, lies on it.
 pub(crate) const ON: f64 = 1e-3;
 
+/// A luminaire this near to a wall's plane, in voxels, stands in it: as near as f32 rounds places.
+const FLUSH: f64 = 2e-4;
 /// Such a share of a voxel before a wall a luminaire hangs that stood in its plane: within [`SLIT`] on grids four times
 /// as fine, too, and farther than positions are rounded.
 const HUNG: f64 = 0.05;
 
 /// Moves the luminaires, the first `emitting` of `polygons`, out of the planes of walls that face where they face and
-/// that they hide a part of.
+/// that they hide a part of. Of one with two faces either is then a luminaire with an opaque back: what shines into
+/// the wall would light nothing else.
 pub(super) fn hang(polygons: &mut [Polygon], emitting: usize, lattice: &Lattice) {
     let before = |light: &Polygon| {
         let wall = polygons[emitting..].iter().find(|wall| lies_on(light, wall, lattice))?;
         Some(HUNG * voxel_along(lattice, light).1 * wall.normal())
     };
     let moves: Vec<Option<DVec3>> = polygons[..emitting].iter().map(before).collect();
-    for (n, light) in polygons[..emitting].iter_mut().enumerate() {
-        // Both faces of one go together.
-        let other = n.wrapping_add_signed(light.other_face as isize);
-        if let Some(by) = moves[n].or(moves.get(other).copied().flatten()) {
-            light.translate(by);
+    for (n, by) in moves.into_iter().enumerate() {
+        let Some(by) = by else { continue };
+        polygons[n].translate(by);
+        let faces = [n, n.wrapping_add_signed(polygons[n].other_face as isize)];
+        for face in faces {
+            (polygons[face].other_face, polygons[face].opaque_back) = (0, true);
         }
     }
 }
@@ -37,7 +41,7 @@ pub(super) fn hang(polygons: &mut [Polygon], emitting: usize, lattice: &Lattice)
 fn lies_on(light: &Polygon, wall: &Polygon, lattice: &Lattice) -> bool {
     let normal = wall.normal();
     let height = |x: DVec3| (x - wall.vertices()[0]).dot(normal);
-    let near = || ON * voxel_along(lattice, light).1;
+    let near = || FLUSH * voxel_along(lattice, light).1;
     if light.normal().dot(normal) <= 0.0 || light.vertices().iter().any(|x| height(*x).abs() > near()) {
         return false;
     }
@@ -126,7 +130,9 @@ mod tests {
         let ceiling = square([0.0, 1.0], [0.0, 1.0], 1.0, false, 0.0);
         let of = |light: Polygon| height(&[light], std::slice::from_ref(&ceiling))[0];
         // Rounded to either side of the plane; at a distance; facing away; beside the ceiling; in part before it.
-        for (z, expected) in [(1.0, hung), (1.00005, hung + 5e-5), (0.99995, hung - 5e-5), (0.99, 0.99), (1.01, 1.01)] {
+        for (z, expected) in
+            [(1.0, hung), (1.00001, hung + 1e-5), (0.99999, hung - 1e-5), (0.9999, 0.9999), (1.0001, 1.0001)]
+        {
             assert!((of(lamp(z, false)) - expected).abs() < 1e-12, "{z}");
         }
         assert_eq!(of(lamp(1.0, true)), 1.0);
@@ -140,8 +146,15 @@ mod tests {
             square([0.4, 0.6], [0.6, 1.0], 1.0, false, 0.0),
         ];
         assert_eq!(height(&[lamp(1.0, false)], &hole), [1.0]);
-        // Both faces go.
-        let both = height(&lamp(1.0, true).both_faces(), std::slice::from_ref(&ceiling));
-        assert!(both.iter().all(|z| (z - hung).abs() < 1e-12), "{both:?}");
+        // Of two faces the one before the ceiling goes; before a ceiling with two faces either does, its own way.
+        let faces = lamp(1.0, true).both_faces();
+        let ceilings = square([0.0, 1.0], [0.0, 1.0], 1.0, false, 0.0).both_faces();
+        for (walls, expected) in [(&ceilings[..1], [1.0, hung]), (&ceilings[..], [2.0 - hung, hung])] {
+            let mut all = [&faces[..], walls].concat();
+            hang(&mut all, 2, &lattice);
+            let found = [0, 1].map(|n| all[n].at([0.5; 2]).z);
+            assert!(found.iter().zip(expected).all(|(z, expected)| (z - expected).abs() < 1e-12), "{found:?}");
+            assert!(all[..2].iter().all(|p| p.opaque_back && p.other_face == 0));
+        }
     }
 }
