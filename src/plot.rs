@@ -125,100 +125,123 @@ fn label(v: f64, step: f64) -> String {
     }
 }
 
+/// An SVG document that grows.
+struct Page(String);
+
+impl Page {
+    fn put(&mut self, text: std::fmt::Arguments<'_>) {
+        self.0.write_fmt(text).expect("strings take all that is written");
+    }
+}
+
 impl Plot {
     /// The plot as an SVG document.
     pub fn to_svg(&self) -> String {
         let [left, top, right, bottom] = MARGINS;
-        let usable = |&(x, y): &(f64, f64)| {
-            x.is_finite() && y.is_finite() && (!self.log_x || x > 0.0) && (!self.log_y || y > 0.0)
-        };
-        let points = || self.series.iter().flat_map(|s| s.points.iter().copied()).filter(|p| usable(p));
-        let x_axis = Axis::new(points().map(|p| p.0), self.log_x, false, [left, WIDTH - right]);
-        let y_axis = Axis::new(points().map(|p| p.1), self.log_y, true, [HEIGHT - bottom, top]);
-        let mut s = format!(
+        let points = || self.series.iter().flat_map(|s| s.points.iter().copied()).filter(|p| self.shows(p));
+        let axes = [
+            Axis::new(points().map(|p| p.0), self.log_x, false, [left, WIDTH - right]),
+            Axis::new(points().map(|p| p.1), self.log_y, true, [HEIGHT - bottom, top]),
+        ];
+        let mut page = Page(format!(
             "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" font-family=\"sans-serif\" \
              font-size=\"12\">\n<rect width=\"100%\" height=\"100%\" fill=\"white\"/>\n"
-        );
-        let mut put = |text: std::fmt::Arguments<'_>| s.write_fmt(text).expect("strings take all that is written");
+        ));
+        self.frame(&mut page, &axes);
+        (0..self.series.len()).for_each(|n| self.curve(&mut page, &axes, n));
+        page.0.push_str("</svg>\n");
+        page.0
+    }
+
+    /// Whether its axes have a place for a point.
+    fn shows(&self, &(x, y): &(f64, f64)) -> bool {
+        x.is_finite() && y.is_finite() && (!self.log_x || x > 0.0) && (!self.log_y || y > 0.0)
+    }
+
+    /// Title, axes with their ticks and names, and guides.
+    fn frame(&self, page: &mut Page, axes: &[Axis; 2]) {
+        let [left, top, right, bottom] = MARGINS;
         let middle = 0.5 * (left + WIDTH - right);
-        put(format_args!(
+        page.put(format_args!(
             "<text x=\"{middle}\" y=\"22\" text-anchor=\"middle\" font-size=\"15\">{}</text>\n",
             escaped(&self.title)
         ));
-        for (v, label) in x_axis.ticks() {
-            let x = x_axis.at(v);
-            put(format_args!("<path d=\"M{x:.1} {top}V{:.1}\" stroke=\"#ddd\"/>", HEIGHT - bottom));
-            put(format_args!(
+        for (v, label) in axes[0].ticks() {
+            let x = axes[0].at(v);
+            page.put(format_args!("<path d=\"M{x:.1} {top}V{:.1}\" stroke=\"#ddd\"/>", HEIGHT - bottom));
+            page.put(format_args!(
                 "<text x=\"{x:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{label}</text>\n",
                 HEIGHT - bottom + 17.0,
             ));
         }
-        for (v, label) in y_axis.ticks() {
-            let y = y_axis.at(v);
-            put(format_args!("<path d=\"M{left} {y:.1}H{:.1}\" stroke=\"#ddd\"/>", WIDTH - right));
-            put(format_args!(
+        for (v, label) in axes[1].ticks() {
+            let y = axes[1].at(v);
+            page.put(format_args!("<path d=\"M{left} {y:.1}H{:.1}\" stroke=\"#ddd\"/>", WIDTH - right));
+            page.put(format_args!(
                 "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">{label}</text>\n",
                 left - 6.0,
                 y + 4.0,
             ));
         }
-        for &v in self.guides.iter().filter(|v| (x_axis.page[0]..=x_axis.page[1]).contains(&x_axis.at(**v))) {
-            let x = x_axis.at(v);
-            put(format_args!(
+        for &v in self.guides.iter().filter(|v| (axes[0].page[0]..=axes[0].page[1]).contains(&axes[0].at(**v))) {
+            let x = axes[0].at(v);
+            page.put(format_args!(
                 "<path d=\"M{x:.1} {top}V{:.1}\" stroke=\"#999\" stroke-dasharray=\"3 3\"/>\n",
                 HEIGHT - bottom
             ));
         }
-        put(format_args!(
+        page.put(format_args!(
             "<path d=\"M{left} {top}V{y}H{x}\" fill=\"none\" stroke=\"black\"/>\n",
             y = HEIGHT - bottom,
             x = WIDTH - right
         ));
-        put(format_args!(
+        page.put(format_args!(
             "<text x=\"{middle}\" y=\"{}\" text-anchor=\"middle\">{}</text>\n",
             HEIGHT - 14.0,
             escaped(&self.x_label)
         ));
         let y_middle = 0.5 * (top + HEIGHT - bottom);
-        put(format_args!(
+        page.put(format_args!(
             "<text transform=\"translate(18 {y_middle}) rotate(-90)\" text-anchor=\"middle\">{}</text>\n",
             escaped(&self.y_label)
         ));
-        for (n, series) in self.series.iter().enumerate() {
-            let colour = COLOURS[n % COLOURS.len()];
-            // Colours that come again are dashed and hollow.
-            let (dash, fill) = match n / COLOURS.len() {
-                0 => ("", colour),
-                1 => (" stroke-dasharray=\"6 3\"", "white"),
-                _ => (" stroke-dasharray=\"2 3\"", "white"),
-            };
-            let at: Vec<(f64, f64)> =
-                series.points.iter().filter(|p| usable(p)).map(|p| (x_axis.at(p.0), y_axis.at(p.1))).collect();
-            if series.line && at.len() > 1 {
-                let path: Vec<String> = at.iter().map(|(x, y)| format!("{x:.1} {y:.1}")).collect();
-                put(format_args!(
-                    "<path d=\"M{}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"1.6\"{dash}/>\n",
-                    path.join("L")
-                ));
-            }
-            if series.marks {
-                for (x, y) in &at {
-                    put(format_args!(
-                        "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"2.8\" fill=\"{fill}\" stroke=\"{colour}\"/>"
-                    ));
-                }
-                put(format_args!("\n"));
-            }
-            let (x, y) = (WIDTH - right + 14.0, top + 14.0 + 19.0 * n as f64);
-            put(format_args!(
-                "<circle cx=\"{x}\" cy=\"{:.1}\" r=\"4\" fill=\"{fill}\" stroke=\"{colour}\"/><text x=\"{}\" y=\"{y}\">{}</text>\n",
-                y - 4.0,
-                x + 10.0,
-                escaped(&series.name)
+    }
+
+    /// Series `n`, and its name.
+    fn curve(&self, page: &mut Page, axes: &[Axis; 2], n: usize) {
+        let [_, top, right, _] = MARGINS;
+        let series = &self.series[n];
+        let colour = COLOURS[n % COLOURS.len()];
+        // Colours that come again are dashed and hollow.
+        let (dash, fill) = match n / COLOURS.len() {
+            0 => ("", colour),
+            1 => (" stroke-dasharray=\"6 3\"", "white"),
+            _ => (" stroke-dasharray=\"2 3\"", "white"),
+        };
+        let at: Vec<(f64, f64)> =
+            series.points.iter().filter(|p| self.shows(p)).map(|p| (axes[0].at(p.0), axes[1].at(p.1))).collect();
+        if series.line && at.len() > 1 {
+            let path: Vec<String> = at.iter().map(|(x, y)| format!("{x:.1} {y:.1}")).collect();
+            page.put(format_args!(
+                "<path d=\"M{}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"1.6\"{dash}/>\n",
+                path.join("L")
             ));
         }
-        s.push_str("</svg>\n");
-        s
+        if series.marks {
+            for (x, y) in &at {
+                page.put(format_args!(
+                    "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"2.8\" fill=\"{fill}\" stroke=\"{colour}\"/>"
+                ));
+            }
+            page.put(format_args!("\n"));
+        }
+        let (x, y) = (WIDTH - right + 14.0, top + 14.0 + 19.0 * n as f64);
+        page.put(format_args!(
+            "<circle cx=\"{x}\" cy=\"{:.1}\" r=\"4\" fill=\"{fill}\" stroke=\"{colour}\"/><text x=\"{}\" y=\"{y}\">{}</text>\n",
+            y - 4.0,
+            x + 10.0,
+            escaped(&series.name)
+        ));
     }
 
     /// Writes the plot.

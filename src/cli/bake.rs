@@ -203,17 +203,21 @@ impl Bake {
             return Ok((sweep, plan.estimates()?));
         }
         let json = match self.begin(&plan, first, progress)? {
-            Begun::Whole(report) => report,
+            Begun::Whole(report) => {
+                self.hand_out(&report)?;
+                report
+            }
             Begun::At(checkpoint) => {
                 let reports = self.work(&plan, &checkpoint, (begun, load), progress)?;
+                let json = in_one(plan.scene(), &reports);
+                self.hand_out(&json)?;
                 if progress.is_shown() {
                     self.summarise(plan.scene(), &reports);
                 }
                 warn_of_unsettled(&reports);
-                in_one(plan.scene(), &reports)
+                json
             }
         };
-        self.hand_out(&json)?;
         Ok((sweep, json))
     }
 

@@ -32,7 +32,7 @@ pub(super) fn hang(polygons: &mut [Polygon], emitting: usize, lattice: &Lattice)
         polygons[n].translate(by);
         let faces = [n, n.wrapping_add_signed(polygons[n].other_face as isize)];
         for face in faces {
-            (polygons[face].other_face, polygons[face].opaque_back) = (0, true);
+            polygons.get_mut(face).into_iter().for_each(|p| (p.other_face, p.opaque_back) = (0, true));
         }
     }
 }

@@ -102,36 +102,14 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
             let settings = BakeSettings::new(&options.clone().or(base), scene)?;
             let (bake, seconds) = study.bake(subject, &settings)?;
             let a = accuracy_of(scene, &bake, &references)?;
-            let s = bake.report.seconds;
-            let [nx, ny, nz] = bake.lattice.dims();
             let mut row = key(mode);
-            // Sweeps need none.
-            let emitted = match bake.report.photons.emitted {
-                0 => "-".to_owned(),
-                emitted => emitted.to_string(),
-            };
-            row.extend([format!("{nx}x{ny}x{nz}"), emitted, bake.report.samples.to_string()]);
-            let numbers = [
-                a.percent_rms,
-                a.confidence[0],
-                a.confidence[1],
-                a.percent_rms_area,
-                a.percent_rms_lit,
-                noise(&bake, &references[0]),
-                floors[0],
-                floors[1],
-                floors[2],
-                total,
-                triangles,
-                s.build,
-                s.photons,
-                s.cache,
-                s.sweep + s.samples + s.interpolate,
-                seconds[0],
-                seconds[1],
-                extract_seconds,
-                picture_seconds,
-            ];
+            row.extend(counts(&bake));
+            let s = bake.report.seconds;
+            let errors = [a.percent_rms, a.confidence[0], a.confidence[1], a.percent_rms_area, a.percent_rms_lit];
+            let floors = [noise(&bake, &references[0]), floors[0], floors[1], floors[2], total, triangles];
+            let stages = [s.build, s.photons, s.cache, s.sweep + s.samples + s.interpolate];
+            let times = [seconds[0], seconds[1], extract_seconds, picture_seconds];
+            let numbers = errors.into_iter().chain(floors).chain(stages).chain(times);
             row.extend(numbers.map(|x| format!("{x:.4}")));
             row.extend(job.clone());
             table.push(row)?;
@@ -143,6 +121,17 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
         provenance(study)
     );
     table.write_markdown(&study.folder.join("datasets.md"), "Data sets", &notes)
+}
+
+/// The grid's points, photons and samples of a bake.
+fn counts(bake: &Bake) -> [String; 3] {
+    let [nx, ny, nz] = bake.lattice.dims();
+    // Sweeps need none.
+    let emitted = match bake.report.photons.emitted {
+        0 => "-".to_owned(),
+        emitted => emitted.to_string(),
+    };
+    [format!("{nx}x{ny}x{nz}"), emitted, bake.report.samples.to_string()]
 }
 
 /// Wall seconds of a path-traced reference picture of 400 × 400 pixels with 64 paths each.
