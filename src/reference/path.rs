@@ -138,8 +138,8 @@ pub fn path_picture<T: Tracer>(
     camera: &Camera,
     progress: Progress,
 ) -> Result<Picture> {
-    // Paths are told apart by their ray: the same picture on any number of threads, and of two cameras that see the same
-    // two with noise of their own.
+    // Paths are told apart by their ray: the same picture on any number of threads, and of two cameras that see the
+    // same two with noise of their own.
     let shade = |ray: &FlattenedRay, hit, direction: DVec3, _| {
         let key = direction.to_array().iter().fold(0u64, |k, x| (k ^ x.to_bits()).wrapping_mul(0x9e37_79b9_7f4a_7c15));
         path_radiance(scene, tracer, ray, hit, &mut Rng::stream(1, Stage::Path, key))
