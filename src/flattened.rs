@@ -201,6 +201,46 @@ pub struct SurfacePoint {
     pub isovalue: f32,
 }
 
+/// Where a ray enters Ω.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Entry {
+    pub t: f64,
+    /// The axis of the face that it comes through; `None` if it starts in Ω.
+    pub axis: Option<usize>,
+}
+
+/// Where a ray from `o` along `d`, with `inv` = 1/`d`, enters Ω of so many `cells`, within its reach: slab by slab. A
+/// component 0 (or −0) never crosses a plane: its slab holds the whole line or nothing of it. `None` for no direction.
+#[inline(always)]
+pub(crate) fn enter<const N: usize>(
+    cells: [usize; N],
+    o: [f64; N],
+    d: [f64; N],
+    inv: [f64; N],
+    reach: f64,
+) -> Option<Entry> {
+    let (mut t, mut t_out, mut axis) = (0f64, reach, None);
+    if !(0..N).all(|a| o[a] >= 0.0 && o[a] <= cells[a] as f64) {
+        for a in 0..N {
+            let far = cells[a] as f64;
+            if d[a] == 0.0 {
+                if !(o[a] >= 0.0 && o[a] <= far) {
+                    return None;
+                }
+                continue;
+            }
+            let (near_plane, far_plane) = if d[a] > 0.0 { (0.0, far) } else { (far, 0.0) };
+            let t0 = (near_plane - o[a]) * inv[a];
+            if t0 > t {
+                (t, axis) = (t0, Some(a));
+            }
+            t_out = t_out.min((far_plane - o[a]) * inv[a]);
+        }
+    }
+    let moves = d.iter().fold(0.0, |most, x| x.abs().max(most)) != 0.0;
+    (t <= t_out && moves).then_some(Entry { t, axis })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -227,6 +267,26 @@ mod tests {
                     assert_eq!(FlattenedRay::unpack_ends(ray.pack_ends()), ray.ends());
                 }
             }
+        }
+    }
+
+    #[test]
+    fn rays_enter_through_the_nearest_face_that_all_slabs_share() {
+        let of = |o: [f64; 2], d: [f64; 2], reach| enter([4, 2], o, d, d.map(|x| 1.0 / x), reach);
+        let at = |t, axis| Some(Entry { t, axis });
+        assert_eq!(of([1.0, 1.0], [1.0, 0.0], 9.0), at(0.0, None));
+        assert_eq!(of([-2.0, 1.0], [1.0, 0.0], 9.0), at(2.0, Some(0)));
+        assert_eq!(of([-2.0, 3.0], [1.0, -1.0], 9.0), at(2.0, Some(0)));
+        assert_eq!(of([-1.0, 4.0], [1.0, -1.0], 9.0), at(2.0, Some(1)));
+        // Beside it, away from it, too far, along it outside, nowhere.
+        for (o, d, reach) in [
+            ([-3.0, 1.0], [1.0, 1.0], 9.0),
+            ([-2.0, 1.0], [-1.0, 0.0], 9.0),
+            ([-2.0, 1.0], [1.0, 0.0], 1.5),
+            ([1.0, 2.5], [1.0, 0.0], 9.0),
+            ([1.0, 1.0], [0.0, 0.0], 9.0),
+        ] {
+            assert_eq!(of(o, d, reach), None, "{o:?} {d:?}");
         }
     }
 }

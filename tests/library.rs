@@ -106,7 +106,7 @@ fn what_was_changed_is_checked_again() {
     let usual = settings(&good, Engine::Sweep);
     refused("directions 7", quietly(&good, &BakeSettings { directions: 7, ..usual.clone() }));
     refused("tau NaN", quietly(&good, &BakeSettings { tau: f64::NAN, ..usual.clone() }));
-    refused("wall-isovalues 0", quietly(&good, &BakeSettings { wall_isovalues: 0, ..usual.clone() }));
+    refused("wall_isovalues 0", quietly(&good, &BakeSettings { wall_isovalues: 0, ..usual.clone() }));
     let mut bright = good.clone();
     bright.surface.albedo = DVec3::splat(3.0).into();
     refused("surface albedo", quietly(&bright, &usual));

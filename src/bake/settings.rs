@@ -471,7 +471,7 @@ impl BakeSettings {
             ("bands", &s.bands, (1..=MOST_BANDS).contains(&s.bands), "1 to 256"),
             ("tau", &s.tau, s.tau > 0.0 && s.tau.is_finite(), "above 0 and finite"),
             ("wall-resolution", &s.wall_resolution, (2..=2048).contains(&s.wall_resolution), "2 to 2048"),
-            ("wall-isovalues", &s.wall_isovalues, (2..=512).contains(&s.wall_isovalues), "2 to 512"),
+            ("wall_isovalues", &s.wall_isovalues, (2..=512).contains(&s.wall_isovalues), "2 to 512"),
         ];
         if s.engine == Engine::Sweep && s.bands > 1 {
             return Err(Error::Invalid(

@@ -12,7 +12,7 @@ use super::{FlatScene, HeightField, Segment};
 use crate::cubic::Cubic;
 use crate::embree::{Bvh, BvhBuilder, Device, Ray, RayHit, RayView, UserGeometry, UserHit};
 use crate::error::Result;
-use crate::flattened::{Departure, Ends, FlattenedHit, FlattenedRay, Side, Target};
+use crate::flattened::{Departure, Ends, Entry, FlattenedHit, FlattenedRay, Side, Target, enter};
 use crate::tracer::Tracer;
 use glam::{DVec2, DVec3, Vec3};
 use std::sync::Arc;
@@ -55,7 +55,7 @@ impl Curves {
         let o = [ray.origin.x, ray.origin.y].map(f64::from);
         let d = [ray.direction.x, ray.direction.y].map(f64::from);
         let inv = d.map(|x| 1.0 / x);
-        let (mut t, mut entry) = clip(n, o, d, reach)?;
+        let Entry { mut t, axis: mut entry } = enter(n, o, d, inv, reach)?;
         let mut cell: [i64; 2] = std::array::from_fn(|a| {
             let p = o[a] + t * d[a];
             // On a shared line the ray is in the cell it goes to.
@@ -147,29 +147,6 @@ impl Curves {
             (cell, t, entry) = (next, t_exit, Some(axis));
         }
     }
-}
-
-/// The t at which a ray from `o` along `d` enters Ω of `n` cells, within its reach, and the axis of the edge that it
-/// comes through, unless it starts there.
-fn clip(n: [usize; 2], o: [f64; 2], d: [f64; 2], reach: f64) -> Option<(f64, Option<usize>)> {
-    let (mut t, mut t_out, mut entry) = (0f64, reach, None);
-    for a in 0..2 {
-        let far = n[a] as f64;
-        if d[a] == 0.0 {
-            if !(o[a] >= 0.0 && o[a] <= far) {
-                return None;
-            }
-            continue;
-        }
-        let (near_plane, far_plane) = if d[a] > 0.0 { (0.0, far) } else { (far, 0.0) };
-        let inv = 1.0 / d[a];
-        let t0 = (near_plane - o[a]) * inv;
-        if t0 > t {
-            (t, entry) = (t0, Some(a));
-        }
-        t_out = t_out.min((far_plane - o[a]) * inv);
-    }
-    (t <= t_out && d != [0.0; 2]).then_some((t, entry))
 }
 
 /// Whether a cell holds a piece of L(h, c); false if a corner is NaN.

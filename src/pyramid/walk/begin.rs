@@ -2,7 +2,7 @@
 
 use super::{Begun, Child, FLIPS, INTEGERS, Lane, PARALLEL, Ray, Step, cap, first_of, not_below, point, state};
 use crate::field::Field;
-use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Side};
+use crate::flattened::{Departure, Entry, FlattenedHit, FlattenedRay, Side, enter};
 use crate::pyramid::Pyramid;
 use crate::pyramid::kernel::{Kernel, Line, Piece};
 use glam::{Vec3, Vec4};
@@ -141,7 +141,7 @@ impl Pyramid {
             return Begun::Done(hit);
         }
         let inv = d.map(|x| 1.0 / x);
-        let Some(Entry { t, axis: entry }) = self.enter(o, d, inv, reach) else { return Begun::Done(None) };
+        let Some(Entry { t, axis: entry }) = enter(self.cells, o, d, inv, reach) else { return Begun::Done(None) };
         let (cell, mut line) = self.line([o, d, inv], t, reach);
         let start = self.nodes(cell);
         self.prefetch(kernel, &start);
@@ -216,33 +216,6 @@ impl Pyramid {
         None
     }
 
-    /// Where a ray enters Ω, within its reach. A component 0 (or −0) never crosses a plane: its slab holds the whole
-    /// line or nothing of it.
-    #[inline(always)]
-    fn enter(&self, o: [f64; 3], d: [f64; 3], inv: [f64; 3], reach: f64) -> Option<Entry> {
-        let n = self.cells;
-        let (mut t, mut t_out, mut axis) = (0f64, reach, None);
-        if !(0..3).all(|a| o[a] >= 0.0 && o[a] <= n[a] as f64) {
-            for a in 0..3 {
-                let far = n[a] as f64;
-                if d[a] == 0.0 {
-                    if !(o[a] >= 0.0 && o[a] <= far) {
-                        return None;
-                    }
-                    continue;
-                }
-                let (near_plane, far_plane) = if d[a] > 0.0 { (0.0, far) } else { (far, 0.0) };
-                let t0 = (near_plane - o[a]) * inv[a];
-                if t0 > t {
-                    (t, axis) = (t0, Some(a));
-                }
-                t_out = t_out.min((far_plane - o[a]) * inv[a]);
-            }
-        }
-        let moves = d[0].abs().max(d[1].abs()).max(d[2].abs()) != 0.0;
-        (t <= t_out && moves).then_some(Entry { t, axis })
-    }
-
     /// The cell of a ray (start, direction and its reciprocals) at `t`, and the line from there.
     #[inline(always)]
     #[allow(clippy::cast_possible_truncation, reason = "clamped cell numbers; lines are f32")]
@@ -277,11 +250,4 @@ impl Pyramid {
         }
         (cell, line)
     }
-}
-
-/// Where a ray enters Ω.
-struct Entry {
-    t: f64,
-    /// The axis of the face that it comes through; `None` if it starts in Ω.
-    axis: Option<usize>,
 }
