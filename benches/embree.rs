@@ -1,7 +1,7 @@
 //! What Embree itself costs: a user geometry that never hits, against triangles.
 //! One thread; the best of seven interleaved runs, in nanoseconds per ray.
 
-use isolume::embree::{Bvh, BvhBuilder, Device, Ray, Ray16, RayHit, RayHit16, RayView, UserGeometry, UserHit, Valid16};
+use isolume::embree::{Bvh, BvhBuilder, Device, Ray, Ray16, RayHit, RayHit16, UserGeometry, UserHit, Valid16};
 use isolume::isa::Isa;
 use std::hint::black_box;
 use std::time::Instant;
@@ -19,11 +19,11 @@ impl UserGeometry for Null {
         ([0.0; 3], [1.0; 3])
     }
     #[inline]
-    fn intersect(&self, _: u32, _: &RayView) -> Option<UserHit> {
+    fn intersect(&self, _: u32, _: &Ray) -> Option<UserHit> {
         None
     }
     #[inline]
-    fn occluded(&self, _: u32, _: &RayView) -> bool {
+    fn occluded(&self, _: u32, _: &Ray) -> bool {
         false
     }
 }

@@ -3,6 +3,7 @@
 use std::fmt;
 
 /// A number with all digits that tell it from others, an exponent where it is very large or small.
+#[derive(Debug)]
 pub struct Shortest(
     /// The number.
     pub f64,

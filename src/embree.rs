@@ -25,7 +25,7 @@ mod extrusions;
 mod hexahedra;
 mod triangles;
 
-pub use abi::{Hit, Hit16, INVALID_ID, Ray, Ray16, RayHit, RayHit16, RayView, Valid16};
+pub use abi::{Hit, Hit16, INVALID_ID, Ray, Ray16, RayHit, RayHit16, Valid16};
 pub use bvh::{Bvh, BvhBuilder, Quality};
 pub use device::Device;
 pub use hexahedra::{GraphTracer, pyramids};

@@ -20,6 +20,14 @@ pub enum Error {
     /// The input is well formed, but asks for something isolume does not do.
     #[error("{0}")]
     NotSupported(String),
+    /// What went wrong, and the line and key of the scene file that asked for it.
+    #[error("{place}: {source}")]
+    At {
+        /// Where it was asked for.
+        place: String,
+        /// What went wrong.
+        source: Box<Error>,
+    },
     /// Embree refused: a missing or too old library, or a failed build.
     #[error("Embree: {0}")]
     Embree(String),
@@ -60,6 +68,16 @@ impl Error {
         }
     }
 
+    /// The same error with `place` in front, which asked for what failed.
+    #[must_use]
+    pub fn at(self, place: impl std::fmt::Display) -> Self {
+        match self {
+            Error::Invalid(message) => Error::Invalid(format!("{place}: {message}")),
+            Error::NotSupported(message) => Error::NotSupported(format!("{place}: {message}")),
+            other => Error::At { place: place.to_string(), source: Box::new(other) },
+        }
+    }
+
     /// The exit code of the command line: 2 for bad usage or input (paths that cannot be read or written among it), 130
     /// when interrupted, 1 for the rest.
     pub fn exit_code(&self) -> u8 {
@@ -72,6 +90,7 @@ impl Error {
                 1
             }
             Error::Io { .. } | Error::Invalid(_) | Error::NotSupported(_) => 2,
+            Error::At { source, .. } => source.exit_code(),
             Error::Interrupted => 130,
             Error::Embree(_) | Error::Failed(_) => 1,
         }

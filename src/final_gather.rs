@@ -64,6 +64,7 @@ impl FinalGatherSettings {
 
 /// Light of a bake, found by rays where one looks. The same bits for the same places and indices, on any number of
 /// threads.
+#[derive(Debug)]
 pub struct FinalGather<'a, T> {
     baked: &'a BakedVolume,
     tracer: &'a T,

@@ -89,11 +89,13 @@ pub struct Irradiance {
 }
 
 /// The photons of one side, arranged for estimates.
+#[derive(Debug)]
 pub struct PhotonMap<'a> {
     arrangement: Arrangement<'a>,
     side: Side,
 }
 
+#[derive(Debug)]
 enum Arrangement<'a> {
     Points(PhotonPoints<'a>),
     Density(PhotonDensity<'a>),

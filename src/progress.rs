@@ -3,6 +3,7 @@
 
 use crate::error::{Error, Result};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use std::fmt;
 use std::io::IsTerminal;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -80,8 +81,14 @@ pub trait Observer: Sync {
     }
 }
 
+impl fmt::Debug for dyn Observer + '_ {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Observer")
+    }
+}
+
 /// Where progress goes.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Debug)]
 pub enum Progress<'a> {
     /// Nowhere.
     Quiet,
@@ -111,6 +118,7 @@ impl Clock {
 }
 
 /// One running stage.
+#[derive(Debug)]
 pub struct Stage<'a> {
     progress: Progress<'a>,
     bar: Option<ProgressBar>,

@@ -16,6 +16,7 @@ use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Where indirect light comes from.
+#[derive(Debug)]
 pub enum Indirect<'a> {
     /// Straight from the photon map without first landings: BB09's own mode.
     Map(&'a PhotonMap<'a>),
@@ -41,6 +42,7 @@ pub struct RadianceSample {
 }
 
 /// Samples and what they cost.
+#[derive(Debug)]
 pub struct RadianceSamples {
     /// One per position; `None` where ∇h vanishes.
     pub samples: Vec<Option<RadianceSample>>,
@@ -87,6 +89,7 @@ fn from_block(bytes: &[u8], places: &[(u64, Vec3)], out: &mut [Option<RadianceSa
 }
 
 /// What samples of one side of a scene's level sets are taken with.
+#[derive(Debug)]
 pub struct Sampler<'a, T> {
     /// The scene.
     pub scene: &'a Scene,

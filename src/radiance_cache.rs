@@ -53,6 +53,7 @@ pub struct CacheSettings {
 type Nodes = [Option<Vec<[f32; 3]>>; 2];
 
 /// The nodes of one field that are filled.
+#[derive(Debug)]
 struct FieldNodes {
     /// Those that have room: if most are filled, all of them, which makes lookups faster.
     stored: NodeSet,
@@ -64,6 +65,7 @@ struct FieldNodes {
 
 /// From what a field's nodes are lit, besides luminaires: the photons that land later than first, per side (lower,
 /// higher); `None` where nothing looks.
+#[derive(Debug)]
 pub struct NodePhotons<'a> {
     maps: [Option<PhotonMap<'a>>; 2],
     /// Of the field's lattice.
@@ -141,6 +143,7 @@ fn whole(band: &RangeInclusive<f32>) -> bool {
 }
 
 /// Outgoing radiance (reflected and, for emitting level sets, emitted) wherever a gather ray can land.
+#[derive(Debug)]
 pub struct RadianceCache {
     /// Per field and side (lower, higher): what a white surface would reflect at each node, NaN where neither the node
     /// nor its surroundings hold a surface. The albedo is that of the hit: isovalues may differ much from node to node.

@@ -83,7 +83,7 @@ impl Camera {
 }
 
 /// How surfaces get their colours.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Debug)]
 pub enum Shading<'a> {
     /// By the baked radiance, or by rays into it; the scene drawn must be the bake's.
     Baked(&'a BakedVolume, Option<FinalGatherSettings>),

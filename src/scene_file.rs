@@ -335,12 +335,12 @@ impl Source {
         let line = |at: usize| format!(":{}", self.text[..at].matches('\n').count() + 1);
         format!("{}{}", self.path.display(), keys::find(&self.text, path).map_or(String::new(), line))
     }
+}
 
-    /// `error` as the fault of the key at `path`, at the line where it stands.
-    fn blame(&self, path: &[&str], error: &Error) -> Error {
-        let key = path.last().unwrap_or(&"");
-        Error::Invalid(format!("{}: {key}: {error}", self.place(path)))
-    }
+/// `error` as the fault of the key at `path` of `source`, if there is one, at the line where it stands.
+fn blame(source: Option<&Source>, path: &[&str], error: Error) -> Error {
+    let Some(source) = source else { return error };
+    error.at(format_args!("{}: {}", source.place(path), path.last().unwrap_or(&"")))
 }
 
 /// Loads a volume, or a scene file (`.toml`), with flags laid over it.
@@ -360,7 +360,7 @@ pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
     // What a flag brought is the flag's fault, the rest its key's.
     let blame = |path: &'static [&'static str], flag: bool| {
         let source = source.as_ref().filter(|_| !flag);
-        move |e: Error| source.map_or_else(|| Error::Invalid(e.to_string()), |s| s.blame(path, &e))
+        move |e: Error| self::blame(source, path, e)
     };
     if file.policy.is_some() {
         return Err(blame(&["policy"], false)(Error::Invalid(
@@ -420,10 +420,10 @@ pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
 
 /// Polygons of all context geometry.
 fn context(entries: &[ContextOptions], folder: &Path, source: Option<&Source>) -> Result<Vec<Polygon>> {
-    let blame = |n: usize, e: Error| {
-        source.map_or_else(|| Error::Invalid(e.to_string()), |s| s.blame(&["context", &n.to_string(), "file"], &e))
-    };
-    let polygons = entries.iter().enumerate().map(|(n, c)| c.polygons(folder).map_err(|e| blame(n, e)));
+    let polygons = entries
+        .iter()
+        .enumerate()
+        .map(|(n, c)| c.polygons(folder).map_err(|e| blame(source, &["context", &n.to_string(), "file"], e)));
     Ok(polygons.collect::<Result<Vec<_>>>()?.concat())
 }
 

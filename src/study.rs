@@ -26,6 +26,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 /// A named scene.
+#[derive(Debug)]
 pub struct Subject {
     /// Name in tables and file names.
     pub name: String,
@@ -77,6 +78,7 @@ pub enum Effort {
 }
 
 /// What all studies share.
+#[derive(Debug)]
 pub struct Study<'a> {
     /// Where tables, plots and cached references go.
     pub folder: PathBuf,

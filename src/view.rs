@@ -28,6 +28,7 @@ const BINS: usize = 256;
 const MOST_POINTS: usize = 1 << 27;
 
 /// What a page is made of, before it is packed.
+#[derive(Debug)]
 pub struct Payload {
     /// Scene, camera, histogram, and where each array lies in `bytes`.
     pub description: Value,

@@ -1,8 +1,7 @@
 //! The fence around Embree: layout, callbacks, errors. Every expected distance is known without Embree.
 
 use isolume::embree::{
-    Bvh, BvhBuilder, Device, INVALID_ID, Ray, Ray16, RayHit, RayHit16, RayView, UserGeometry, UserHit, UserHits16,
-    Valid16,
+    Bvh, BvhBuilder, Device, INVALID_ID, Ray, Ray16, RayHit, RayHit16, UserGeometry, UserHit, UserHits16, Valid16,
 };
 use isolume::error::Error;
 use isolume::isa::Isa;
@@ -54,7 +53,7 @@ impl UserGeometry for Spheres {
         ([x - r, -r, -r], [x + r, r, r])
     }
 
-    fn intersect(&self, prim: u32, ray: &RayView) -> Option<UserHit> {
+    fn intersect(&self, prim: u32, ray: &Ray) -> Option<UserHit> {
         self.seen.lock().unwrap().push((ray.id, ray.time));
         let o = [ray.org[0] - 4.0 * prim as f32, ray.org[1], ray.org[2]];
         let dot = |a: [f32; 3], b: [f32; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -65,7 +64,7 @@ impl UserGeometry for Spheres {
         Some(UserHit { t, u: 0.25, v: 0.75, normal })
     }
 
-    fn occluded(&self, prim: u32, ray: &RayView) -> bool {
+    fn occluded(&self, prim: u32, ray: &Ray) -> bool {
         self.intersect(prim, ray).is_some()
     }
 }
@@ -254,11 +253,11 @@ impl UserGeometry for Counter {
     fn bounds(&self, _: u32) -> ([f32; 3], [f32; 3]) {
         ([-1.0; 3], [1.0; 3])
     }
-    fn intersect(&self, _: u32, _: &RayView) -> Option<UserHit> {
+    fn intersect(&self, _: u32, _: &Ray) -> Option<UserHit> {
         self.single.fetch_add(1, Ordering::Relaxed);
         None
     }
-    fn occluded(&self, prim: u32, ray: &RayView) -> bool {
+    fn occluded(&self, prim: u32, ray: &Ray) -> bool {
         self.intersect(prim, ray).is_some()
     }
     fn intersect16(&self, _: u32, active: u16, _: &Ray16, _: &mut UserHits16) -> u16 {
@@ -300,10 +299,10 @@ impl UserGeometry for Liar {
     fn bounds(&self, _: u32) -> ([f32; 3], [f32; 3]) {
         ([-1.0; 3], [1.0; 3])
     }
-    fn intersect(&self, _: u32, _: &RayView) -> Option<UserHit> {
+    fn intersect(&self, _: u32, _: &Ray) -> Option<UserHit> {
         Some(UserHit { t: self.0, u: 0.0, v: 0.0, normal: [0.0; 3] })
     }
-    fn occluded(&self, _: u32, _: &RayView) -> bool {
+    fn occluded(&self, _: u32, _: &Ray) -> bool {
         true
     }
 }
@@ -374,10 +373,10 @@ fn what_embree_would_swallow_is_refused() {
         fn bounds(&self, _: u32) -> ([f32; 3], [f32; 3]) {
             (self.0, self.1)
         }
-        fn intersect(&self, _: u32, _: &RayView) -> Option<UserHit> {
+        fn intersect(&self, _: u32, _: &Ray) -> Option<UserHit> {
             None
         }
-        fn occluded(&self, _: u32, _: &RayView) -> bool {
+        fn occluded(&self, _: u32, _: &Ray) -> bool {
             false
         }
     }

@@ -12,6 +12,7 @@ use isolume::progress::{Observer, Progress};
 use isolume::reference::{Integrator, ReferenceSettings, reference};
 use isolume::render::{Camera, Shading, render};
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
+use isolume::scene_file::{self, SceneOptions};
 use isolume::surface_mesh::SurfaceMesh;
 use isolume::volume::{Lattice, Samples, Volume};
 use std::sync::Mutex;
@@ -165,4 +166,26 @@ fn what_is_stopped_or_does_not_fit_is_no_result() {
     let camera = Camera { samples: 0, ..Camera::facing(&scene, 8) };
     let picture = render(&scene, 0.3, &camera, Shading::Local(1.0), &device, Progress::Quiet);
     assert!(matches!(picture, Err(Error::Invalid(_))));
+}
+
+/// Whoever asked for it, what failed is known by its kind.
+#[test]
+fn errors_of_scene_files_keep_their_kind() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("scene.toml");
+    let found = |text: &str| {
+        std::fs::write(&path, text).unwrap();
+        scene_file::load(&path, &SceneOptions::default()).unwrap_err()
+    };
+    for text in ["[volume]\nfile = \"none.vti\"\n", "[[volume]]\nfile = \"none.vti\"\nisovalues = [0.0, 1.0]\n"] {
+        let error = found(text);
+        let Error::At { place, source } = &error else { panic!("{error:?}") };
+        assert!(place.contains("scene.toml:") && matches!(**source, Error::Io { .. }), "{error:?}");
+        assert_eq!(error.exit_code(), 2);
+    }
+    std::fs::write(folder.path().join("page.vti"), "<VTKFile type=\"PolyData\"/>").unwrap();
+    let error = found("[volume]\nfile = \"page.vti\"\n");
+    assert!(matches!(&error, Error::NotSupported(m) if m.contains("scene.toml:2: file: ")), "{error:?}");
+    let error = found("[volume]\ngenerator = \"none\"\n");
+    assert!(matches!(&error, Error::Invalid(m) if m.contains("scene.toml:2: generator: ")), "{error:?}");
 }

@@ -10,10 +10,6 @@ pub(super) mod raw {
 pub use raw::{Hit, Hit16, Ray, Ray16, RayHit, RayHit16};
 pub(super) use raw::{Ray8, RayHit8};
 
-/// A ray as the callbacks of a [`UserGeometry`](super::UserGeometry) see it: `time` and `id` hold whatever 32 bits
-/// the caller of the query put there, bit for bit.
-pub type RayView = Ray;
-
 /// Embree's `RTC_INVALID_GEOMETRY_ID`: no geometry, no instance.
 pub const INVALID_ID: u32 = u32::MAX;
 

@@ -6,6 +6,7 @@ use super::device::Device;
 use super::user::UserGeometry;
 use crate::error::{Error, Result};
 use std::ffi::c_void;
+use std::fmt;
 use std::marker::PhantomData;
 use std::sync::Arc;
 
@@ -47,6 +48,7 @@ impl Quality {
 /// assert!(rayhit.hit.geometry == floor && (rayhit.ray.tfar - 2.0).abs() < 1e-6);
 /// # Ok::<(), isolume::error::Error>(())
 /// ```
+#[derive(Debug)]
 pub struct BvhBuilder<'a> {
     bvh: Bvh<'a>,
     quality: Quality,
@@ -66,6 +68,12 @@ pub struct Bvh<'a> {
     _shared: Vec<Arc<dyn UserGeometry + Send + 'a>>,
     /// The same for borrowed ones.
     _borrowed: PhantomData<&'a dyn UserGeometry>,
+}
+
+impl fmt::Debug for Bvh<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Bvh").field("handle", &self.handle).field("device", &self.device).finish_non_exhaustive()
+    }
 }
 
 // SAFETY: the handle belongs to no thread. What its callbacks read is either borrowed, `&'a G` with `G: Sync`, or

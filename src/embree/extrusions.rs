@@ -1,6 +1,6 @@
 //! Walls and luminaires as Embree user geometry, and rays as Embree carries them: what both tracers share.
 
-use super::{BvhBuilder, Ray, RayView, UserGeometry, UserHit};
+use super::{BvhBuilder, Ray, UserGeometry, UserHit};
 use crate::error::Result;
 use crate::flattened::{Ends, FlattenedRay};
 use crate::polygon::LocalPolygon;
@@ -12,6 +12,7 @@ use std::sync::Arc;
 const PADDING: f64 = 1e-3;
 
 /// Walls and luminaires, a primitive each.
+#[derive(Debug)]
 pub(super) struct Extrusions {
     polygons: Vec<LocalPolygon>,
 }
@@ -27,7 +28,7 @@ pub(super) fn embree_ray(ray: &FlattenedRay) -> Ray {
 
 /// The inverse of [`embree_ray`].
 #[inline]
-pub(super) fn flattened_ray(r: &RayView) -> FlattenedRay {
+pub(super) fn flattened_ray(r: &Ray) -> FlattenedRay {
     let Ends { departure, target, with_light } = FlattenedRay::unpack_ends(r.time);
     FlattenedRay {
         origin: Vec3::from_array(r.org),
@@ -90,7 +91,7 @@ impl Extrusions {
     }
 
     #[inline]
-    fn meet(&self, prim: u32, ray: &RayView) -> Option<f64> {
+    fn meet(&self, prim: u32, ray: &Ray) -> Option<f64> {
         let o = DVec3::from_array(ray.org.map(f64::from));
         let d = DVec3::from_array(ray.dir.map(f64::from));
         let ends = FlattenedRay::unpack_ends(ray.time);
@@ -110,13 +111,13 @@ impl UserGeometry for Extrusions {
 
     #[inline]
     #[allow(clippy::cast_possible_truncation, reason = "t leaves as f32, clamped to the reach")]
-    fn intersect(&self, prim: u32, ray: &RayView) -> Option<UserHit> {
+    fn intersect(&self, prim: u32, ray: &Ray) -> Option<UserHit> {
         let t = (self.meet(prim, ray)? as f32).min(ray.tfar);
         Some(UserHit { t, u: 0.0, v: 0.0, normal: [0.0; 3] })
     }
 
     #[inline]
-    fn occluded(&self, prim: u32, ray: &RayView) -> bool {
+    fn occluded(&self, prim: u32, ray: &Ray) -> bool {
         self.meet(prim, ray).is_some()
     }
 }

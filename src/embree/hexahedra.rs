@@ -7,7 +7,7 @@
 
 use super::extrusions::{Extrusions, embree_ray, flattened_ray, padded};
 use super::{
-    Bvh, BvhBuilder, Device, INVALID_ID, Ray16, RayHit, RayHit16, RayView, UserGeometry, UserHit, UserHits16, Valid16,
+    Bvh, BvhBuilder, Device, INVALID_ID, Ray, Ray16, RayHit, RayHit16, UserGeometry, UserHit, UserHits16, Valid16,
 };
 use crate::error::{Error, Result};
 use crate::field::Field;
@@ -19,6 +19,7 @@ use glam::DVec3;
 use std::sync::Arc;
 
 /// The 4D scene in Embree: nearest flattened hits of the graph, walls and luminaires.
+#[derive(Debug)]
 pub struct GraphTracer<'a> {
     bvh: Bvh<'a>,
     /// Geometries below this number are volumes.
@@ -187,12 +188,12 @@ impl UserGeometry for Graph<'_> {
     }
 
     #[inline]
-    fn intersect(&self, _: u32, ray: &RayView) -> Option<UserHit> {
+    fn intersect(&self, _: u32, ray: &Ray) -> Option<UserHit> {
         self.pyramid.intersect(self.field, &flattened_ray(ray), f64::from(ray.tfar)).map(user_hit)
     }
 
     #[inline]
-    fn occluded(&self, _: u32, ray: &RayView) -> bool {
+    fn occluded(&self, _: u32, ray: &Ray) -> bool {
         self.pyramid.occluded(self.field, &flattened_ray(ray), f64::from(ray.tfar))
     }
 
@@ -217,7 +218,7 @@ struct CompanionGraph<'a> {
 
 impl CompanionGraph<'_> {
     #[inline]
-    fn ray(&self, ray: &RayView) -> FlattenedRay {
+    fn ray(&self, ray: &Ray) -> FlattenedRay {
         self.companion.ray_to_index(&flattened_ray(ray))
     }
 
@@ -240,13 +241,13 @@ impl UserGeometry for CompanionGraph<'_> {
     }
 
     #[inline]
-    fn intersect(&self, _: u32, ray: &RayView) -> Option<UserHit> {
+    fn intersect(&self, _: u32, ray: &Ray) -> Option<UserHit> {
         let hit = self.graph.pyramid.intersect(self.graph.field, &self.ray(ray), f64::from(ray.tfar))?;
         Some(user_hit(self.named(hit)))
     }
 
     #[inline]
-    fn occluded(&self, _: u32, ray: &RayView) -> bool {
+    fn occluded(&self, _: u32, ray: &Ray) -> bool {
         self.graph.pyramid.occluded(self.graph.field, &self.ray(ray), f64::from(ray.tfar))
     }
 
@@ -287,7 +288,7 @@ impl UserGeometry for StackedGraphs<'_> {
     }
 
     #[inline]
-    fn intersect(&self, _: u32, ray: &RayView) -> Option<UserHit> {
+    fn intersect(&self, _: u32, ray: &Ray) -> Option<UserHit> {
         let flattened = flattened_ray(ray);
         let mut nearest = self.graph.pyramid.intersect(self.graph.field, &flattened, f64::from(ray.tfar));
         for c in &self.same {
@@ -302,7 +303,7 @@ impl UserGeometry for StackedGraphs<'_> {
     }
 
     #[inline]
-    fn occluded(&self, _: u32, ray: &RayView) -> bool {
+    fn occluded(&self, _: u32, ray: &Ray) -> bool {
         let (flattened, reach) = (flattened_ray(ray), f64::from(ray.tfar));
         let hidden = |c: &CompanionGraph<'_>| {
             c.graph.pyramid.occluded(c.graph.field, &c.companion.ray_to_index(&flattened), reach)

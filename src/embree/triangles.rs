@@ -37,6 +37,7 @@ fn bit(mesh: usize) -> u32 {
 }
 
 /// The ordinary 3D scene of one isovalue: the triangles of its isosurface, walls and luminaires.
+#[derive(Debug)]
 pub struct SurfaceTracer<'a> {
     bvh: Bvh<'a>,
     extrusions: Arc<Extrusions>,

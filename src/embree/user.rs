@@ -1,6 +1,6 @@
 //! Primitives of our own: what Embree calls back for, and what is reported to it.
 
-use super::abi::{Ray16, RayView};
+use super::abi::{Ray, Ray16};
 
 /// What a [`UserGeometry`] reports for the nearest hit.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -34,7 +34,8 @@ impl UserHits16 {
     pub const ZERO: Self = Self { t: [0.0; 16], u: [0.0; 16], v: [0.0; 16], normal: [[0.0; 16]; 3] };
 }
 
-/// Primitives that intersect rays themselves.
+/// Primitives that intersect rays themselves. The `time` and `id` of the rays they see hold whatever 32 bits the caller
+/// of the query put there, bit for bit.
 ///
 /// Embree calls these functions from C, on any thread, several at a time. **They must not panic:** a panic cannot
 /// cross C, so that it aborts the process (those in `callbacks` are `extern "C"`, which aborts on unwinding since
@@ -57,10 +58,10 @@ pub trait UserGeometry: Sync {
 
     /// The nearest hit within `tnear` and `tfar`. The ray need not meet the primitive's box: Embree does not test the
     /// box of a geometry that is alone in its scene with one primitive.
-    fn intersect(&self, prim: u32, ray: &RayView) -> Option<UserHit>;
+    fn intersect(&self, prim: u32, ray: &Ray) -> Option<UserHit>;
 
     /// Whether anything is hit within `tnear` and `tfar`.
-    fn occluded(&self, prim: u32, ray: &RayView) -> bool;
+    fn occluded(&self, prim: u32, ray: &Ray) -> bool;
 
     /// `intersect` for the rays whose bit is set in `active`; returns the bits of the rays that hit, and their hits in
     /// `hits` (whatever stands in the other lanes is ignored).

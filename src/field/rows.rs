@@ -6,6 +6,7 @@ use crate::volume::Lattice;
 use glam::DVec3;
 
 /// The rows of one lattice.
+#[derive(Debug)]
 pub struct FieldRows<'a> {
     field: &'a Field,
     places: Places,
@@ -18,7 +19,7 @@ pub struct FieldRows<'a> {
 type Places = [Vec<(usize, f64)>; 3];
 
 /// Room for the receiver gradients of a row.
-#[derive(Default)]
+#[derive(Debug, Default)]
 pub struct GradientRow {
     /// Of the nodes around the row, in index space: interpolated across it.
     nodes: Vec<DVec3>,

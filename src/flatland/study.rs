@@ -88,6 +88,7 @@ pub struct Measured {
 }
 
 /// A world with its converged radiance at the grid's points.
+#[derive(Debug)]
 pub struct Bench {
     world: World,
     solution: Solution,

@@ -10,7 +10,7 @@
 
 use super::{FlatScene, HeightField, Segment};
 use crate::cubic::Cubic;
-use crate::embree::{Bvh, BvhBuilder, Device, Ray, RayHit, RayView, UserGeometry, UserHit};
+use crate::embree::{Bvh, BvhBuilder, Device, Ray, RayHit, UserGeometry, UserHit};
 use crate::error::Result;
 use crate::flattened::{Departure, Ends, Entry, FlattenedHit, FlattenedRay, Side, Target, enter};
 use crate::tracer::Tracer;
@@ -195,13 +195,13 @@ impl UserGeometry for Curves {
     }
 
     #[inline]
-    fn intersect(&self, _: u32, ray: &RayView) -> Option<UserHit> {
+    fn intersect(&self, _: u32, ray: &Ray) -> Option<UserHit> {
         let (t, side) = self.meet(&flattened_ray(ray), f64::from(ray.tfar))?;
         Some(UserHit { t: t as f32, u: side.index() as f32, v: 0.0, normal: [0.0; 3] })
     }
 
     #[inline]
-    fn occluded(&self, _: u32, ray: &RayView) -> bool {
+    fn occluded(&self, _: u32, ray: &Ray) -> bool {
         self.meet(&flattened_ray(ray), f64::from(ray.tfar)).is_some()
     }
 }
@@ -224,7 +224,7 @@ impl Extrusions {
 
     /// Where the ray meets segment `id`. One that starts on its line, within the rounding of f32, meets it at 0.
     #[inline]
-    fn meet(&self, id: u32, ray: &RayView) -> Option<f64> {
+    fn meet(&self, id: u32, ray: &Ray) -> Option<f64> {
         let ([a, b], opaque_back) = self.segments[id as usize];
         let Ends { departure, target, .. } = FlattenedRay::unpack_ends(ray.time);
         if departure == Departure::Polygon(id) || target == Some(id) {
@@ -268,13 +268,13 @@ impl UserGeometry for Extrusions {
     }
 
     #[inline]
-    fn intersect(&self, prim: u32, ray: &RayView) -> Option<UserHit> {
+    fn intersect(&self, prim: u32, ray: &Ray) -> Option<UserHit> {
         let t = (self.meet(prim, ray)? as f32).min(ray.tfar);
         Some(UserHit { t, u: 0.0, v: 0.0, normal: [0.0; 3] })
     }
 
     #[inline]
-    fn occluded(&self, prim: u32, ray: &RayView) -> bool {
+    fn occluded(&self, prim: u32, ray: &Ray) -> bool {
         self.meet(prim, ray).is_some()
     }
 }
@@ -293,7 +293,7 @@ fn embree_ray(ray: &FlattenedRay) -> Ray {
 }
 
 #[inline]
-fn flattened_ray(r: &RayView) -> FlattenedRay {
+fn flattened_ray(r: &Ray) -> FlattenedRay {
     let Ends { departure, target, with_light } = FlattenedRay::unpack_ends(r.time);
     FlattenedRay {
         origin: Vec3::from_array(r.org),
@@ -307,6 +307,7 @@ fn flattened_ray(r: &RayView) -> FlattenedRay {
 }
 
 /// Flattened geometry: level curves and segments; every ray has direction (·, ·, 0).
+#[derive(Debug)]
 pub struct LevelCurves {
     bvh: Bvh<'static>,
     curves: u32,
@@ -352,6 +353,7 @@ impl Tracer for LevelCurves {
 }
 
 /// Ordinary geometry: the graph as triangles, walls and luminaires upright over the sweep. Rays ignore the isovalue.
+#[derive(Debug)]
 pub struct GraphSurface {
     bvh: Bvh<'static>,
     graph: u32,

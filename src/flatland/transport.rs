@@ -10,6 +10,7 @@ use crate::rng::{Key, Rng, Sobol, Stage};
 use crate::tracer::Tracer;
 use crate::warp::{Frame, cosine_hemisphere};
 use glam::{DVec2, DVec3, Vec3};
+use std::fmt;
 
 /// Bisections of the edge of a shadow: 2⁻¹² of a stratum.
 const BISECTIONS: usize = 12;
@@ -23,6 +24,12 @@ pub struct World {
     tracer: Box<dyn Tracer + Send>,
     /// Luminaires with their upright rectangles (used when ordinary).
     lights: Vec<(u32, Polygon)>,
+}
+
+impl fmt::Debug for World {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("World").field("scene", &self.scene).field("transport", &self.transport).finish_non_exhaustive()
+    }
 }
 
 /// A point that receives light.

@@ -14,6 +14,7 @@ const LEAST: f64 = 1e-5;
 const NEAR: f64 = 1.0;
 
 /// A luminaire as one receiver sees it.
+#[derive(Debug)]
 pub struct Aim<'a> {
     polygon: &'a Polygon,
     x: DVec3,
@@ -22,6 +23,7 @@ pub struct Aim<'a> {
 }
 
 /// What points are uniform over.
+#[derive(Debug)]
 enum Spread {
     /// The solid angle of all of a rectangle.
     Rectangle(SphericalRectangle),

@@ -3,6 +3,7 @@
 use glam::DVec3;
 
 /// A planar convex polygon projected onto the unit sphere around a receiver, as a fan of spherical triangles.
+#[derive(Debug)]
 pub(super) struct SphericalFan {
     /// Towards the vertex that all triangles share.
     apex: DVec3,
@@ -15,6 +16,7 @@ pub(super) struct SphericalFan {
 }
 
 /// The triangle between the apex and an arc.
+#[derive(Debug)]
 struct SphericalTriangle {
     /// Where the arc starts, and its tangent there.
     start: DVec3,

@@ -4,6 +4,7 @@ use crate::polygon::Polygon;
 use glam::DVec3;
 
 /// A rectangle projected onto the unit sphere. \[Urena13\]
+#[derive(Debug)]
 pub(super) struct SphericalRectangle {
     /// Along its edges, and across it towards the other side of the receiver.
     axes: [DVec3; 3],

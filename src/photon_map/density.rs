@@ -58,6 +58,7 @@ struct Neighbour {
 }
 
 /// The photons of one side in bins.
+#[derive(Debug)]
 pub(super) struct PhotonDensity<'a> {
     field: &'a Field,
     settings: EstimateSettings,

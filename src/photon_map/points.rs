@@ -19,6 +19,7 @@ const FOOTPRINT_ENOUGH: usize = 32;
 const FOOTPRINT_SETS: usize = 16;
 
 /// The photons of one side, sorted for lookup.
+#[derive(Debug)]
 pub(super) struct PhotonPoints<'a> {
     field: &'a Field,
     settings: EstimateSettings,

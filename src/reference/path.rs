@@ -16,6 +16,7 @@ use crate::warp::{Frame, cosine_hemisphere};
 use glam::DVec3;
 
 /// A path tracer that counts its rays.
+#[derive(Debug)]
 pub struct PathTracer<'a, T> {
     pub(super) scene: &'a Scene,
     pub(super) tracer: &'a T,

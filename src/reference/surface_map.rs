@@ -39,6 +39,7 @@ const CUTS: usize = 4;
 const DISK: usize = 64;
 
 /// Photons that were reflected before, on the mesh and on polygons.
+#[derive(Debug)]
 pub struct SurfaceMap {
     settings: SurfaceMapSettings,
     isovalue: f32,
@@ -52,6 +53,7 @@ pub struct SurfaceMap {
 }
 
 /// Photons of one field's surface, and the surface's area.
+#[derive(Debug)]
 struct MappedSurface {
     /// One per side (lower, higher).
     sides: [Share; 2],
@@ -61,6 +63,7 @@ struct MappedSurface {
 }
 
 /// Photons of one side or polygon.
+#[derive(Debug)]
 struct Share {
     grid: PointGrid,
     /// Slot order: power and the surface's lower normal (unused on walls).

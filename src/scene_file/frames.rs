@@ -1,6 +1,6 @@
 //! `[volume]` in time: `file` as a pattern, or `files`.
 
-use super::{RawOptions, SceneOptions, VolumeSource, Volumes, parse};
+use super::{RawOptions, SceneOptions, VolumeSource, Volumes, blame, parse};
 use crate::error::{Error, Result};
 use crate::series::Series;
 use crate::volume::Volume;
@@ -13,8 +13,7 @@ use std::path::Path;
 pub fn load_series(input: &Path, options: &SceneOptions) -> Result<Option<Series>> {
     let (source, file, folder) = parse(input)?;
     let Volumes::One(single) = &file.volume else { return Ok(None) };
-    let blame = |e: Error| source.as_ref().map_or_else(|| e.to_string(), |s| s.blame(single.key(), &e).to_string());
-    let series = single.series(&folder).map_err(|e| Error::Invalid(blame(e)))?;
+    let series = single.series(&folder).map_err(|e| blame(source.as_ref(), single.key(), e))?;
     if let Some(series) = &series {
         series.check(|path| read_volume(path, single, &options.raw))?;
     }

@@ -223,7 +223,8 @@ pub(super) fn load(
             // Many messages begin with the key.
             let text = e.to_string();
             let key = text.split([' ', ':']).next().unwrap_or_default();
-            Error::invalid(source.place(&["volume", &n.to_string(), key]), format!("volume {name}: {text}"))
+            let place = source.place(&["volume", &n.to_string(), key]);
+            e.at(format_args!("{place}: volume {name}"))
         };
         let volume = entry.volume(folder).map_err(named)?;
         lattices.push(volume.lattice.clone());
@@ -240,7 +241,7 @@ pub(super) fn load(
     };
     let around = enclosing(members[0].field.lattice(), &lattices).map_err(|e| e.in_file(input))?;
     let mut polygons = surroundings(&file.surroundings, &options.surroundings, folder, &around)
-        .map_err(|e| Error::invalid(source.place(&["box", "kind"]), format!("box: {e}")))?;
+        .map_err(|e| e.at(format_args!("{}: box", source.place(&["box", "kind"]))))?;
     polygons.extend(context(&file.context, folder, Some(&source))?);
     polygons.extend(standing);
     let policy = match file.policy {

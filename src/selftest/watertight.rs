@@ -19,6 +19,7 @@ use glam::{DVec3, Vec3};
 const TRIANGLE_ISOVALUES: u64 = 8;
 
 /// A class of scenes.
+#[derive(Debug)]
 pub struct Class {
     /// Name in the table.
     pub name: &'static str,

@@ -9,6 +9,7 @@ use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 /// Places of the graph, each of which belongs to a point of a lattice that is at most a step away along every axis.
+#[derive(Debug)]
 pub struct Scattered<'a> {
     /// The lattice.
     pub lattice: &'a Lattice,

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 
 /// Rows of text under named columns; the first `keys` columns tell rows apart, the last two are the digest of their
 /// job, and what made them.
+#[derive(Debug)]
 pub struct Table {
     path: PathBuf,
     columns: Vec<&'static str>,

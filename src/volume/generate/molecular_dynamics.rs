@@ -16,6 +16,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 /// A force between pairs of particles: which potential acts between which two species.
+#[derive(Debug)]
 pub struct PairTerm {
     potentials: Vec<PairPotential>,
     /// Index of the potential between two species.
@@ -45,6 +46,7 @@ impl PairTerm {
 pub type ExternalField = Box<dyn Fn(DVec3) -> (f64, DVec3) + Send + Sync>;
 
 /// Particles in motion. Units are the caller's; the temperature is an energy (Boltzmann's constant is 1).
+#[allow(missing_debug_implementations, reason = "holds a function")]
 pub struct MolecularDynamics {
     /// The box.
     pub bounds: SimulationBox,

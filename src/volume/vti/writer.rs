@@ -168,6 +168,7 @@ struct Array<'a> {
 ///
 /// The same content gives the same bytes, for every number of threads. VTK, ParaView, PyVista and
 /// [`super::VtiFile`] read it.
+#[allow(missing_debug_implementations, reason = "holds functions")]
 pub struct VtiWriter<'a> {
     lattice: &'a Lattice,
     point_data: Vec<Array<'a>>,
