@@ -27,7 +27,6 @@ use isolume::volume::{Lattice, Samples, Volume};
 use isolume::warp::{Frame, cosine_hemisphere};
 use rayon::prelude::*;
 use std::hint::black_box;
-use std::io::Read;
 use std::path::Path;
 use std::time::Instant;
 
@@ -64,48 +63,16 @@ fn bumps() -> Case {
     Case { name: "bumps 101³", volume, sweep: [3.6, 95.0], mesh: 47.0 }
 }
 
-fn bytes_volume(name: &str, dims: [usize; 3], samples: Vec<u8>) -> Volume {
-    let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::ONE).expect("a lattice");
-    Volume::new(name, lattice, Samples::U8(samples)).expect("a volume")
-}
+/// Real volumes, their sweeps, and the isovalue of the extracted mesh.
+const DATA: [(&str, [f64; 2], f64); 3] = [
+    ("pasta-proton.vti", [0.01, 0.05], 0.03),
+    ("ch2.nii.gz", [15.0, 200.0], 80.0),
+    ("engine.vti", [40.0, 230.0], 100.0),
+];
 
-/// NIfTI-1, gzip.
-fn ch2(dir: &Path) -> std::io::Result<Case> {
-    let mut bytes = Vec::new();
-    flate2::read::MultiGzDecoder::new(std::fs::File::open(dir.join("ch2.nii.gz"))?).read_to_end(&mut bytes)?;
-    let dims = [181, 217, 181];
-    let samples = bytes[352..][..dims.iter().product()].to_vec();
-    Ok(Case { name: "ch2", volume: bytes_volume("ch2", dims, samples), sweep: [15.0, 200.0], mesh: 80.0 })
-}
-
-/// VTK ImageData, appended raw, zlib blocks behind a header of 64-bit words.
-fn engine(dir: &Path) -> std::io::Result<Case> {
-    let bytes = std::fs::read(dir.join("engine.vti"))?;
-    let tag = b"<AppendedData encoding=\"raw\">";
-    let tag = bytes.windows(tag.len()).position(|w| w == tag).expect("appended data");
-    let start = tag + bytes[tag..].iter().position(|&b| b == b'_').expect("an underscore") + 1;
-    let word = |i: usize| {
-        let word = bytes[start + 8 * i..][..8].try_into().expect("eight bytes");
-        usize::try_from(u64::from_le_bytes(word)).expect("a size")
-    };
-    let (mut samples, mut at) = (Vec::new(), start + 8 * (3 + word(0)));
-    for block in 0..word(0) {
-        let packed = &bytes[at..][..word(3 + block)];
-        flate2::read::ZlibDecoder::new(packed).read_to_end(&mut samples)?;
-        at += packed.len();
-    }
-    Ok(Case {
-        name: "engine",
-        volume: bytes_volume("engine", [256, 256, 128], samples),
-        sweep: [40.0, 230.0],
-        mesh: 100.0,
-    })
-}
-
-/// Protons of nuclear pasta, as isolume generates them.
-fn pasta(dir: &Path) -> isolume::error::Result<Case> {
-    let volume = Volume::open(dir.join("pasta-proton.vti"))?;
-    Ok(Case { name: "pasta 101³", volume, sweep: [0.01, 0.05], mesh: 0.03 })
+/// A file of the data folder.
+fn file(dir: &Path, name: &'static str, sweep: [f64; 2], mesh: f64) -> isolume::error::Result<Case> {
+    Ok(Case { name, volume: Volume::open(dir.join(name))?, sweep, mesh })
 }
 
 /// Interleaves the bits of an index position.
@@ -237,29 +204,33 @@ fn run(case: &Case, device: &Device, count: usize, repetitions: usize, summary: 
     let vertices: Vec<[f32; 3]> = surface.vertices.iter().map(|v| v.as_vec3().to_array()).collect();
     let tracer = GraphTracer::new(device, &scene).expect("a tracer");
 
-    let commit = || {
-        let mut builder = BvhBuilder::new(device).expect("a scene").quality(Quality::High).robust(false);
+    let commit = |quality: Quality| {
+        let mut builder = BvhBuilder::new(device).expect("a scene").quality(quality).robust(false);
         builder.triangles(&vertices, &surface.triangles, u32::MAX).expect("triangles");
         builder.commit().expect("a built scene")
     };
-    let mesh = commit();
+    let mesh = commit(Quality::High);
     // Set-up alone: the pyramid and the commit of its one primitive, against the commit of the mesh.
-    let mut setups = [vec![], vec![], vec![]];
+    let mut setups = [vec![], vec![], vec![], vec![]];
     for _ in 0..repetitions {
         setups[0].push(seconds(|| usize::from(GraphTracer::new(device, &scene).is_ok())).0);
-        setups[1].push(seconds(|| size_of_val(&commit())).0);
-        setups[2].push(seconds(|| Pyramid::new(field, false).bytes()).0);
+        setups[1].push(seconds(|| size_of_val(&commit(Quality::Medium))).0);
+        setups[2].push(seconds(|| size_of_val(&commit(Quality::High))).0);
+        setups[3].push(seconds(|| Pyramid::new(field, false).bytes()).0);
     }
-    let [setup, commit, pyramid] = setups.map(median);
+    let [setup, commit, careful, pyramid] = setups.map(median);
     let cells: usize = field.lattice().cells().iter().product();
     let bytes = Pyramid::new(field, false).bytes() as f64 / cells as f64;
     println!("\n{}: {} cells, mesh of {} triangles at {}", case.name, cells, surface.triangles.len(), case.mesh);
     println!(
-        "  set-up {:.2} ms (pyramid {:.2}), commit of the mesh {:.2} ms: {:.1} times faster; {bytes:.2} bytes per cell",
+        "  set-up {:.2} ms (pyramid {:.2}), commit of the mesh {:.2} ms: {:.1} times faster (quality HIGH {:.2} ms: \
+         {:.1}); {bytes:.2} bytes per cell",
         1e3 * setup,
         1e3 * pyramid,
         1e3 * commit,
-        commit / setup
+        commit / setup,
+        1e3 * careful,
+        careful / setup
     );
     summary.setup.push(commit / setup);
     summary.bytes = summary.bytes.max(bytes);
@@ -396,10 +367,12 @@ fn main() {
 
     let mut cases = vec![bumps()];
     if let Some(dir) = data.map(Path::new) {
-        let left_out = |why: String| println!("left out: {why}");
-        cases.extend(pasta(dir).map_err(|e| left_out(e.to_string())).ok());
-        cases.extend(ch2(dir).map_err(|e| left_out(format!("ch2.nii.gz: {e}"))).ok());
-        cases.extend(engine(dir).map_err(|e| left_out(format!("engine.vti: {e}"))).ok());
+        for (name, sweep, mesh) in DATA {
+            match file(dir, name, sweep, mesh) {
+                Ok(case) => cases.push(case),
+                Err(e) => println!("left out: {e}"),
+            }
+        }
     }
     let mut summary = Summary::default();
     for case in &cases {

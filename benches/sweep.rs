@@ -1,12 +1,16 @@
 //! Gather rays of the sweep engine (RGB lookup, cosine, accumulation and walls included) against Embree's rays on the
 //! triangles of one extracted isosurface; per CPU second, medians of interleaved repetitions of one run.
 //!
+//! Those rays come twice: one by one and in random order, as bounces of paths do, ROBUST; and as a final gather sends
+//! them, 64 from each place, places in Morton order, to a mesh that Embree built with care and without ROBUST, by the
+//! faster of single rays and packets.
+//!
 //! `cargo bench --bench sweep [-- --full] [--data DIR]`. "bumps" leaves two thirds of its nodes outside the sweep,
 //! "foam" (300 blobs, every node in the sweep) none. DIR holds pasta-proton.vti, fluid.vti, neuron.mha, ch2.nii.gz;
 //! files that are not there are left out. `--full` adds the growth with the lattice.
 
 use glam::{DVec3, Vec3};
-use isolume::embree::{Bvh, BvhBuilder, Device, Ray, RayHit};
+use isolume::embree::{Bvh, BvhBuilder, Device, INVALID_ID, Quality, Ray, Ray16, RayHit, RayHit16, Valid16};
 use isolume::field::{Field, Sweep};
 use isolume::isa::Isa;
 use isolume::isosurface::extract;
@@ -62,37 +66,69 @@ fn foam(n: usize) -> Scene {
     scene_of(&volume, range.map(f64::from))
 }
 
-/// Cosine-distributed rays off the isosurface at unit isovalue `c`, in random order, and its mesh in Embree.
-fn bounces<'d>(device: &'d Device, scene: &Scene, c: f32, count: usize) -> (Bvh<'d>, usize, Vec<Ray>) {
-    let surface = extract(scene.lattice().dims(), scene.field.samples(), c).expect("a mesh");
-    let place = |p: DVec3| scene.lattice().to_world(p).as_vec3();
-    let vertices: Vec<[f32; 3]> = surface.vertices.iter().map(|&p| place(p).to_array()).collect();
-    let step = 1e-2 * scene.lattice().spacing().min_element() as f32;
-    let mut rng = Rng::stream(1, Stage::Test, 0);
-    let rays = (0..count)
-        .map(|_| {
-            let at = (rng.unit() * vertices.len() as f64) as usize;
+/// An isosurface in Embree, and cosine-distributed rays off its vertices.
+struct Triangles {
+    mesh: Bvh<'static>,
+    count: usize,
+    rays: Vec<Ray>,
+}
+
+/// Interleaves the bits of a place's cell.
+fn morton(p: DVec3) -> u64 {
+    let spread = |x: f64| (0..21).fold(0u64, |bits, b| bits | ((x * 16.0) as u64 >> b & 1) << (3 * b));
+    spread(p.x) | spread(p.y) << 1 | spread(p.z) << 2
+}
+
+impl Triangles {
+    /// The isosurface at unit isovalue `c`, and so many rays: `per_place` from each place, those in Morton order if
+    /// they are several.
+    fn new(builder: BvhBuilder<'static>, scene: &Scene, c: f32, per_place: usize, count: usize) -> Self {
+        let surface = extract(scene.lattice().dims(), scene.field.samples(), c).expect("a mesh");
+        let place = |p: DVec3| scene.lattice().to_world(p).as_vec3();
+        let vertices: Vec<[f32; 3]> = surface.vertices.iter().map(|&p| place(p).to_array()).collect();
+        let step = 1e-2 * scene.lattice().spacing().min_element() as f32;
+        let mut rng = Rng::stream(1, Stage::Test, 0);
+        let mut places: Vec<usize> =
+            (0..count / per_place).map(|_| (rng.unit() * vertices.len() as f64) as usize).collect();
+        if per_place > 1 {
+            places.sort_by_key(|&at| morton(surface.vertices[at]));
+        }
+        let mut ray = |at: usize| {
             let n = scene.field.falling_normal(surface.vertices[at]).unwrap_or(DVec3::Z);
             let d = Frame::new(n).to_world(cosine_hemisphere(rng.unit2())).as_vec3();
             Ray::new((Vec3::from_array(vertices[at]) + step * n.as_vec3()).to_array(), d.to_array(), 0.0, f32::INFINITY)
-        })
-        .collect();
-    let mut builder = BvhBuilder::new(device).expect("a scene");
-    builder.triangles(&vertices, &surface.triangles, u32::MAX).expect("triangles");
-    (builder.commit().expect("a built scene"), surface.triangles.len(), rays)
-}
+        };
+        let rays = places.into_iter().flat_map(|at| vec![at; per_place]).map(&mut ray).collect();
+        let mut builder = builder;
+        builder.triangles(&vertices, &surface.triangles, u32::MAX).expect("triangles");
+        Self { mesh: builder.commit().expect("a built scene"), count: surface.triangles.len(), rays }
+    }
 
-/// Triangle rays per CPU second.
-fn triangle_rate(mesh: &Bvh, rays: &[Ray]) -> f64 {
-    let start = processor_seconds();
-    let hit = |ray: &&Ray| {
-        let mut hit = RayHit::new(**ray);
-        mesh.intersect1(&mut hit);
-        hit.is_hit()
-    };
-    let hits: usize = rays.par_chunks(1 << 12).map(|chunk| chunk.iter().filter(hit).count()).sum();
-    assert!(hits > 0);
-    rays.len() as f64 / (processor_seconds() - start).max(1e-2)
+    /// Rays per CPU second, of which `hits` counts what is hit.
+    fn rate(&self, hits: impl Fn(&[Ray]) -> usize + Send + Sync) -> f64 {
+        let start = processor_seconds();
+        let hits: usize = self.rays.par_chunks(1 << 12).map(hits).sum();
+        assert!(hits > 0);
+        self.rays.len() as f64 / (processor_seconds() - start).max(1e-2)
+    }
+
+    fn single(&self) -> f64 {
+        let hit = |ray: &&Ray| {
+            let mut hit = RayHit::new(**ray);
+            self.mesh.intersect1(&mut hit);
+            hit.is_hit()
+        };
+        self.rate(|rays| rays.iter().filter(hit).count())
+    }
+
+    fn packets(&self) -> f64 {
+        let hits = |rays: &[Ray]| {
+            let mut hit = RayHit16::new(Ray16::new(&std::array::from_fn(|i| rays[i % rays.len()])));
+            self.mesh.intersect16(&Valid16::ALL, &mut hit);
+            hit.hit.geometry.iter().filter(|&&geometry| geometry != INVALID_ID).count()
+        };
+        self.rate(|rays| rays.chunks(16).map(hits).sum())
+    }
 }
 
 fn median(mut x: Vec<f64>) -> f64 {
@@ -102,7 +138,9 @@ fn median(mut x: Vec<f64>) -> f64 {
 
 /// Prints the ratios of one scene; returns the CPU seconds of a pass.
 fn compare(device: &Device, name: &str, scene: &Scene, c: f32) -> f64 {
-    let (mesh, triangles, rays) = bounces(device, scene, c, 1 << 20);
+    let builder = || BvhBuilder::new(device).expect("a scene");
+    let bounces = Triangles::new(builder(), scene, c, 1, 1 << 20);
+    let gathered = Triangles::new(builder().quality(Quality::High).robust(false), scene, c, 64, 1 << 20);
     let directions = if scene.lattice().len() < 3_000_000 { 128 } else { 32 };
     let settings = |max_bounces, light_points| SweepSettings {
         directions,
@@ -116,26 +154,30 @@ fn compare(device: &Device, name: &str, scene: &Scene, c: f32) -> f64 {
         let out = sweep(scene, &s, &|_| true).expect("a sweep");
         (processor_seconds() - start, out.counts)
     };
-    let mut columns: [Vec<f64>; 7] = Default::default();
+    let mut columns: [Vec<f64>; 9] = Default::default();
     let mut valid = 0.0;
     for _ in 0..REPEATS {
-        let exact = triangle_rate(&mesh, &rays);
+        let exact = bounces.single();
+        let best = gathered.single().max(gathered.packets());
         let (t0, _) = time(settings(0, 1));
         let (t1, _) = time(settings(0, 17));
         let (t2, counts) = time(settings(1, 1));
-        let pass = (t2 - t0).max(1e-9);
+        let pass = t2 - t0;
+        assert!(pass > 0.05 && t1 > t0, "too short to time: {t0}, {t1}, {t2} s");
         let gather = counts.gather_rays as f64 / pass;
-        let direct = 16.0 * counts.valid as f64 / (t1 - t0).max(1e-9);
+        let direct = 16.0 * counts.valid as f64 / (t1 - t0);
         let nodes = scene.lattice().len() as f64;
         valid = counts.valid as f64 / nodes;
-        let row = [exact, gather, gather / exact, gather / valid, direct, direct / exact, pass];
+        let row = [exact, best, gather, gather / exact, gather / best, gather / valid, direct, direct / exact, pass];
         columns.iter_mut().zip(row).for_each(|(column, x)| column.push(x));
     }
-    let [exact, gather, ratio, all, direct, direct_ratio, pass] = columns.map(median);
+    let [exact, best, gather, ratio, least, all, direct, direct_ratio, pass] = columns.map(median);
     println!(
-        "{name}: Embree triangles {:.1} M rays/s ({triangles} triangles); gather {:.1} M/s ({ratio:.1}×; {:.0} % of the nodes in \
-         the sweep, {:.1} M/s over all); direct {:.1} M/s ({direct_ratio:.1}×)",
+        "{name}: Embree triangles {:.1} M rays/s, gathered in order {:.1} ({} triangles); gather {:.1} M/s ({ratio:.1}×, \
+         {least:.1}×; {:.0} % of the nodes in the sweep, {:.1} M/s over all); direct {:.1} M/s ({direct_ratio:.1}×)",
         exact * 1e-6,
+        best * 1e-6,
+        bounces.count,
         gather * 1e-6,
         100.0 * valid,
         all * 1e-6,
@@ -170,14 +212,21 @@ fn main() {
         passes.push(((n as f64).ln() * 3.0, compare(&device, &format!("bumps {n}³"), &scene, 0.4).ln()));
         converge(&scene);
     }
-    if let (Some(first), Some(last), true) = (passes.first(), passes.last(), full) {
-        println!("time of a pass over voxels: exponent {:.2}", (last.1 - first.1) / (last.0 - first.0));
+    if full {
+        let mean = |of: fn(&(f64, f64)) -> f64| passes.iter().map(of).sum::<f64>() / passes.len() as f64;
+        let (x, y) = (mean(|p| p.0), mean(|p| p.1));
+        let fit = |of: fn(f64, f64) -> f64| passes.iter().map(|p| of(p.0 - x, p.1 - y)).sum::<f64>();
+        println!("time of a pass over voxels: fitted exponent {:.2}", fit(|x, y| x * y) / fit(|x, _| x * x));
     }
     let scene = foam(101);
     compare(&device, "foam 101³", &scene, 0.2);
     converge(&scene);
     for (file, range, c) in DATA {
-        let Some(path) = data.map(|d| Path::new(d).join(file)).filter(|p| p.exists()) else { continue };
+        let Some(path) = data.map(|d| Path::new(d).join(file)) else { continue };
+        if !path.exists() {
+            println!("left out: there is no {file}");
+            continue;
+        }
         let volume = Volume::open(&path).expect("a volume");
         let scene = scene_of(&volume, range);
         compare(&device, file, &scene, scene.field.sweep().isovalue(c));
