@@ -147,12 +147,20 @@ fn files_and_names_beside_equations_exist() {
         let code = document(file);
         assert!(!cited.is_empty(), "{row}");
         for name in cited {
-            let defined = ["fn ", "struct ", "enum ", "trait ", "pub ", "    "].iter().any(|k| {
+            let defined = ["fn ", "struct ", "enum ", "trait ", "const ", "static ", "type ", "mod "].iter().any(|k| {
                 code.match_indices(&format!("{k}{name}")).any(|(at, m)| {
                     let next = code[at + m.len()..].chars().next().unwrap_or(' ');
                     !next.is_alphanumeric() && next != '_'
                 })
             });
+            // A field, or a variant of an enum: in a line of its own, with its type.
+            let declared = code.lines().any(|line| {
+                let line = line.trim_start().trim_start_matches("pub ").trim_start_matches("pub(super) ");
+                line.strip_prefix(name)
+                    .is_some_and(|rest| rest.starts_with(": ") || rest == "," || rest == " {" || rest.starts_with('('))
+                    && !line.ends_with(';')
+            });
+            let defined = defined || declared;
             assert!(defined, "{file} defines no {name}, which docs/equations.md names");
             names += 1;
         }

@@ -1,12 +1,16 @@
 //! `make gallery`: the script, the scenes it uses and its page; tiny, and one figure at preview quality.
 
+#[path = "shared/folder.rs"]
+mod folder;
+
+use folder::Folder;
 use std::fs;
 use std::path::Path;
 use std::process::Command;
 
 #[test]
 fn two_figures_render_tiny() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/gallery");
     let mut command = Command::new("python3");
     command.arg(script).arg(env!("CARGO_BIN_EXE_isolume")).arg(dir.path()).args(["--tiny", "--only", "1", "4"]);
@@ -42,7 +46,7 @@ fn middle(path: &Path) -> [f64; 3] {
 /// Albedo by isovalue at preview quality, as the page shows it: blue at 20, grey at 47, orange at 75.
 #[test]
 fn a_figure_renders_at_preview_quality() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/gallery");
     let mut command = Command::new("python3");
     command.arg(script).arg(env!("CARGO_BIN_EXE_isolume")).arg(dir.path()).args(["--only", "colour"]);

@@ -1,5 +1,7 @@
-//! The README stays true: every shell command in it runs, in order, but `make test`.
+//! The README stays true: every shell command in it runs, in order, but `make test`; its scene is one.
 
+use isolume::scene_file::SceneFile;
+use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::Command;
 
@@ -34,5 +36,33 @@ fn every_command_of_the_readme_runs() {
     }
     for picture in readme.split("](").skip(1).filter_map(|s| s.split(')').next()).filter(|s| s.ends_with(".png")) {
         assert!(root.join(picture).exists(), "the README shows {picture}, which does not exist");
+    }
+}
+
+/// What the README says of scenes, verbs and flags beside its commands.
+#[test]
+fn what_the_readme_names_is_there() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let readme = std::fs::read_to_string(root.join("README.md")).unwrap();
+    let dir = tempfile::tempdir().unwrap();
+    let scene = readme.split("```toml\n").nth(1).unwrap().split("```").next().unwrap();
+    std::fs::write(dir.path().join("s.toml"), scene).unwrap();
+    SceneFile::read(&dir.path().join("s.toml")).unwrap();
+    let help = |verb: &str| {
+        let output = Command::new(env!("CARGO_BIN_EXE_isolume")).args([verb, "--help"]).output().unwrap();
+        assert!(output.status.success(), "the README names the verb '{verb}'");
+        String::from_utf8(output.stdout).unwrap()
+    };
+    let word = |text: &str| -> String {
+        text.chars().take_while(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || *c == '-').collect()
+    };
+    let verbs: BTreeSet<String> = readme.split("`isolume ").skip(1).map(word).collect();
+    let verbs: Vec<String> = verbs.into_iter().filter(|verb| !["", "help"].contains(&verb.as_str())).collect();
+    let all: String = verbs.iter().map(|verb| help(verb)).collect();
+    let flags: BTreeSet<String> = readme.split("`--").skip(1).map(word).collect();
+    assert!(verbs.len() >= 5 && flags.len() >= 8, "{verbs:?}, {flags:?}");
+    for flag in flags {
+        let found = all.match_indices(&format!("--{flag}")).any(|(at, m)| word(&all[at + m.len()..]).is_empty());
+        assert!(found, "the README names --{flag}, which no verb of {verbs:?} has");
     }
 }

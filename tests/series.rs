@@ -1,10 +1,17 @@
 //! Series in time: frames are their own single bakes, moments between them the bakes of blended volumes.
 
+#[path = "shared/folder.rs"]
+mod folder;
+#[path = "shared/program.rs"]
+mod program;
+
+use folder::Folder;
 use isolume::volume::Samples;
 use isolume::volume::vti::VtiFile;
+use program::isolume;
 use std::fs;
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::Output;
 
 /// A ball of radius √0.06 whose centre moves along x with time, n³ samples on [0, 1]³; the value rises inwards.
 fn ball(time: f64, n: usize) -> Vec<f32> {
@@ -29,13 +36,15 @@ fn write(path: &Path, samples: &[f32], kind: &str, n: usize) {
     fs::write(path, bytes).unwrap();
 }
 
-fn isolume(dir: &Path, args: &[&str]) -> Output {
-    let more = ["--photons", "4000", "--gather", "8", "--wall-resolution", "8", "--shadow-rays", "16"];
-    Command::new(env!("CARGO_BIN_EXE_isolume")).current_dir(dir).args(args).args(more).output().unwrap()
+/// Runs a quick bake.
+fn bake(dir: &Path, args: &[&str]) -> Output {
+    let few = ["--photons", "4000", "--gather", "8", "--wall-resolution", "8", "--shadow-rays", "16"];
+    isolume(dir, &[args, &few].concat())
 }
 
-fn ok(dir: &Path, args: &[&str]) -> String {
-    let output = isolume(dir, args);
+/// What is said by a quick bake that must succeed.
+fn told(dir: &Path, args: &[&str]) -> String {
+    let output = bake(dir, args);
     let text = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(output.status.success(), "{args:?}: {text}");
     text
@@ -59,7 +68,7 @@ fn light(path: &Path) -> Vec<u32> {
 
 #[test]
 fn frames_are_single_bakes_and_blends_those_of_blended_volumes() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     let frames: Vec<Vec<f32>> = (0..3).map(|t| ball(f64::from(t), 13)).collect();
     for (n, frame) in frames.iter().enumerate() {
@@ -67,7 +76,7 @@ fn frames_are_single_bakes_and_blends_those_of_blended_volumes() {
     }
     let range = ["--isovalues", "0.9", "0.97"];
     let with = |args: &[&'static str]| [args, &range].concat();
-    let output = isolume(dir, &with(&["bake", "ball_%03d.nrrd", "-o", "lit.vti", "--tau", "0.1", "--json"]));
+    let output = bake(dir, &with(&["bake", "ball_%03d.nrrd", "-o", "lit.vti", "--tau", "0.1", "--json"]));
     let text = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(text.contains("frame  3 of 3, time 10") && text.contains("lit.pvd"), "{text}");
     // One document, a report each.
@@ -88,12 +97,12 @@ fn frames_are_single_bakes_and_blends_those_of_blended_volumes() {
         assert!(String::from_utf8_lossy(&image[..200]).contains("type=\"ImageData\""));
         assert_eq!(light(&dir.join(set.attribute("file").unwrap())).len(), light(&dir.join("lit_0000.vti")).len());
     }
-    ok(dir, &with(&["bake", "ball_005.nrrd", "-o", "single.vti"]));
+    told(dir, &with(&["bake", "ball_005.nrrd", "-o", "single.vti"]));
     assert!(light(&dir.join("lit_0001.vti")) == light(&dir.join("single.vti")));
     assert!(light(&dir.join("lit_0001.vti")) != light(&dir.join("lit_0002.vti")), "the ball moves");
 
     // 0.2 of the way from the second to the third, in f64 as the blend is.
-    ok(dir, &with(&["bake", "ball_%03d.nrrd", "--time", "6.0", "-o", "between.vti"]));
+    told(dir, &with(&["bake", "ball_%03d.nrrd", "--time", "6.0", "-o", "between.vti"]));
     let samples: Vec<f64> =
         frames[1].iter().zip(&frames[2]).map(|(a, b)| (1.0 - 0.2) * f64::from(*a) + 0.2 * f64::from(*b)).collect();
     let mut bytes = fs::read(dir.join("ball_000.nrrd")).unwrap();
@@ -101,7 +110,7 @@ fn frames_are_single_bakes_and_blends_those_of_blended_volumes() {
     let mut bytes = String::from_utf8(bytes).unwrap().replace("float", "double").into_bytes();
     samples.iter().for_each(|s| bytes.extend(s.to_le_bytes()));
     fs::write(dir.join("blend.nrrd"), bytes).unwrap();
-    ok(dir, &with(&["bake", "blend.nrrd", "-o", "blended.vti"]));
+    told(dir, &with(&["bake", "blend.nrrd", "-o", "blended.vti"]));
     assert!(light(&dir.join("between.vti")) == light(&dir.join("blended.vti")));
 
     // What is there stays with --resume, if it is of the same job.
@@ -109,7 +118,7 @@ fn frames_are_single_bakes_and_blends_those_of_blended_volumes() {
     let before: Vec<_> = (0..3).map(written).collect();
     let first = light(&dir.join("lit_0001.vti"));
     fs::remove_file(dir.join("lit_0001.vti")).unwrap();
-    let text = ok(dir, &with(&["bake", "ball_%03d.nrrd", "-o", "lit.vti", "--resume", "--report", "r.json"]));
+    let text = told(dir, &with(&["bake", "ball_%03d.nrrd", "-o", "lit.vti", "--resume", "--report", "r.json"]));
     assert!(text.contains("lit_0000.vti is complete") && !text.contains("lit_0001.vti is complete"), "{text}");
     assert_eq!((written(0), written(2)), (before[0], before[2]));
     // Reports tell of all frames.
@@ -122,20 +131,20 @@ fn frames_are_single_bakes_and_blends_those_of_blended_volumes() {
     // Nor is a series of other settings replaced, unless this one was begun.
     let other = with(&["bake", "ball_%03d.nrrd", "-o", "lit.vti", "--resume", "--seed", "2"]);
     let before: Vec<_> = (0..3).map(written).collect();
-    let output = isolume(dir, &other);
+    let output = bake(dir, &other);
     let text = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(output.status.code() == Some(2) && text.contains("lit_0000.vti: is a bake of other settings"), "{text}");
     assert!((0..3).map(written).eq(before.iter().copied()), "{text}");
     fs::remove_file(dir.join("lit_0000.vti")).unwrap();
-    let text = ok(dir, &other);
+    let text = told(dir, &other);
     assert!(!text.contains("is complete") && light(&dir.join("lit_0001.vti")) != first, "{text}");
-    ok(dir, &with(&["bake", "ball_%03d.nrrd", "-o", "lit.vti"]));
+    told(dir, &with(&["bake", "ball_%03d.nrrd", "-o", "lit.vti"]));
     assert!(written(0) > before[0], "without --resume all is done again");
 }
 
 #[test]
 fn scenes_name_series_and_share_a_sweep() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     // The second frame is four times as large: its own suggested sweep would be another.
     let scaled: Vec<f32> = ball(1.0, 11).iter().map(|v| 4.0 * v).collect();
@@ -143,7 +152,7 @@ fn scenes_name_series_and_share_a_sweep() {
     write(&dir.join("b.nrrd"), &scaled, "float", 11);
     let scene = "[volume]\nfiles = [\"a.nrrd\", \"b.nrrd\"]\ntimes = [0.5, 2.0]\n[bake]\npreset = \"preview\"\n";
     fs::write(dir.join("s.toml"), scene).unwrap();
-    ok(dir, &["bake", "s.toml", "-o", "lit.vti", "--report", "r.json"]);
+    told(dir, &["bake", "s.toml", "-o", "lit.vti", "--report", "r.json"]);
     let sweep = |name: &str| {
         let file = VtiFile::read(&dir.join(name)).unwrap();
         match &file.field_data.iter().find(|a| a.name == "isovalues").unwrap().samples {
@@ -155,7 +164,7 @@ fn scenes_name_series_and_share_a_sweep() {
     assert!(dir.join("r_0001.json").exists() && fs::read_to_string(dir.join("lit.pvd")).unwrap().contains("\"0.5\""));
 
     let refused = |args: &[&str], words: &[&str]| {
-        let output = isolume(dir, args);
+        let output = bake(dir, args);
         let text = String::from_utf8_lossy(&output.stderr).into_owned();
         assert_eq!((output.status.code(), text.lines().count()), (Some(2), 1), "{text}");
         words.iter().for_each(|w| assert!(text.contains(w), "{w}: {text}"));

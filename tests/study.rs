@@ -1,13 +1,15 @@
 //! Studies as users meet them: what an earlier run left is taken up if it is of the same scene, settings and volume,
 //! and refused otherwise.
 
+#[path = "shared/folder.rs"]
+mod folder;
+#[path = "shared/program.rs"]
+mod program;
+
+use folder::Folder;
+use program::{isolume, ok};
 use std::fs;
 use std::path::Path;
-use std::process::{Command, Output};
-
-fn isolume(dir: &Path, args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_isolume")).current_dir(dir).args(args).output().expect("the program starts")
-}
 
 fn scene(dir: &Path, albedo: f64) {
     fs::create_dir_all(dir).unwrap();
@@ -30,9 +32,9 @@ fn content(dir: &Path) -> Vec<(String, Vec<u8>)> {
 
 #[test]
 fn what_another_scene_or_other_settings_left_is_refused_and_the_same_study_adds_nothing() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
-    assert!(isolume(dir, &["generate", "bumps", "--size", "8", "-o", "b.vti", "-q"]).status.success());
+    ok(dir, &["generate", "bumps", "--size", "8", "-o", "b.vti", "-q"]);
     scene(&dir.join("sa"), 0.1);
     scene(&dir.join("sb"), 0.9);
     let study = |scenes: &[&str], more: &[&str]| {
@@ -83,9 +85,9 @@ fn what_another_scene_or_other_settings_left_is_refused_and_the_same_study_adds_
 
 #[test]
 fn settings_are_checked_before_anything_is_computed() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
-    assert!(isolume(dir, &["generate", "bumps", "--size", "8", "-o", "b.vti", "-q"]).status.success());
+    ok(dir, &["generate", "bumps", "--size", "8", "-o", "b.vti", "-q"]);
     for n in 0..2 {
         fs::copy(dir.join("b.vti"), dir.join(format!("t_{n}.vti"))).unwrap();
     }
@@ -107,9 +109,9 @@ fn settings_are_checked_before_anything_is_computed() {
 
 #[test]
 fn strategies_are_not_baked_again_where_there_is_no_surface_to_compare() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
-    assert!(isolume(dir, &["generate", "bumps", "--size", "8", "-o", "b.vti", "-q"]).status.success());
+    ok(dir, &["generate", "bumps", "--size", "8", "-o", "b.vti", "-q"]);
     let study = |range: &str| {
         let text = format!("isovalues = [{range}]\n[volume]\nfile = \"b.vti\"\n");
         fs::write(dir.join("s.toml"), text).unwrap();
@@ -138,9 +140,9 @@ fn strategies_are_not_baked_again_where_there_is_no_surface_to_compare() {
 
 #[test]
 fn curves_are_refused_where_no_error_would_be_known() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
-    assert!(isolume(dir, &["generate", "bumps", "--size", "8", "-o", "b.vti", "-q"]).status.success());
+    ok(dir, &["generate", "bumps", "--size", "8", "-o", "b.vti", "-q"]);
     let text = |range: &str| format!("isovalues = [{range}]\n[volume]\nfile = \"b.vti\"\n");
     fs::write(dir.join("good.toml"), text("3.6, 95")).unwrap();
     fs::write(dir.join("bad.toml"), text("-1e6, 1e6")).unwrap();

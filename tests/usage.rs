@@ -1,24 +1,25 @@
 //! What the command line says about itself: help with examples that parse, completions, manual pages, `init`, JSON, and
 //! what it makes of misspellings.
 
+#[path = "shared/folder.rs"]
+mod folder;
+#[path = "shared/program.rs"]
+mod program;
+
 use clap::{CommandFactory, Parser};
+use folder::Folder;
 use isolume::bake::BakeSettings;
 use isolume::cli::Cli;
 use isolume::illumination_grid::GridSize;
 use isolume::scene::Surface;
 use isolume::scene_file::{SceneFile, SceneOptions, load};
+use program::{isolume, ok};
 use std::fs;
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::Command;
 
-fn isolume(dir: &Path, args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_isolume")).current_dir(dir).args(args).output().expect("the program starts")
-}
-
-fn ok(dir: &Path, args: &[&str]) -> String {
-    let output = isolume(dir, args);
-    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
-    String::from_utf8(output.stdout).unwrap()
+fn printed(dir: &Path, args: &[&str]) -> String {
+    String::from_utf8(ok(dir, args).stdout).unwrap()
 }
 
 /// An example as a shell would split it; what two blanks set apart is a comment.
@@ -58,22 +59,22 @@ fn every_verb_teaches_by_examples_that_parse() {
     let mut checked = 0;
     check_examples(&Cli::command(), &mut checked);
     assert!(checked > 30, "{checked} examples");
-    let dir = tempfile::tempdir().unwrap();
-    let help = ok(dir.path(), &["bake", "--help"]);
+    let dir = Folder::new();
+    let help = printed(dir.path(), &["bake", "--help"]);
     assert!(help.contains("--isovalues") && !help.contains('\u{1b}'), "no colours into a pipe");
 }
 
 #[test]
 fn completions_and_manual_pages() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     for shell in ["bash", "zsh", "fish", "elvish", "powershell"] {
-        let script = ok(dir, &["completions", shell]);
+        let script = printed(dir, &["completions", shell]);
         for word in ["bake", "wall-resolution", "completions"] {
             assert!(script.contains(word), "{shell}: {word}");
         }
     }
-    let script = ok(dir, &["completions", "bash"]);
+    let script = printed(dir, &["completions", "bash"]);
     fs::write(dir.join("c.sh"), script).unwrap();
     let tried = Command::new("bash")
         .current_dir(dir)
@@ -97,13 +98,13 @@ fn completions_and_manual_pages() {
 
 #[test]
 fn init_writes_a_scene_whose_comments_are_the_defaults() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "21", "-o", "my bumps.v1.nrrd", "-q"]);
     ok(dir, &["init", "my bumps.v1.nrrd", "-q"]);
     let path = dir.join("my bumps.toml");
     let loaded = load(&path, &SceneOptions::default()).unwrap();
-    let info: serde_json::Value = serde_json::from_str(&ok(dir, &["info", "my bumps.v1.nrrd", "--json"])).unwrap();
+    let info: serde_json::Value = serde_json::from_str(&printed(dir, &["info", "my bumps.v1.nrrd", "--json"])).unwrap();
     let sweep = loaded.scene.field.sweep();
     assert_eq!(info["sweep"], serde_json::json!([sweep.lo(), sweep.hi()]));
 
@@ -147,33 +148,33 @@ fn init_writes_a_scene_whose_comments_are_the_defaults() {
 
 #[test]
 fn results_as_json() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "15", "-o", "b.vti", "-q"]);
     let bake = ["bake", "b.vti", "--isovalues", "3.6", "95", "-o", "out.vti", "--photons", "4000", "--gather", "4"];
     let parse = |text: String| -> serde_json::Value { serde_json::from_str(&text).unwrap() };
-    let dry = parse(ok(dir, &[&bake[..], &["--dry-run", "--json", "--report", "r.json"]].concat()));
+    let dry = parse(printed(dir, &[&bake[..], &["--dry-run", "--json", "--report", "r.json"]].concat()));
     assert_eq!((&dry["settings"]["engine"], &dry["settings"]["photons"]), (&"photon".into(), &4000.into()), "{dry}");
     let stages = |key: &str| dry[key].as_object().unwrap().values().map(|v| v.as_f64().unwrap()).collect::<Vec<_>>();
     let close = |a: f64, b: &serde_json::Value| (a / b.as_f64().unwrap() - 1.0).abs() < 1e-9;
     assert!(close(stages("seconds").iter().sum(), &dry["total_seconds"]), "{dry}");
     assert!(close(stages("bytes").iter().copied().fold(0.0, f64::max), &dry["peak_bytes"]), "{dry}");
     assert!(!dir.join("r.json").exists() && !dir.join("out.vti").exists());
-    let report = parse(ok(dir, &[&bake[..], &["--samples", "2000", "--json", "--report", "r.json"]].concat()));
+    let report = parse(printed(dir, &[&bake[..], &["--samples", "2000", "--json", "--report", "r.json"]].concat()));
     assert_eq!(report["photons"]["emitted"], 4000);
     assert_eq!(report["settings"], parse(fs::read_to_string(dir.join("r.json")).unwrap())["settings"]);
-    let mesh = parse(ok(dir, &["extract", "out.vti", "--isovalue", "47", "-o", "m.ply", "--json"]));
+    let mesh = parse(printed(dir, &["extract", "out.vti", "--isovalue", "47", "-o", "m.ply", "--json"]));
     assert!(mesh["vertices"].as_u64().unwrap() > 50 && mesh["lit"] == true, "{mesh}");
     let reference =
         ["reference", "out.vti", "--isovalue", "47", "-o", "ref.ply", "--vertices", "50", "--samples", "16"];
-    let reference = parse(ok(dir, &[&reference[..], &["--json"]].concat()));
+    let reference = parse(printed(dir, &[&reference[..], &["--json"]].concat()));
     assert_eq!((&reference["sampled"], &reference["vertices"]), (&serde_json::json!(50), &mesh["vertices"]));
-    assert!(parse(ok(dir, &["compare", "out.vti", "ref.ply", "--json"]))["percent_rms"].is_number());
+    assert!(parse(printed(dir, &["compare", "out.vti", "ref.ply", "--json"]))["percent_rms"].is_number());
 }
 
 #[test]
 fn misspellings_are_told_what_was_meant() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     fs::write(dir.join("s.toml"), "[volume]\ngenerator = \"bumps\"\n[bake]\nphotns = 5\n").unwrap();
     fs::write(dir.join("f.toml"), "[field]\ngenerator = \"bumps2\"\n[box]\nluminair = 1\n").unwrap();

@@ -1,33 +1,36 @@
 //! `isolume view`: what the page holds, and what a browser makes of it.
 
+#[path = "shared/folder.rs"]
+mod folder;
+#[path = "shared/program.rs"]
+mod program;
+#[path = "shared/skipped.rs"]
+mod skipped;
 #[path = "view/browser.rs"]
 mod browser;
 
 use base64::Engine;
+use folder::Folder;
 use glam::{DMat3, DVec3};
 use isolume::export::bake_file::BakedVolume;
 use isolume::export::picture::{Picture, srgb_decode, srgb_encode};
 use isolume::mask::Mask;
 use isolume::view::{Payload, codec};
 use isolume::volume::{Lattice, Samples, Volume};
+use program::{isolume, ok};
+use skipped::skipped;
 use std::fs;
 use std::io::Read;
 use std::path::Path;
-use std::process::Command;
-
-fn isolume(dir: &Path, args: &[&str]) {
-    let output = Command::new(env!("CARGO_BIN_EXE_isolume")).current_dir(dir).args(args).output().unwrap();
-    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
-}
 
 const QUICK: [&str; 9] =
     ["--photons", "20000", "--samples", "20000", "--gather", "16", "--wall-resolution", "16", "--quiet"];
 
 /// A bake of the bumps, as `out.vti` in `dir`.
 fn bake_bumps(dir: &Path, size: &str, extra: &[&str]) -> BakedVolume {
-    isolume(dir, &["generate", "bumps", "--size", size, "-o", "b.vti", "-q"]);
+    ok(dir, &["generate", "bumps", "--size", size, "-o", "b.vti", "-q"]);
     let bake = ["bake", "b.vti", "--isovalues", "3.6", "95", "-o", "out.vti"];
-    isolume(dir, &[&bake[..], &QUICK, extra].concat());
+    ok(dir, &[&bake[..], &QUICK, extra].concat());
     BakedVolume::read(&dir.join("out.vti")).unwrap()
 }
 
@@ -39,10 +42,10 @@ fn element<'a>(page: &'a str, id: &str) -> &'a str {
 
 #[test]
 fn the_page_holds_the_bake_and_nothing_from_elsewhere() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     let baked = bake_bumps(dir, "41", &["--sides", "both"]);
-    isolume(dir, &["view", "out.vti", "-o", "page.html", "--title", "</script><b>&", "-q"]);
+    ok(dir, &["view", "out.vti", "-o", "page.html", "--title", "</script><b>&", "-q"]);
     let page = fs::read_to_string(dir.join("page.html")).unwrap();
     for foreign in ["http:", "https:", "src=", "@import", "import(", "fetch(", "XMLHttpRequest"] {
         assert!(!page.contains(foreign), "the page is self-contained, but says {foreign}");
@@ -104,11 +107,11 @@ fn the_page_holds_the_bake_and_nothing_from_elsewhere() {
 
 #[test]
 fn what_is_no_bake_or_no_page_is_refused() {
-    let dir = tempfile::tempdir().unwrap();
-    isolume(dir.path(), &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
+    let dir = Folder::new();
+    ok(dir.path(), &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
     for (args, word) in [(["view", "b.vti", "-o", "p.html"], "is no bake"), (["view", "b.vti", "-o", "p.png"], ".html")]
     {
-        let output = Command::new(env!("CARGO_BIN_EXE_isolume")).current_dir(dir.path()).args(args).output().unwrap();
+        let output = isolume(dir.path(), &args);
         assert_eq!(output.status.code(), Some(2));
         assert!(String::from_utf8_lossy(&output.stderr).contains(word));
     }
@@ -125,7 +128,7 @@ impl Bytes {
     /// What `isolume render` draws.
     fn render(dir: &Path, args: &[&str]) -> Self {
         let fixed = ["render", "out.vti", "-o", "r.png", "--height", "240", "--samples", "16", "-q"];
-        isolume(dir, &[&fixed[..], args].concat());
+        ok(dir, &[&fixed[..], args].concat());
         let file = fs::File::open(dir.join("r.png")).unwrap();
         let mut reader = png::Decoder::new(std::io::BufReader::new(file)).read_info().unwrap();
         let mut bytes = vec![0; reader.output_buffer_size().unwrap()];
@@ -175,7 +178,7 @@ struct View {
 
 /// Compares views of the bake in `dir`, and returns everything else that the page posted.
 fn compare(dir: &Path, program: &Path, views: &[View], driver: &str) -> Vec<(String, Vec<u8>)> {
-    isolume(dir, &["view", "out.vti", "-o", "page.html", "-q"]);
+    ok(dir, &["view", "out.vti", "-o", "page.html", "-q"]);
     let page = fs::read_to_string(dir.join("page.html")).unwrap();
     let pictures: Vec<Bytes> =
         views.iter().map(|v| Bytes::render(dir, &v.render.iter().map(String::as_str).collect::<Vec<_>>())).collect();
@@ -217,7 +220,7 @@ fn words(text: &str) -> Vec<String> {
 fn chromium() -> Option<std::path::PathBuf> {
     let found = browser::find();
     if found.is_none() {
-        println!("skipped: no Chromium on the path or in ISOLUME_CHROMIUM");
+        skipped("the page in a browser", "Chromium is neither on the path nor in ISOLUME_CHROMIUM");
     }
     found
 }
@@ -225,7 +228,7 @@ fn chromium() -> Option<std::path::PathBuf> {
 #[test]
 fn the_browser_shows_what_render_draws() {
     let Some(program) = chromium() else { return };
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     bake_bumps(dir, "41", &[]);
     // The unit cube: half a diagonal is √3/2; the eye stands 1.8737 from the centre.
@@ -307,7 +310,7 @@ fn the_browser_shows_what_render_draws() {
 #[test]
 fn plateaus_at_the_isovalue_are_within() {
     let Some(program) = chromium() else { return };
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     let lattice = Lattice::aligned([17; 3], DVec3::ZERO, DVec3::splat(1.0 / 16.0)).unwrap();
     let within = |o: usize, range: std::ops::Range<usize>| lattice.ijk(o).iter().all(|i| range.contains(i));
@@ -315,7 +318,7 @@ fn plateaus_at_the_isovalue_are_within() {
     let samples = (0..lattice.len()).map(label).collect();
     Volume::new("labels", lattice.clone(), Samples::U8(samples)).unwrap().write(dir.join("b.nrrd")).unwrap();
     let bake = ["bake", "b.nrrd", "--isovalues", "1", "201", "-o", "out.vti", "--engine", "photon"];
-    isolume(dir, &[&bake[..], &QUICK].concat());
+    ok(dir, &[&bake[..], &QUICK].concat());
     // 79 of 200 is no whole number of the page's steps, and rounds down.
     let view = |name, isovalue: u32| View {
         name,
@@ -330,7 +333,7 @@ fn plateaus_at_the_isovalue_are_within() {
 #[test]
 fn axes_caps_and_sides_are_where_render_has_them() {
     let Some(program) = chromium() else { return };
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     let dims = [25, 17, 33];
     let axes = DMat3::from_cols(DVec3::new(0.0, 0.2, -1.0), DVec3::new(2.0, 0.0, 0.3), DVec3::new(0.1, -0.9, 0.0));
@@ -342,7 +345,7 @@ fn axes_caps_and_sides_are_where_render_has_them() {
     });
     Volume::new("skew", lattice.clone(), Samples::F32(samples.collect())).unwrap().write(dir.join("b.nrrd")).unwrap();
     let bake = ["bake", "b.nrrd", "--isovalues", "5", "90", "-o", "out.vti", "--box", "cornell", "--margin", "0.1"];
-    isolume(dir, &[&bake[..], &QUICK, &["--boundary", "capped", "--sides", "both", "--outside", "higher"]].concat());
+    ok(dir, &[&bake[..], &QUICK, &["--boundary", "capped", "--sides", "both", "--outside", "higher"]].concat());
     let view = |name, shading: &str, extra: &str| View {
         name,
         page: format!("{{ iso: {}, shading: '{shading}' }}", (40.0 - 5.0) / 85.0),
@@ -356,7 +359,7 @@ fn axes_caps_and_sides_are_where_render_has_them() {
 #[test]
 fn walls_within_solids_are_as_render_has_them() {
     let Some(program) = chromium() else { return };
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     let lattice = Lattice::aligned([25; 3], DVec3::ZERO, DVec3::splat(1.0 / 24.0)).unwrap();
     let samples = (0..lattice.len()).map(|o| {
@@ -370,7 +373,7 @@ fn walls_within_solids_are_as_render_has_them() {
         [("both", "sweep", "higher"), ("both", "photon", "higher"), ("outside", "sweep", "lower")]
     {
         let asked = ["--engine", engine, "--sides", sides, "--outside", outside];
-        isolume(dir, &[&bake[..], &QUICK, &asked].concat());
+        ok(dir, &[&bake[..], &QUICK, &asked].concat());
         let stored = BakedVolume::read(&dir.join("out.vti")).unwrap().flats;
         let own = stored.iter().flatten().filter(|light| light.own().is_some()).count();
         assert_eq!(own > 3, sides == "both", "{engine}, {sides}: {own}");
@@ -385,7 +388,7 @@ fn walls_within_solids_are_as_render_has_them() {
 #[test]
 fn split_light_is_what_render_draws() {
     let Some(program) = chromium() else { return };
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     let axes = DMat3::from_cols(DVec3::new(0.0, 0.2, -1.0), DVec3::new(2.0, 0.0, 0.3), DVec3::new(0.1, -0.9, 0.0));
     let lattice = Lattice::new([11, 7, 13], DVec3::new(1000.0, -2000.0, 500.0), 2.0 * axes).unwrap();
@@ -404,7 +407,7 @@ fn split_light_is_what_render_draws() {
                  albedo = [{ isovalue = 5, colour = [0.9, 0.8, 0.7] }, { isovalue = 90, colour = [0.3, 0.4, 0.5] }]\n[box]\nmargin = 0.3\n[[context]]\nfile = \"lamp.obj\"\n\
                  [bake]\npreset = \"preview\"\ngrid = \"2x\"\nsplit = true\n";
     fs::write(dir.join("b.toml"), scene).unwrap();
-    isolume(dir, &["bake", "b.toml", "-o", "out.vti", "-q"]);
+    ok(dir, &["bake", "b.toml", "-o", "out.vti", "-q"]);
     let baked = BakedVolume::read(&dir.join("out.vti")).unwrap();
     let lights = baked.scene.luminaires().iter().map(|l| l.vertices().len());
     assert!(baked.sides.iter().all(|(_, grid)| grid.split.is_some()) && lights.collect::<Vec<_>>() == [4, 3, 3]);
@@ -416,7 +419,7 @@ fn split_light_is_what_render_draws() {
     compare(dir, &program, &[view("split-40", 40.0, ""), view("split-15", 15.0, "")], "");
     // What the page shows is not the grid's radiance.
     let whole = Bytes::render(dir, &["--isovalue", "40"]);
-    isolume(dir, &["bake", "b.toml", "-o", "out.vti", "-q", "--split=false"]);
+    ok(dir, &["bake", "b.toml", "-o", "out.vti", "-q", "--split=false"]);
     let without = Bytes::render(dir, &["--isovalue", "40"]);
     let differing = whole.rgb.iter().zip(&without.rgb).filter(|(a, b)| a != b).count();
     println!("{differing} pixels differ from those without");
@@ -428,7 +431,7 @@ fn split_light_is_what_render_draws() {
 #[test]
 fn walls_of_crowded_isovalues_are_as_bright_as_render_has_them() {
     let Some(program) = chromium() else { return };
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     let lattice = Lattice::aligned([33; 3], DVec3::splat(-0.5), DVec3::splat(1.0 / 32.0)).unwrap();
     let samples = (0..lattice.len()).map(|o| {
@@ -437,7 +440,7 @@ fn walls_of_crowded_isovalues_are_as_bright_as_render_has_them() {
     });
     let volume = Volume::new("density", lattice.clone(), Samples::F64(samples.collect())).unwrap();
     volume.write(dir.join("b.nrrd")).unwrap();
-    isolume(
+    ok(
         dir,
         &[&["bake", "b.nrrd", "--isovalues", "0.001", "1", "-o", "out.vti", "--margin", "0.1"][..], &QUICK].concat(),
     );
@@ -461,7 +464,7 @@ fn gaps_are_open_where_render_has_them() {
         (["slab", "slab-local"], "open", 9),
         (["capped", "capped-local"], "capped", 3),
     ] {
-        let dir = tempfile::tempdir().unwrap();
+        let dir = Folder::new();
         let dir = dir.path();
         let samples = (0..lattice.len()).map(|o| {
             let p = DVec3::from_array(lattice.ijk(o).map(|i| i as f64));
@@ -470,7 +473,7 @@ fn gaps_are_open_where_render_has_them() {
         let volume = Volume::new("ball", lattice.clone(), Samples::F64(samples.collect())).unwrap();
         volume.write(dir.join("b.nrrd")).unwrap();
         let bake = ["bake", "b.nrrd", "--isovalues", "-0.4", "0.9", "-o", "out.vti", "--margin", "0.1"];
-        isolume(dir, &[&bake[..], &QUICK, &["--boundary", boundary]].concat());
+        ok(dir, &[&bake[..], &QUICK, &["--boundary", boundary]].concat());
         let view = |name, shading: &str, extra: &str| View {
             name,
             page: format!("{{ iso: {}, shading: '{shading}' }}", (-0.2 + 0.4) / 1.3),
@@ -483,10 +486,10 @@ fn gaps_are_open_where_render_has_them() {
 #[test]
 fn a_file_needs_no_server_and_writes_nothing_to_the_console() {
     let Some(program) = chromium() else { return };
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     bake_bumps(dir, "21", &[]);
-    isolume(dir, &["view", "out.vti", "-o", "page.html", "-q"]);
+    ok(dir, &["view", "out.vti", "-o", "page.html", "-q"]);
     let address = format!("file://{}#isovalue=47&azimuth=20", dir.join("page.html").display());
     let output = browser::command(&program, &dir.join("profile"))
         .args(["--window-size=800,600", "--virtual-time-budget=20000", "--run-all-compositor-stages-before-draw"])
@@ -509,10 +512,10 @@ fn a_file_needs_no_server_and_writes_nothing_to_the_console() {
 #[test]
 fn without_webgl2_the_page_says_so() {
     let Some(program) = chromium() else { return };
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     bake_bumps(dir, "9", &[]);
-    isolume(dir, &["view", "out.vti", "-o", "page.html", "-q"]);
+    ok(dir, &["view", "out.vti", "-o", "page.html", "-q"]);
     let page = fs::read_to_string(dir.join("page.html")).unwrap();
     let without = "<body><script>HTMLCanvasElement.prototype.getContext = () => null;</script>";
     let driver = "await isolume.ready.catch(() => 0); const m = document.getElementById('message');
@@ -524,7 +527,7 @@ fn without_webgl2_the_page_says_so() {
 
 #[test]
 fn pages_are_a_function_of_the_bake() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let baked = bake_bumps(dir.path(), "13", &[]);
     let [a, b] = [0, 1].map(|_| Payload::new(&baked, "t").unwrap());
     assert_eq!((a.description.to_string(), &a.bytes), (b.description.to_string(), &b.bytes));

@@ -1,12 +1,12 @@
 //! What cannot be right: one clear line, exit code 2, and nothing left behind.
 
-use super::{QUICK, ok, refused, text};
+use super::{Folder, QUICK, ok, refused, text};
 use isolume::volume::{Lattice, Samples, Volume};
 use std::fs;
 
 #[test]
 fn bad_input_is_one_clear_line_and_leaves_nothing() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     refused(dir, &["bake", "nowhere.nii.gz", "-o", "out.vti"], &["nowhere.nii.gz"]);
     refused(dir, &["bake", "nowhere.xyz", "-o", "out.vti"], &["nowhere.xyz"]);
@@ -132,7 +132,7 @@ fn bad_input_is_one_clear_line_and_leaves_nothing() {
 /// An option that a scene file sets is named by its line, one that a flag sets is not.
 #[test]
 fn options_of_a_bake_out_of_range_are_named_where_they_are_set() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     let scene = "[volume]\ngenerator = \"bumps\"\nsize = 9\n[bake]\nlight-points = 17\ngather = 5\n";
     fs::write(dir.join("s.toml"), scene).unwrap();
@@ -146,7 +146,7 @@ fn options_of_a_bake_out_of_range_are_named_where_they_are_set() {
 /// Spacings, by name, before anything is made of them.
 #[test]
 fn spacings_out_of_range_are_named() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     fs::write(dir.join("r.raw"), (0..27).collect::<Vec<u8>>()).unwrap();
     let verbs: [&[&str]; 2] =
@@ -167,7 +167,7 @@ fn spacings_out_of_range_are_named() {
 /// What is asked of a file of another kind, or with a number beyond use, is told what to do instead.
 #[test]
 fn messages_say_what_to_do_instead() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "sphere", "--size", "9", "-o", "b.npy", "-q"]);
     refused(dir, &["info", "b.npy", "--raw-dims", "9,9,9"], &["b.npy", ".npy has a header", "leave --raw-… out"]);
@@ -220,7 +220,7 @@ fn messages_say_what_to_do_instead() {
 /// Its photons would come from all isovalues of the sweep.
 #[test]
 fn photons_of_one_isosurface_that_emits_are_refused() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "12", "-o", "b.nrrd", "-q"]);
     let reference =
@@ -232,7 +232,7 @@ fn photons_of_one_isosurface_that_emits_are_refused() {
 /// The surfaces are there, but between the grid's points; a volume without any is another matter.
 #[test]
 fn a_grid_that_is_too_coarse_is_told_from_a_constant_volume() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "20", "-o", "b.nrrd", "-q"]);
     for engine in ["sweep", "photon"] {
@@ -253,7 +253,7 @@ fn a_grid_that_is_too_coarse_is_told_from_a_constant_volume() {
 /// MTL: one number is grey; what tobj would panic at is refused with its line.
 #[test]
 fn colours_of_an_mtl_are_one_number_or_three() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.nrrd", "-q"]);
     fs::write(dir.join("w.obj"), "mtllib w.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl w\nf 1 2 3\n").unwrap();
@@ -290,7 +290,7 @@ fn colours_of_an_mtl_are_one_number_or_three() {
 /// Radiances are stored in 32 bits, and so are the squares that their standard errors come from.
 #[test]
 fn emissions_that_floats_cannot_square_are_refused() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.nrrd", "-q"]);
     let bake = ["bake", "b.nrrd", "--isovalues", "3.6", "95", "-o", "out.vti", "-q", "--dry-run"];
@@ -320,7 +320,7 @@ fn emissions_that_floats_cannot_square_are_refused() {
 /// What would change a bake's scene is refused where a bake is read: its light is that of the scene it holds.
 #[test]
 fn scene_flags_are_refused_where_the_input_is_a_bake() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
     ok(dir, &[&["bake", "b.vti", "--isovalues", "30", "60", "-o", "lit.vti", "-q"], &QUICK[..]].concat());
@@ -368,7 +368,7 @@ fn scene_flags_are_refused_where_the_input_is_a_bake() {
 /// too.
 #[test]
 fn a_sweep_that_is_too_thin_is_refused_beforehand() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let lattice = Lattice::aligned([20; 3], glam::DVec3::splat(-0.5), glam::DVec3::splat(1.0 / 19.0)).unwrap();
     let radius = |o: usize| lattice.to_world(glam::DVec3::from_array(lattice.ijk(o).map(|i| i as f64))).length();
     let samples = Samples::F64((0..lattice.len()).map(|o| 1.0 - radius(o)).collect());

@@ -1,6 +1,6 @@
 //! `--shadow-rays` and `--gather-rays`: light where one looks, by rays into a bake, beside path tracing.
 
-use super::{ok, refused, text};
+use super::{Folder, ok, refused, text};
 use exr::prelude::read_all_flat_layers_from_file;
 use glam::DVec3;
 use isolume::export::ply;
@@ -38,7 +38,7 @@ const TWO: &str = "[[volume]]\nname = \"bumps\"\ngenerator = \"bumps\"\nsize = 1
 /// those of the light that is stored.
 #[test]
 fn pictures_by_rays_are_as_paths_have_them() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     // Its solid ends in a cap towards the camera, with a hole.
     let lattice = Lattice::aligned([13; 3], DVec3::ZERO, DVec3::splat(1.0 / 12.0)).unwrap();
@@ -80,7 +80,7 @@ fn pictures_by_rays_are_as_paths_have_them() {
 /// threads; nearer to paths than by shadow rays alone, and these than the stored light.
 #[test]
 fn meshes_by_rays_are_nearer_to_paths() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     std::fs::write(dir.join("s.toml"), BUMPS).unwrap();
     ok(dir, &["bake", "s.toml", "-o", "whole.vti", "--preset", "preview", "-q"]);
@@ -137,7 +137,7 @@ fn meshes_by_rays_are_nearer_to_paths() {
 
 #[test]
 fn rays_need_a_bake_that_has_use_for_them() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     std::fs::write(dir.join("s.toml"), BUMPS).unwrap();
     ok(dir, &["bake", "s.toml", "-o", "lit.vti", "--preset", "preview", "-q"]);

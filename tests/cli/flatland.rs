@@ -1,6 +1,6 @@
 //! Pictures of n = 2 from the command line.
 
-use super::{ok, refused, text};
+use super::{Folder, ok, refused, text};
 use isolume::volume::{Lattice, Samples, Volume};
 use std::fs;
 use std::path::Path;
@@ -16,7 +16,7 @@ fn write(dir: &Path, name: &str, nz: usize) {
 
 #[test]
 fn samples_that_are_not_finite_are_told_of() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     write(dir, "v.npy", 2);
     fs::write(dir.join("s.toml"), "[field]\nfile = \"v.npy\"\n").unwrap();
@@ -28,7 +28,7 @@ fn samples_that_are_not_finite_are_told_of() {
 
 #[test]
 fn paths_have_a_most() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     fs::write(dir.path().join("s.toml"), SCENE).unwrap();
     refused(dir.path(), &["flatland", "s.toml", "-o", "o", "--paths", "65537"], &["--paths 65537: 0 to 65536"]);
     // Before there is a folder.
@@ -47,7 +47,7 @@ fn drawing_paths_can_be_interrupted() {
     use std::process::{Command, Stdio};
     use std::time::{Duration, Instant};
     for signal in ["-INT", "-TERM"] {
-        let dir = tempfile::tempdir().unwrap();
+        let dir = Folder::new();
         let dir = dir.path();
         fs::write(dir.join("s.toml"), SCENE).unwrap();
         let mut child = Command::new(env!("CARGO_BIN_EXE_isolume"))

@@ -1,10 +1,16 @@
 //! The program as users meet it: verbs, files, exit codes, and one clear line for every kind of bad input.
 
+#[path = "../shared/folder.rs"]
+mod folder;
+#[path = "../shared/program.rs"]
+mod program;
+
+use folder::Folder;
 use isolume::volume::vti::VtiFile;
 use isolume::volume::{Samples, Volume};
+use program::{isolume, ok};
 use std::fs;
 use std::path::Path;
-use std::process::{Command, Output};
 
 mod bad_input;
 mod compare;
@@ -16,10 +22,6 @@ mod pictures;
 mod reproducibility;
 mod split;
 mod volumes;
-
-fn isolume(dir: &Path, args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_isolume")).current_dir(dir).args(args).output().expect("the program starts")
-}
 
 fn text(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()
@@ -42,17 +44,11 @@ fn refused(dir: &Path, args: &[&str], words: &[&str]) {
     assert!(left.is_empty(), "{args:?} left {left:?}");
 }
 
-fn ok(dir: &Path, args: &[&str]) -> Output {
-    let output = isolume(dir, args);
-    assert!(output.status.success(), "{args:?}: {}", text(&output.stderr));
-    output
-}
-
 const QUICK: [&str; 8] = ["--photons", "4000", "--samples", "2000", "--gather", "8", "--wall-resolution", "8"];
 
 #[test]
 fn generate_info_bake_render() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "21", "-o", "b.nrrd", "--quiet"]);
     let info = text(&ok(dir, &["info", "b.nrrd"]).stdout);

@@ -1,13 +1,13 @@
 //! What is written where: never over an input, never twice, and into a pipe only while someone reads it.
 
-use super::{QUICK, isolume, ok, refused, text};
+use super::{Folder, QUICK, isolume, ok, refused, text};
 use isolume::volume::vti::VtiFile;
 use std::fs;
 use std::process::Command;
 
 #[test]
 fn a_second_bake_never_harms_the_first_unless_it_finishes() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     fs::write(dir.join("keep.vti"), "precious").unwrap();
     ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
@@ -25,7 +25,7 @@ fn a_second_bake_never_harms_the_first_unless_it_finishes() {
 /// Whatever a verb reads is as it was, and nothing is written twice.
 #[test]
 fn no_output_takes_the_place_of_an_input() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
     let mut bake = vec!["bake", "b.vti", "-o", "lit.vti", "--isovalues", "3.6", "95", "-q"];
@@ -68,7 +68,7 @@ fn no_output_takes_the_place_of_an_input() {
 
 #[test]
 fn a_pipe_that_nobody_reads_is_no_fault() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     ok(dir.path(), &["generate", "bumps", "--size", "9", "-o", "b.vti"]);
     let mut command = Command::new(env!("CARGO_BIN_EXE_isolume"));
     command.current_dir(dir.path()).args(["info", "b.vti", "--json"]);

@@ -1,6 +1,6 @@
 //! Colours of what leaves a bake, worked out again from its radiance.
 
-use super::{QUICK, ok};
+use super::{Folder, QUICK, ok};
 use exr::prelude::{AttributeValue, MetaData, Text};
 use glam::DVec3;
 use isolume::export::ply;
@@ -43,7 +43,7 @@ pub(crate) fn pixels(path: &Path) -> (Vec<[u8; 3]>, usize) {
 
 #[test]
 fn colours_are_exposed_and_encoded_radiance() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     bake(dir, "bumps", ["3.6", "95"]);
     let file = VtiFile::read(&dir.join("lit.vti")).unwrap();
@@ -70,7 +70,7 @@ fn colours_are_exposed_and_encoded_radiance() {
 /// Light is inside of the sphere, the lower side: normals point to its centre, and triangles turn that way.
 #[test]
 fn triangles_and_normals_face_outside() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "sphere", "--size", "11", "-o", "b.vti", "-q"]);
     for (side, sign) in [("lower", -1.0), ("higher", 1.0)] {
@@ -97,7 +97,7 @@ fn triangles_and_normals_face_outside() {
 
 #[test]
 fn the_box_stands_in_the_picture_as_it_is() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     bake(dir, "bumps", ["3.6", "95"]);
     for (name, more) in [("lit.png", &[][..]), ("local.png", &["--local"])] {
@@ -121,7 +121,7 @@ fn the_box_stands_in_the_picture_as_it_is() {
 /// A plane that fills the picture, seen from the front: ρ (0.15 + 0.85 cos) at every pixel.
 #[test]
 fn local_shading_is_a_headlight_and_a_constant() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::splat(0.125)).unwrap();
     let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[1] as f32 / 8.0).collect();
@@ -142,7 +142,7 @@ fn local_shading_is_a_headlight_and_a_constant() {
 /// Exposure of an .exr is what makes its radiance the .png; its attributes are all that made it.
 #[test]
 fn an_exr_says_what_made_it() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     bake(dir, "bumps", ["3.6", "95"]);
     let own = exposure(&VtiFile::read(&dir.join("lit.vti")).unwrap());
@@ -181,7 +181,7 @@ fn an_exr_says_what_made_it() {
 /// At 10 the isosurface shadows walls up to their edges, where the linear functions between texels go on below 0.
 #[test]
 fn pictures_hold_no_negative_light() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "11", "-o", "b.vti", "-q"]);
     let bake =

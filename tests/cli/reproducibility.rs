@@ -1,13 +1,13 @@
 //! The same bits, whatever the machine has.
 
-use super::{QUICK, isolume, ok, refused, text};
+use super::{Folder, QUICK, isolume, ok, refused, text};
 use isolume::volume::Samples;
 use isolume::volume::vti::VtiFile;
 use std::fs;
 
 #[test]
 fn the_same_bits_for_any_number_of_threads() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "17", "-o", "b.vti", "-q"]);
     let grids: Vec<Vec<f32>> = ["1", "2", "7", "16"]
@@ -37,7 +37,7 @@ fn the_same_bits_for_any_number_of_threads() {
 /// Every kernel gives the same bits; what the machine lacks is refused before any work.
 #[test]
 fn every_instruction_set_bakes_the_same_light() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "21", "-o", "b.nrrd", "--quiet"]);
     let found = isolume::isa::Isa::found();

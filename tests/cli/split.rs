@@ -1,6 +1,6 @@
 //! `bake --split`: light in two parts, of which direct light is exact between grid points.
 
-use super::{ok, refused, text};
+use super::{Folder, ok, refused, text};
 use isolume::accuracy::{Survey, SurveySettings, survey};
 use isolume::embree::{Device, GraphTracer};
 use isolume::export::bake_file::BakedVolume;
@@ -29,7 +29,7 @@ fn surveyed(baked: &BakedVolume, grid: &IlluminationGrid) -> Survey {
 /// the grid's points both parts are the radiance that is there without them, and between them they are nearer to paths.
 #[test]
 fn split_light_is_nearer_between_grid_points() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "25", "-o", "b.vti", "-q"]);
     let scene = "[volume]\nfile = \"b.vti\"\n[surface]\nsides = \"both\"\n";
@@ -73,7 +73,7 @@ fn split_light_is_nearer_between_grid_points() {
 /// What `compare` says of bakes with and without.
 #[test]
 fn compare_tells_split_light_from_its_texture() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "17", "-o", "b.vti", "-q"]);
     for (flag, split) in [("--split=false", false), ("--split", true)] {
@@ -87,7 +87,7 @@ fn compare_tells_split_light_from_its_texture() {
 /// Pictures and meshes of a split bake are its own, not those of its radiance.
 #[test]
 fn pictures_and_meshes_show_split_light() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "17", "-o", "b.vti", "-q"]);
     let made = |more: &[&str]| {
@@ -103,7 +103,7 @@ fn pictures_and_meshes_show_split_light() {
 
 #[test]
 fn scattered_samples_are_not_split() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
     let given = ["bake", "b.vti", "--isovalues", "3.6", "95", "-o", "lit.vti", "--split"];

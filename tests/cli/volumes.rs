@@ -1,7 +1,7 @@
 //! Volumes of every kind from file to file: simulated, on an offset, without a header, with axes that mean something,
 //! several in a scene.
 
-use super::{QUICK, ok, refused, text};
+use super::{Folder, QUICK, ok, refused, text};
 use glam::DVec3;
 use isolume::export::ply;
 use isolume::volume::vti::{VtiFile, VtiWriter};
@@ -10,7 +10,7 @@ use std::fs;
 
 #[test]
 fn simulations_write_one_file_per_field() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     let small = ["--size", "13", "--steps", "20", "--particles", "400", "--density", "0.05"];
     let with = |args: &[&'static str]| [args, &small[..]].concat();
@@ -39,7 +39,7 @@ fn simulations_write_one_file_per_field() {
 /// without it.
 #[test]
 fn bakes_of_data_on_an_offset_hold_their_isosurfaces() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "13", "-o", "b.vti", "-q"]);
     let bumps = Volume::open(dir.join("b.vti")).unwrap();
@@ -92,7 +92,7 @@ fn bakes_of_data_on_an_offset_hold_their_isosurfaces() {
 /// What is printed of data on an offset tells its ends apart, and can be pasted.
 #[test]
 fn the_suggested_sweep_of_data_on_an_offset_can_be_pasted() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     let lattice = Lattice::aligned([20; 3], DVec3::splat(-1.0), DVec3::splat(2.0 / 19.0)).unwrap();
     let ball = |o: usize| {
@@ -129,7 +129,7 @@ fn the_suggested_sweep_of_data_on_an_offset_can_be_pasted() {
 /// 64-bit integers that become the same floats are told from samples that are the same.
 #[test]
 fn integers_that_floats_do_not_hold_are_told_of() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     let lattice = Lattice::aligned([4; 3], DVec3::ZERO, DVec3::ONE).unwrap();
     let write = |factor: i64| {
@@ -152,7 +152,7 @@ fn integers_that_floats_do_not_hold_are_told_of() {
 
 #[test]
 fn a_headerless_file_may_have_flipped_axes() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     fs::write(dir.join("r.raw"), (0..12).collect::<Vec<u8>>()).unwrap();
     let place = ["--raw-dims", "3,2,2", "--raw-spacing", "-1,2,-3", "--raw-origin", "-7,0,1"];
@@ -172,7 +172,7 @@ fn a_headerless_file_may_have_flipped_axes() {
 /// What Slicer draws mirrored if it is lost.
 #[test]
 fn what_the_axes_mean_goes_from_file_to_file() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.nrrd", "--quiet"]);
     ok(dir, &["export", "b.nrrd", "--space", "ras", "-o", "b.vti", "--quiet"]);
@@ -189,7 +189,7 @@ fn what_the_axes_mean_goes_from_file_to_file() {
 /// Two volumes: a file each and one that names them; every verb that should takes them.
 #[test]
 fn several_volumes_in_one_scene() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     let scene = "[[volume]]\nname = \"a\"\ngenerator = \"bumps\"\nsize = 13\nisovalues = [10, 90]\n\
         [[volume]]\nname = \"b\"\ngenerator = \"sphere\"\nsize = 9\norigin = [0.05, 0.1, 0.02]\nscale = 0.3\n\
@@ -250,7 +250,7 @@ fn several_volumes_in_one_scene() {
 
 #[test]
 fn info_of_a_damaged_bake_is_that_of_its_volume() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     let lattice = Lattice::aligned([3; 3], DVec3::ZERO, DVec3::ONE).unwrap();
     let volume = Volume::new("v", lattice, Samples::F32((0u8..27).map(f32::from).collect())).unwrap();
@@ -275,7 +275,7 @@ fn gaussian() -> (Lattice, Vec<f64>) {
 
 #[test]
 fn isosurfaces_far_outside_the_suggested_sweep_are_where_they_are() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     let (lattice, values) = gaussian();
     npy::write(&dir.join("g.npy"), &lattice, 1, (&Samples::F64(values)).into()).unwrap();
@@ -296,7 +296,7 @@ fn isosurfaces_far_outside_the_suggested_sweep_are_where_they_are() {
 /// Not what happens to be called as a bake's array is.
 #[test]
 fn the_scalars_of_a_volume_are_exported() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     let lattice = Lattice::aligned([2; 3], DVec3::ZERO, DVec3::ONE).unwrap();
     let [density, radiance] = [[1u8, 2, 3, 4, 5, 6, 7, 8], [9; 8]].map(|v| Samples::U8(v.to_vec()));
