@@ -5,6 +5,7 @@
 //! Its headers are not needed.
 
 use std::env;
+use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -21,7 +22,8 @@ fn main() {
     }
 }
 
-/// The short hash of the commit; nothing in a package without git, or one that lies inside a foreign repository.
+/// The short hash of the commit, and one of the sources if they are not the commit's: checkpoints of another program
+/// are refused by it. Nothing in a package without git, or one that lies inside a foreign repository.
 fn commit(root: &Path) -> Option<String> {
     let git = |args: &[&str]| {
         let output = Command::new("git").arg("-C").arg(root).args(args).output().ok()?;
@@ -38,7 +40,27 @@ fn commit(root: &Path) -> Option<String> {
             println!("cargo:rerun-if-changed={}", path.display());
         }
     }
-    git(&["rev-parse", "--short", "HEAD"])
+    let commit = git(&["rev-parse", "--short", "HEAD"])?;
+    let parts = ["src", "wrapper", "Cargo.toml", "Cargo.lock"];
+    parts.iter().for_each(|part| println!("cargo:rerun-if-changed={part}"));
+    let changed = git(&[&["--no-optional-locks", "status", "--porcelain", "--"], &parts[..]].concat())?;
+    if changed.is_empty() {
+        return Some(commit);
+    }
+    let mut hasher = DefaultHasher::new();
+    parts.iter().for_each(|part| hash(&root.join(part), &mut hasher));
+    Some(format!("{commit}+{:08x}", hasher.finish() >> 32))
+}
+
+/// Hashes a file, or all of a folder.
+fn hash(path: &Path, hasher: &mut DefaultHasher) {
+    if let Ok(entries) = path.read_dir() {
+        let mut entries: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).collect();
+        entries.sort();
+        entries.iter().for_each(|entry| hash(entry, hasher));
+    } else {
+        std::fs::read(path).ok().hash(hasher);
+    }
 }
 
 /// The library file to link.

@@ -8,7 +8,7 @@ use isolume::bake::{BakeOptions, BakeSettings, Engine, Preset, bake};
 use isolume::embree::{Device, GraphTracer, SurfaceTracer};
 use isolume::export::bake_file;
 use isolume::field::{Field, Sweep};
-use isolume::fitted_grid::{PULL, Wish, fit};
+use isolume::fitted_grid::{GridFit, Wish};
 use isolume::flattened::Side;
 use isolume::illumination_grid::shepard;
 use isolume::isovalue_axis::IsovalueAxis;
@@ -205,7 +205,8 @@ fn main() {
             "fit",
             Box::new(|| {
                 let free = NodeSet::new(lattice.len(), |o| start.mask[o] != Mask::Empty);
-                drop(black_box(fit(&scene.field, lattice, &wishes, start.radiance.clone(), &free, PULL, &|_| true)));
+                let fit = GridFit::new(&scene.field, lattice, &free, &|_| true);
+                drop(black_box(fit.light(&wishes, start.radiance.clone())));
             }),
         ),
         ("sweep, direct", Box::new(|| swept(8, 64, 1))),

@@ -10,8 +10,8 @@ mod floor;
 mod survey;
 
 pub use belongs::belongs;
-pub use clamped::clamped_variance;
-pub use floor::{interpolation_floor, through_grid, total_floor};
+use clamped::clamped_variance;
+pub use floor::{interpolation_floor, total_floor};
 pub use survey::{Part, Survey, SurveySettings, survey};
 
 use crate::error::{Error, Result};
@@ -164,6 +164,9 @@ pub fn compare(texture: &[DVec3], references: &[ReferenceMesh], exposure: f64) -
     let Some(first) = references.first() else {
         return Err(Error::Invalid("no reference given".into()));
     };
+    if references.len() > 2 {
+        return Err(Error::Invalid(format!("{} references given: noise cancels between two", references.len())));
+    }
     references.iter().try_for_each(ReferenceMesh::check)?;
     let n = first.positions.len();
     if texture.len() != n {

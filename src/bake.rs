@@ -80,7 +80,9 @@ pub struct BakeReport {
     /// The share of all indirect light, up to 1, that further bounces of sweeps would bring or take, as far as that is
     /// known; NaN where it is not.
     pub unsettled: f64,
-    /// Rays and queries per second of the stages that trace them.
+    /// Blocks of work that earlier runs had finished: rays and counts are of all, seconds and instruction set of this.
+    pub resumed_blocks: usize,
+    /// Rays and queries per second of the stages that trace them, NaN of a bake that was resumed.
     pub rays_per_second: f64,
     /// Photons.
     pub photons: PhotonCounts,
@@ -143,14 +145,11 @@ struct Lit {
     seconds: Seconds,
     processor_seconds: Seconds,
     bands: usize,
-    rays: u64,
+    counts: Counts,
     sweep_queries: u64,
     sweep_bounces: usize,
     unsettled: f64,
     photons: PhotonCounts,
-    samples: u64,
-    without_gradient: u64,
-    misses: u64,
 }
 
 impl Lit {
@@ -159,13 +158,6 @@ impl Lit {
         let [wall, processor] = clock.seconds();
         *stage(&mut self.seconds) += wall;
         *stage(&mut self.processor_seconds) += processor;
-    }
-
-    fn count(&mut self, c: Counts) {
-        self.rays += c.rays;
-        self.misses += c.misses;
-        self.samples += c.samples;
-        self.without_gradient += c.without_gradient;
     }
 }
 
@@ -183,8 +175,8 @@ pub fn bake(scene: &Scene, settings: &BakeSettings, device: &Device, progress: P
     bake_resumable(scene, settings, device, progress, None)
 }
 
-/// As [`bake`], keeping finished blocks of the long stages (radiance cache, radiance samples) in `checkpoint` and
-/// taking from there what a run of the same [`job`] finished: with the same bits, counts included.
+/// As [`bake`], keeping finished blocks of the long stages (radiance cache, radiance samples, passes of sweeps) in
+/// `checkpoint` and taking from there what a run of the same [`job`] finished: with the same bits, counts included.
 ///
 /// # Errors
 /// As [`bake`].
@@ -217,6 +209,7 @@ pub fn bake_fields(
     scene.check()?;
     supported(scene, settings)?;
     let digest = digest(&job(scene, settings, &device.version()));
+    let resumed_blocks = checkpoint.map_or(0, Checkpoint::blocks);
     let job = |number: u32| -> Result<Job> {
         let scene = scene.lit(number as usize);
         let lattice = grid_of(&scene, settings)?;
@@ -235,6 +228,11 @@ pub fn bake_fields(
             Engine::Sweep => sweep_engine::light(&group[0], settings, device, progress, checkpoint)?,
         };
         bakes.extend(finish(group, lit, scene.exposure(), &digest, settings, device)?);
+    }
+    if resumed_blocks > 0 {
+        for Bake { report, .. } in &mut bakes {
+            (report.resumed_blocks, report.rays_per_second) = (resumed_blocks, f64::NAN);
+        }
     }
     Ok(bakes)
 }
@@ -363,17 +361,18 @@ fn finish(
             seconds: s,
             processor_seconds: lit.processor_seconds,
             bands: lit.bands,
-            rays: lit.rays,
+            rays: lit.counts.rays,
             sweep_queries: lit.sweep_queries,
             sweep_bounces: lit.sweep_bounces,
             unsettled: lit.unsettled,
-            rays_per_second: (lit.rays + lit.sweep_queries) as f64 / (s.photons + s.cache + s.sweep + s.samples),
+            resumed_blocks: 0,
+            rays_per_second: (lit.counts.rays + lit.sweep_queries) as f64 / (s.photons + s.cache + s.sweep + s.samples),
             photons: lit.photons,
-            samples: lit.samples,
-            samples_without_gradient: lit.without_gradient,
+            samples: lit.counts.samples,
+            samples_without_gradient: lit.counts.without_gradient,
             masked: empty + filled,
             filled,
-            misses: lit.misses,
+            misses: lit.counts.misses,
             non_finite,
             non_finite_voxels: job.scene.field.samples().par_iter().filter(|s| !s.is_finite()).count() as u64,
             threads: rayon::current_num_threads(),

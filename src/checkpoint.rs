@@ -128,12 +128,12 @@ impl Checkpoint {
         Ok(Self { path: path.to_path_buf(), job, every, state: Mutex::new(state) })
     }
 
-    /// Reads the blocks that an interrupted run of the same job left. False if there is no file. Half-written files of
-    /// killed runs are removed.
+    /// Reads the blocks that an interrupted run of the same job left, up to the first that is damaged. False if there
+    /// is no file. Half-written files of killed runs are removed.
     ///
     /// # Errors
-    /// `Io`; `Invalid` if another checkpoint holds the file, or if it is damaged, of another version or of another job;
-    /// the message names the first difference.
+    /// `Io`; `Invalid` if another checkpoint holds the file, if its beginning is damaged, or if it is of another
+    /// version or of another job; the message names the first difference.
     pub fn resume(&self) -> Result<bool> {
         atomic::remove_orphans(&self.path);
         if !self.path.exists() {
@@ -198,6 +198,11 @@ impl Checkpoint {
             let again = |key: &&Key| s.log.as_ref().is_some_and(|log| log.blocks.contains_key(key));
             written + s.waiting.len() - s.waiting.keys().filter(again).count()
         })
+    }
+
+    /// Bytes of the file that [`Checkpoint::resume`] found damaged, with all that stood behind them.
+    pub fn damaged(&self) -> u64 {
+        self.state.lock().map_or(0, |s| s.log.as_ref().map_or(0, |log| log.damaged))
     }
 
     fn put(&self, key: Key, bytes: Vec<u8>) {
@@ -363,7 +368,7 @@ mod tests {
     }
 
     #[test]
-    fn any_damage_is_seen_and_a_missing_end_costs_only_its_blocks() {
+    fn damage_and_a_missing_end_cost_only_the_blocks_from_there_on() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.checkpoint");
         let first = Checkpoint::new(&path, job(1), Duration::ZERO).unwrap();
@@ -402,8 +407,17 @@ mod tests {
             }
             let mut bad = bytes.clone();
             bad[n] ^= 0x10;
-            assert!(resumed(&bad).is_none(), "bit of byte {n}");
+            let Some(bad) = resumed(&bad) else {
+                assert!(n < start, "bit of byte {n}");
+                continue;
+            };
+            let left = ends.iter().filter(|&&e| e <= n).count() - 1;
+            assert_eq!(held(&bad), whole.clone().into_iter().take(left).collect(), "bit of byte {n}");
+            assert_eq!(bad.damaged(), (bytes.len() - ends[left]) as u64, "bit of byte {n}");
         }
+        // What some file systems leave when the power fails.
+        let padded = resumed(&[&bytes[..], &[0; 4096]].concat()).unwrap();
+        assert_eq!((held(&padded), padded.damaged()), (whole, 4096));
     }
 
     #[test]

@@ -12,6 +12,8 @@ mod init;
 mod reference;
 mod render;
 mod selftest;
+#[cfg(unix)]
+mod signals;
 mod study;
 mod view;
 
@@ -19,7 +21,7 @@ use crate::embree::Device;
 use crate::error::{Error, Result};
 use crate::export::bake_file::BakeSummary;
 use crate::isa::Isa;
-use crate::progress::{self, Progress, say};
+use crate::progress::{Progress, say};
 use crate::scene_file::{self, Inputs, RawOptions};
 use crate::series::is_pattern;
 use crate::volume::Volume;
@@ -28,7 +30,6 @@ use crate::volume::vti::VtiFile;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
 
 /// Global illumination for every isosurface of a volume at once.
 #[derive(Parser, Debug)]
@@ -123,9 +124,6 @@ struct Info {
 /// More are of no use to any machine, and take long to start.
 const MOST_THREADS: usize = 1024;
 
-/// Signals this close to each other are one.
-const TOGETHER: Duration = Duration::from_millis(500);
-
 /// `-.5` as `-0.5`, which clap knows for a number.
 fn spelt_out(argument: OsString) -> OsString {
     match argument.to_str().and_then(|text| text.strip_prefix("-.").filter(|_| text.parse::<f64>().is_ok())) {
@@ -168,15 +166,8 @@ impl Cli {
         if let Some(name) = &self.isa {
             Isa::from_name(name)?.choose();
         }
-        // Another signal ends the process at once; not one that came with the first, as `timeout` and shells send them
-        // to a process and to its group.
-        let mut first: Option<Instant> = None;
-        let _ = ctrlc::set_handler(move || {
-            if first.get_or_insert_with(Instant::now).elapsed() > TOGETHER {
-                std::process::exit(130);
-            }
-            progress::interrupt();
-        });
+        #[cfg(unix)]
+        signals::heed();
         let progress = if self.quiet { Progress::Quiet } else { Progress::Shown };
         match self.verb {
             Verb::Info(v) => v.run(),

@@ -8,6 +8,7 @@
 //! matrix-free.
 
 use crate::field::Field;
+use crate::illumination_grid::IlluminationGrid;
 use crate::node_set::NodeSet;
 use crate::radiance::RadianceSample;
 use crate::rng::Stage;
@@ -17,7 +18,7 @@ use rayon::prelude::*;
 
 /// Strength of the pull towards the start, in units of the mean weight that samples put on a node, for samples as bakes
 /// have them: noise of theirs that it holds back outweighs what it blurs. 0.01 lets noise through, 1 blurs.
-pub const PULL: f32 = 0.2;
+const PULL: f32 = 0.2;
 /// Conjugate-gradient steps at most, and the share of the residual's square (as preconditioned) at which they end:
 /// the samples' noise is far above.
 const STEPS: usize = 16;
@@ -69,25 +70,124 @@ impl Placed {
     }
 }
 
-/// Improves `start`, light at the points of `lattice` (Shepard's, say), by the least-squares fit described above at the
-/// nodes that `free` holds; the others stay as they are. `pull` as [`PULL`]. The result does not depend on the number
-/// of threads. Beside the grid it takes 84 bytes per free node and 114 per sample.
-pub fn fit(
-    field: &Field,
-    lattice: &Lattice,
-    samples: &[Wish],
-    mut start: Vec<[f32; 3]>,
-    free: &NodeSet,
+/// The least-squares fit described above. Its result does not depend on the number of threads.
+#[derive(Clone, Copy)]
+#[allow(missing_debug_implementations, reason = "holds a function")]
+pub struct GridFit<'a> {
+    field: &'a Field,
+    lattice: &'a Lattice,
+    /// The nodes that are fitted; the others stay as they are.
+    free: &'a NodeSet,
+    /// As [`PULL`].
     pull: f32,
-    tick: &(dyn Fn(u64) -> bool + Sync),
-) -> Vec<[f32; 3]> {
-    let fitted = solve(&Sorted::new(field, lattice, samples), &|o| Vec3::from_array(start[o]), free, pull, tick);
-    tick(lattice.len() as u64);
-    for (o, light) in free.members(0..lattice.len()).zip(fitted) {
-        // Light is not negative, but a fit through noise may be.
-        start[o] = light.max(Vec3::ZERO).to_array();
+    tick: &'a (dyn Fn(u64) -> bool + Sync),
+}
+
+impl<'a> GridFit<'a> {
+    /// A fit of light at the nodes of `lattice` that `free` holds. `tick(n)` reports n nodes done; returning false
+    /// stops early.
+    pub fn new(
+        field: &'a Field,
+        lattice: &'a Lattice,
+        free: &'a NodeSet,
+        tick: &'a (dyn Fn(u64) -> bool + Sync),
+    ) -> Self {
+        Self { field, lattice, free, pull: PULL, tick }
     }
-    start
+
+    /// Improves `start`, light at the nodes (Shepard's, say). Beside the grid it takes 84 bytes per free node and 114
+    /// per sample.
+    pub fn light(&self, samples: &[Wish], mut start: Vec<[f32; 3]>) -> Vec<[f32; 3]> {
+        let fitted = self.solve(samples, &|o| Vec3::from_array(start[o]));
+        (self.tick)(self.lattice.len() as u64);
+        for (o, light) in self.free.members(0..self.lattice.len()).zip(fitted) {
+            // Light is not negative, but a fit through noise may be.
+            start[o] = light.max(Vec3::ZERO).to_array();
+        }
+        start
+    }
+
+    /// The variance of what [`GridFit::light`] makes of the nodes, in rising order, if `errors` are [`draws`] of the
+    /// samples' errors instead of their light and `start` tells those of the nodes that it started from. From samples
+    /// in a cell's corner the fit extrapolates, and enlarges them. It is linear, so errors go through it as light does;
+    /// three draws know the variance of one node to about 4/5, that of many nodes' light well.
+    pub(crate) fn variances(&self, errors: &[Wish], start: &(dyn Fn(usize) -> Vec3 + Sync)) -> Vec<f32> {
+        let fitted = self.solve(errors, start);
+        fitted.into_iter().map(|draws| draws.length_squared() / 3.0).collect()
+    }
+
+    /// Improves a grid that blends `samples`, and its standard errors.
+    pub(crate) fn improve(&self, grid: &mut IlluminationGrid, samples: Vec<RadianceSample>) {
+        let mut wishes: Vec<Wish> = samples.iter().map(Wish::from).collect();
+        let errors: Vec<f32> = samples.iter().map(|s| s.variance.sqrt()).collect();
+        drop(samples);
+        grid.radiance = self.light(&wishes, std::mem::take(&mut grid.radiance));
+        for ((n, wish), &error) in (0..).zip(&mut wishes).zip(&errors) {
+            wish.light = draws(n, error);
+        }
+        let start = |o: usize| draws((errors.len() + o) as u64, grid.std_error[o]);
+        let variances = self.variances(&wishes, &start);
+        for (o, variance) in self.free.members(0..self.lattice.len()).zip(variances) {
+            if grid.std_error[o].is_finite() {
+                grid.std_error[o] = variance.sqrt();
+            }
+        }
+    }
+
+    /// Light at the nodes that are fitted, in rising order: what `start` tells of all nodes, made to fit the samples.
+    fn solve(&self, samples: &[Wish], start: &(dyn Fn(usize) -> Vec3 + Sync)) -> Vec<Vec3> {
+        let Self { field, lattice, free, pull, tick } = *self;
+        let sorted = &Sorted::new(field, lattice, samples);
+        let [nx, ny, nz] = sorted.dims;
+        let nodes = || free.members(0..nx * ny * nz);
+        if free.is_empty() || sorted.samples.is_empty() {
+            return nodes().map(start).collect();
+        }
+        // Σ φ w, the row sums of the normal equations: preconditioner, and the scale of the pull.
+        let diagonal: Vec<f32> =
+            sorted.gather(free, |n| Vec3::splat(sorted.samples[n].weight)).iter().map(|d| d.x).collect();
+        let seen = diagonal.par_iter().filter(|d| **d > 0.0).count().max(1);
+        let pull = pull * diagonal.iter().map(|d| f64::from(*d)).sum::<f64>() as f32 / seen as f32;
+        // What each sample's cell says, from the values of its nodes two by two along x.
+        let each = |pair: &(dyn Fn(usize) -> [Vec3; 2] + Sync)| -> Vec<Vec3> {
+            sorted.samples.par_iter().with_min_len(1024).map(|s| sorted.value(s, pair)).collect()
+        };
+        let apply = |x: &[Vec3]| -> Vec<Vec3> {
+            let said = each(&|o| free.pair(o).map(|slot| slot.map_or(Vec3::ZERO, |slot| x[slot])));
+            let mut y = sorted.gather(free, |n| sorted.samples[n].weight * said[n]);
+            y.par_iter_mut().zip(x).for_each(|(y, x)| *y += pull * *x);
+            y
+        };
+        // A x = b with x = start + d: r = Σ w φ (r_j − interpolated start).
+        let mut r = {
+            let said = each(&|o| [o, o + 1].map(start));
+            sorted.gather(free, |n| sorted.samples[n].weight * (sorted.samples[n].light - said[n]))
+        };
+        let mut d = vec![Vec3::ZERO; free.len()];
+        let precondition = |r: &[Vec3]| -> Vec<Vec3> {
+            r.par_iter().zip(&diagonal).map(|(r, d)| *r / (d + pull).max(f32::MIN_POSITIVE)).collect()
+        };
+        let mut z = precondition(&r);
+        let mut p = z.clone();
+        let mut rz = dot(&r, &z);
+        let first = rz;
+        for _ in 0..STEPS {
+            if !tick(0) || !rz.cmpgt(SETTLED * first).any() {
+                break;
+            }
+            let q = apply(&p);
+            let alpha = divide(rz, dot(&p, &q));
+            d.par_iter_mut().zip(&p).for_each(|(d, p)| *d += alpha * *p);
+            r.par_iter_mut().zip(&q).for_each(|(r, q)| *r -= alpha * *q);
+            z = precondition(&r);
+            let next = dot(&r, &z);
+            let beta = divide(next, rz);
+            p.par_iter_mut().zip(&z).for_each(|(p, z)| *p = *z + beta * *p);
+            rz = next;
+        }
+        d.iter_mut().zip(nodes()).for_each(|(d, o)| *d += start(o));
+        d
+    }
 }
 
 /// Three draws of an error with mean 0 and this standard deviation; equal `index`, equal signs. None where it is not
@@ -99,88 +199,11 @@ pub(crate) fn draws(index: u64, deviation: f32) -> Vec3 {
     Vec3::from_array([0, 1, 2].map(|n| if bits >> n & 1 == 0 { deviation } else { -deviation }))
 }
 
-/// The variance of what [`fit`] with the same `pull` makes of the nodes that `free` holds, in rising order, if `errors`
-/// are [`draws`] of the samples' errors instead of their light and `start` tells those of the nodes that it started
-/// from. From samples in a cell's corner the fit extrapolates, and enlarges them. It is linear, so errors go through it
-/// as light does; three draws know the variance of one node to about 4/5, that of many nodes' light well. Takes what
-/// [`fit`] takes.
-pub(crate) fn fitted_variance(
-    field: &Field,
-    lattice: &Lattice,
-    errors: &[Wish],
-    start: &(dyn Fn(usize) -> Vec3 + Sync),
-    free: &NodeSet,
-    pull: f32,
-    tick: &(dyn Fn(u64) -> bool + Sync),
-) -> Vec<f32> {
-    let fitted = solve(&Sorted::new(field, lattice, errors), start, free, pull, tick);
-    fitted.into_iter().map(|draws| draws.length_squared() / 3.0).collect()
-}
-
-/// Light at the nodes that `free` holds, in rising order: what `start` tells of all nodes, made to fit the samples.
-fn solve(
-    sorted: &Sorted,
-    start: &(dyn Fn(usize) -> Vec3 + Sync),
-    free: &NodeSet,
-    pull: f32,
-    tick: &(dyn Fn(u64) -> bool + Sync),
-) -> Vec<Vec3> {
-    let [nx, ny, nz] = sorted.dims;
-    let nodes = || free.members(0..nx * ny * nz);
-    if free.is_empty() || sorted.samples.is_empty() {
-        return nodes().map(start).collect();
-    }
-    // Diagonal of the normal equations: preconditioner, and the scale of the pull.
-    let diagonal: Vec<f32> =
-        sorted.gather(free, |n| Vec3::splat(sorted.samples[n].weight)).iter().map(|d| d.x).collect();
-    let seen = diagonal.par_iter().filter(|d| **d > 0.0).count().max(1);
-    let pull = pull * diagonal.iter().map(|d| f64::from(*d)).sum::<f64>() as f32 / seen as f32;
-    // What each sample's cell says, from the values of its nodes two by two along x.
-    let each = |pair: &(dyn Fn(usize) -> [Vec3; 2] + Sync)| -> Vec<Vec3> {
-        sorted.samples.par_iter().with_min_len(1024).map(|s| sorted.value(s, pair)).collect()
-    };
-    let apply = |x: &[Vec3]| -> Vec<Vec3> {
-        let said = each(&|o| free.pair(o).map(|slot| slot.map_or(Vec3::ZERO, |slot| x[slot])));
-        let mut y = sorted.gather(free, |n| sorted.samples[n].weight * said[n]);
-        y.par_iter_mut().zip(x).for_each(|(y, x)| *y += pull * *x);
-        y
-    };
-    // A x = b with x = start + d: r = Σ w φ (r_j − interpolated start).
-    let mut r = {
-        let said = each(&|o| [o, o + 1].map(start));
-        sorted.gather(free, |n| sorted.samples[n].weight * (sorted.samples[n].light - said[n]))
-    };
-    let mut d = vec![Vec3::ZERO; free.len()];
-    let precondition = |r: &[Vec3]| -> Vec<Vec3> {
-        r.par_iter().zip(&diagonal).map(|(r, d)| *r / (d + pull).max(f32::MIN_POSITIVE)).collect()
-    };
-    let mut z = precondition(&r);
-    let mut p = z.clone();
-    let mut rz = dot(&r, &z);
-    let first = rz;
-    for _ in 0..STEPS {
-        if !tick(0) || !rz.cmpgt(SETTLED * first).any() {
-            break;
-        }
-        let q = apply(&p);
-        let alpha = divide(rz, dot(&p, &q));
-        d.par_iter_mut().zip(&p).for_each(|(d, p)| *d += alpha * *p);
-        r.par_iter_mut().zip(&q).for_each(|(r, q)| *r -= alpha * *q);
-        z = precondition(&r);
-        let next = dot(&r, &z);
-        let beta = divide(next, rz);
-        p.par_iter_mut().zip(&z).for_each(|(p, z)| *p = *z + beta * *p);
-        rz = next;
-    }
-    d.iter_mut().zip(nodes()).for_each(|(d, o)| *d += start(o));
-    d
-}
-
 /// Sums per channel in f64, in fixed blocks.
 fn dot(a: &[Vec3], b: &[Vec3]) -> DVec3 {
     a.par_chunks(1 << 14)
         .zip(b.par_chunks(1 << 14))
-        .map(|(a, b)| a.iter().zip(b).fold(DVec3::ZERO, |s, (a, b)| s + (*a * *b).as_dvec3()))
+        .map(|(a, b)| a.iter().zip(b).fold(DVec3::ZERO, |s, (a, b)| s + a.as_dvec3() * b.as_dvec3()))
         .collect::<Vec<_>>()
         .into_iter()
         .sum()
@@ -273,7 +296,7 @@ impl Sorted {
 mod tests {
     use super::*;
     use crate::field::Sweep;
-    use crate::illumination_grid::{IlluminationGrid, shepard};
+    use crate::illumination_grid::shepard;
     use crate::mask::{Mask, masks};
     use crate::rng::{Rng, Sobol};
     use crate::volume::{Samples, Volume};
@@ -312,8 +335,8 @@ mod tests {
         let wishes: Vec<Wish> = samples.iter().map(Wish::from).collect();
         let free = NodeSet::new(field.lattice().len(), |o| start.mask[o] != Mask::Empty);
         let with = |pull: f32| {
-            let radiance = start.radiance.clone();
-            let radiance = fit(&field, field.lattice(), &wishes, radiance, &free, pull, &|_| true);
+            let fit = GridFit { pull, ..GridFit::new(&field, field.lattice(), &free, &|_| true) };
+            let radiance = fit.light(&wishes, start.radiance.clone());
             error(&IlluminationGrid { radiance, ..start.clone() })
         };
         // These samples have no noise.
@@ -321,6 +344,34 @@ mod tests {
         println!("RMS error: Shepard {before}, fitted {after}, held against noise {held}");
         assert!(before > 0.02 && after < 0.2 * before, "Shepard {before}, fitted {after}");
         assert!(held < 0.5 * before, "Shepard {before}, fitted {held}");
+    }
+
+    /// Light and lengths in any unit: the same fit, times the unit.
+    #[test]
+    fn the_fit_has_no_unit() {
+        let fitted = |spacing: f64, unit: f32| {
+            let lattice = Lattice::aligned([7; 3], DVec3::ZERO, DVec3::splat(spacing)).unwrap();
+            let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[0] as f32).collect();
+            let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
+            let field = Field::new(&volume, Sweep::new(0.0, 6.0).unwrap()).unwrap();
+            let free = NodeSet::new(lattice.len(), |_| true);
+            let mut rng = Rng::stream(3, Stage::Test, 0);
+            let mut next = || rng.unit() as f32;
+            let wishes: Vec<Wish> = (0..3000)
+                .map(|_| {
+                    let position = 6.0 * Vec3::new(next(), next(), next());
+                    Wish { position, light: Vec3::splat(unit * (1.0 + position.y)), weight: 1.0 }
+                })
+                .collect();
+            GridFit::new(&field, &lattice, &free, &|_| true).light(&wishes, vec![[0.0; 3]; lattice.len()])
+        };
+        let plain = fitted(1.0, 1.0);
+        // Nanometres in metres, and as much light as is taken.
+        for (spacing, unit) in [(1e-9, 1e18), (1e9, 1e-15)] {
+            for (a, b) in plain.iter().zip(fitted(spacing, unit)) {
+                assert!((a[1] - b[1] / unit).abs() < 1e-4 * a[1], "{spacing} {unit}: {} {}", a[1], b[1] / unit);
+            }
+        }
     }
 
     /// Samples in one corner of their cells and nodes that are fixed, all with errors: the variance of many fits is
@@ -347,21 +398,14 @@ mod tests {
         };
         let node = |o: usize| 0.03 + 0.02 * (o % 3) as f32;
         let drawn = |o: usize| draws((at.len() + o) as u64, node(o));
-        let said = fitted_variance(
-            &field,
-            &lattice,
-            &wishes(&mut |n| draws(n as u64, errors[n])),
-            &drawn,
-            &free,
-            PULL,
-            &|_| true,
-        );
+        let fit = GridFit::new(&field, &lattice, &free, &|_| true);
+        let said = fit.variances(&wishes(&mut |n| draws(n as u64, errors[n])), &drawn);
         let mut normal = |deviation: f32| Vec3::from_array([(); 3].map(|()| 5.0 + deviation * rng.normal() as f32));
         let mut found = vec![0.0; said.len()];
         const FITS: usize = 40;
         for _ in 0..FITS {
             let start = (0..lattice.len()).map(|o| normal(node(o)).to_array()).collect();
-            let light = fit(&field, &lattice, &wishes(&mut |n| normal(errors[n])), start, &free, PULL, &|_| true);
+            let light = fit.light(&wishes(&mut |n| normal(errors[n])), start);
             for (found, o) in found.iter_mut().zip(free.members(0..lattice.len())) {
                 *found += (Vec3::from_array(light[o]) - 5.0).length_squared() / (3 * FITS) as f32;
             }

@@ -1,5 +1,6 @@
-//! The illumination grid: radiance at the points of a regular lattice over Ω, by modified Shepard interpolation of
-//! scattered samples. Linear interpolation of it is what every viewer does with a 3D texture.
+//! The illumination grid: radiance at the points of a regular lattice over Ω, of samples at the points themselves or,
+//! by modified Shepard interpolation, of scattered ones. Linear interpolation of it is what every viewer does with a
+//! 3D texture.
 
 use crate::error::{Error, Result};
 use crate::field::Field;
@@ -155,25 +156,8 @@ impl IlluminationGrid {
     /// What `values` of the points, three channels each, say between them; `None` where none of the points holds
     /// something.
     fn between<const N: usize>(&self, lattice: &Lattice, p: DVec3, values: [&[[f32; 3]]; N]) -> Option<[DVec3; N]> {
-        let far = lattice.far();
-        let p = p.clamp(DVec3::ZERO, far);
-        let base = p.floor().min(far - 1.0);
-        let u = p - base;
-        let cell = [base.x, base.y, base.z].map(|x| {
-            #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "inside the lattice")]
-            let i = x as usize;
-            i
-        });
         let (mut sums, mut weight) = ([DVec3::ZERO; N], 0.0);
-        for corner in 0..8 {
-            let [x, y, z] = [corner & 1, corner >> 1 & 1, corner >> 2];
-            let o = lattice.offset(cell[0] + x, cell[1] + y, cell[2] + z);
-            if self.mask[o] == Mask::Empty {
-                continue;
-            }
-            let w = (if x == 1 { u.x } else { 1.0 - u.x })
-                * (if y == 1 { u.y } else { 1.0 - u.y })
-                * (if z == 1 { u.z } else { 1.0 - u.z });
+        for (o, w) in lattice.around(p).into_iter().filter(|(o, _)| self.mask[*o] != Mask::Empty) {
             sums.iter_mut().zip(values).for_each(|(sum, v)| *sum += w * DVec3::from_array(v[o].map(f64::from)));
             weight += w;
         }

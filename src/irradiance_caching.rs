@@ -16,7 +16,7 @@ use crate::radiance::RadianceSample;
 use crate::scene::Scene;
 use crate::split::share;
 use crate::volume::Lattice;
-use glam::{DVec3, Vec3};
+use glam::{DVec3, DVec4, Vec3};
 use rayon::prelude::*;
 
 /// Volume of a ball of radius 1.
@@ -74,7 +74,7 @@ pub fn interpolate(
         let indirect = around.indirect(normal.unwrap_or_default().as_vec3());
         let albedo = scene.surface.albedo.at(field.value(p).clamp(0.0, 1.0));
         let radiance = reflected(albedo, (direct + indirect).max(DVec3::ZERO)) + scene.surface.emission;
-        (radiance.as_vec3().to_array(), around.std_error())
+        (radiance.as_vec3().to_array(), around.std_error(normal.unwrap_or_default().as_vec3()))
     })
 }
 
@@ -148,18 +148,33 @@ impl<'a> Around<'a> {
 
     /// Indirect irradiance of a point with unit `normal`.
     fn indirect(&self, normal: Vec3) -> DVec3 {
-        let faces = |k: &Known| k.normal.dot(normal) >= CONE;
-        let few = self.each().filter(|(.., k)| faces(k)).take(FEW).count() < FEW;
-        self.fit(|k| f32::from(u8::from(few || faces(k))), |k| k.indirect)
+        self.fit(self.facing(normal), |k| k.indirect)
     }
 
-    /// Standard error of the kernel's mean.
-    fn std_error(&self) -> f32 {
-        let (mut variance, mut weights) = (0.0, 0.0);
-        for (_, w, k) in self.each() {
-            (variance, weights) = (variance + w * w * k.variance, weights + w);
+    /// 1 for samples that face nearly as a point with unit `normal` does, or for all where those are few; 0 for others.
+    fn facing(&self, normal: Vec3) -> impl Fn(&Known) -> f32 {
+        let faces = move |k: &Known| k.normal.dot(normal) >= CONE;
+        let few = self.each().filter(|(.., k)| faces(k)).take(FEW).count() < FEW;
+        move |k| f32::from(u8::from(few || faces(k)))
+    }
+
+    /// Standard error at a point with unit `normal`, as if all of the samples' were of indirect light.
+    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
+    fn std_error(&self, normal: Vec3) -> f32 {
+        let counts = self.facing(normal);
+        let each = || self.each().map(|(d, kernel, k)| (d, kernel * counts(k), k.variance));
+        let mut matrix = NormalMatrix::default();
+        each().for_each(|(d, w, _)| matrix.add(w, d));
+        if matrix.weight() <= 0.0 {
+            return 0.0;
         }
-        if weights > 0.0 { variance.sqrt() / weights } else { 0.0 }
+        // What the fit's value at the point takes of each sample.
+        let g = matrix.at_origin();
+        let taken = each().filter(|e| e.1 > 0.0).map(|(d, w, variance)| {
+            let share = f64::from(w) * g.dot(DVec4::new(1.0, d.x.into(), d.y.into(), d.z.into()));
+            share * share * f64::from(variance)
+        });
+        taken.sum::<f64>().sqrt() as f32
     }
 }
 
@@ -273,5 +288,39 @@ mod tests {
             let expected = if *m == Mask::Empty { Vec3::ZERO } else { expected };
             assert!((Vec3::from_array(*r) - expected).length() < 1e-5, "{r:?}");
         }
+    }
+
+    /// Samples in one half of space, with errors: the spread of many grids is what one tells, beyond them, too.
+    #[test]
+    fn errors_go_through_the_fits() {
+        const GRIDS: usize = 40;
+        let scene = scene(DVec3::length);
+        let (lattice, masks) = (scene.lattice(), masks(&scene.field, scene.lattice()));
+        let mut all = samples(&scene, |_| 1.0, |_, _| 1.0);
+        all.retain(|s| s.position.x < 6.5);
+        let over_pi = scene.surface.albedo.at(0.5).x / std::f64::consts::PI;
+        let mut rng = crate::rng::Rng::stream(1, Stage::Test, 0);
+        let near = |o: &usize| masks[*o] != Mask::Empty && lattice.ijk(*o)[0] < 9;
+        let points: Vec<usize> = (0..lattice.len()).filter(near).collect();
+        let (mut sums, mut told) = (vec![[0.0; 2]; points.len()], 0.0);
+        for _ in 0..GRIDS {
+            let mut noisy = all.clone();
+            for s in &mut noisy {
+                let off = 0.1 * rng.normal();
+                s.indirect = s.indirect.map(|e| e + off as f32);
+                s.radiance += (over_pi * off) as f32;
+                s.variance = (over_pi * 0.1).powi(2) as f32;
+            }
+            let grid = interpolate(&scene, Side::Lower, lattice, &masks, &noisy, 16, &|_| true);
+            for (sum, &o) in sums.iter_mut().zip(&points) {
+                let x = f64::from(grid.radiance[o][1]);
+                (sum[0], sum[1]) = (sum[0] + x, sum[1] + x * x);
+                told += f64::from(grid.std_error[o]).powi(2) / (GRIDS * points.len()) as f64;
+            }
+        }
+        let n = GRIDS as f64;
+        let spread = sums.iter().map(|[x, xx]| (xx - x * x / n) / (n - 1.0)).sum::<f64>() / points.len() as f64;
+        println!("{} points, spread {:.5}, told {:.5}", points.len(), spread.sqrt(), told.sqrt());
+        assert!(((told / spread).sqrt() - 1.0).abs() < 0.1, "{} {}", told.sqrt(), spread.sqrt());
     }
 }

@@ -188,8 +188,7 @@ pub fn reference<T: Tracer>(
                 &PhotonSettings {
                     count: (settings.photons / u64::from(batches)).max(1),
                     max_bounces: u16::MAX,
-                    // Streams of batches must differ in the seed: photons are keyed by nothing else.
-                    seed: settings.seed.wrapping_mul(0x1_0000_0001).wrapping_add(batch << 32),
+                    seed: seed_of(settings.seed, batch),
                     axis: IsovalueAxis::EVEN,
                     fixed_isovalue: Some(isovalue),
                 },
@@ -242,4 +241,8 @@ pub fn reference<T: Tracer>(
         out.sampled[v] = true;
     }
     Ok(out)
+}
+/// The seed of a batch: photons are keyed by nothing else.
+fn seed_of(seed: u64, batch: u64) -> u64 {
+    Rng::stream(seed, Stage::Photon, u64::MAX - batch).bits()
 }

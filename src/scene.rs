@@ -366,7 +366,8 @@ pub(crate) fn check_edges(lattice: &Lattice) -> Result<()> {
 pub fn cornell_box(lattice: &Lattice, margin: f64) -> Result<Vec<Polygon>> {
     if !(0.0..=MOST_MARGIN).contains(&margin) {
         return Err(Error::Invalid(format!(
-            "box margin {margin}: must be a fraction of the volume's edges, 0 to {MOST_MARGIN}"
+            "box margin {}: must be a fraction of the volume's edges, 0 to {MOST_MARGIN}",
+            Shortest(margin)
         )));
     }
     check_edges(lattice)?;

@@ -9,7 +9,7 @@ mod table;
 pub use curve::curve;
 pub use datasets::datasets;
 pub use strategies::strategies;
-pub use table::Table;
+use table::Table;
 
 use crate::accuracy::{Accuracy, ReferenceMesh, compare};
 use crate::bake::{Bake, BakeOptions, BakeSettings, Engine, bake, digest, scene_job, settings_job};
@@ -20,6 +20,7 @@ use crate::progress::{Progress, processor_seconds, say};
 use crate::reference::{Origin, ReferenceSettings, VERSION, reference};
 use crate::scene::Scene;
 use crate::surface_mesh::SurfaceMesh;
+use crate::volume::generate::bumps;
 use glam::DVec3;
 use rayon::prelude::*;
 use std::path::PathBuf;
@@ -64,7 +65,7 @@ impl Subject {
 
     /// The isovalue reported first.
     pub fn main_isovalue(&self) -> f64 {
-        self.isovalue.unwrap_or_else(|| self.at((47.0 - 3.6) / 91.4))
+        self.isovalue.unwrap_or_else(|| self.at(bumps::fraction(47.0)))
     }
 }
 

@@ -59,6 +59,7 @@ use direct::Direct;
 pub(crate) use fans::seen;
 use flats::Flats;
 pub(crate) use flats::texels;
+pub(crate) use gather::workspace;
 use glam::DVec3;
 use grid::Geometry;
 use lit_rows::LitRows;
@@ -83,8 +84,8 @@ pub struct SweepSettings {
     pub max_bounces: usize,
     /// The share of indirect light that may be missing when the bounces stop; rounding ends below 1e-4.
     pub target: f64,
-    /// Repetitions with random numbers of their own, averaged; 4 or more give a standard error. Their directions and
-    /// luminaire points are parts of one low-discrepancy set.
+    /// Repetitions with random numbers of their own, averaged; two or more give a standard error, which 4, 8 … know
+    /// better. Their directions and luminaire points are parts of one low-discrepancy set.
     pub replicates: usize,
     /// Texels along the longer edge of a wall, and isovalues of its texture.
     pub flat_resolution: (usize, usize),
@@ -156,9 +157,10 @@ pub struct SweepCounts {
     pub families: u64,
     /// Nodes that hold a surface of the sweep.
     pub valid: u64,
-    /// Nodes that do not.
-    pub masked: u64,
 }
+
+/// Points along an axis that a sweep takes.
+const MOST_ALONG: usize = 1 << 19;
 
 /// Polygons that a sweep takes.
 pub const MOST_POLYGONS: usize = 256;
@@ -185,6 +187,11 @@ pub fn supported(scene: &Scene) -> Result<()> {
         )));
     }
     let [nx, ny, nz] = scene.lattice().dims();
+    if nx.max(ny).max(nz) > MOST_ALONG {
+        return Err(Error::NotSupported(format!(
+            "{nx}×{ny}×{nz} points: sweeps take {MOST_ALONG} along an axis at most; take a coarser grid or --engine photon"
+        )));
+    }
     if !numbered([nx, ny, nz]) {
         return Err(Error::NotSupported(format!(
             "{nx}×{ny}×{nz} points: sweeps number points in 31 bits; take a coarser grid or --engine photon"
@@ -268,7 +275,6 @@ pub fn sweep_resumable(
         let nodes = geometry.h.len();
         state.counts.valid =
             (0..nodes).into_par_iter().with_min_len(1 << 14).filter(|&at| geometry.valid(at)).count() as u64;
-        state.counts.masked = nodes as u64 - state.counts.valid;
     }
     let spare = Spare::default();
     let isa = Isa::current();

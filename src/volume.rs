@@ -194,6 +194,23 @@ impl Lattice {
         std::array::from_fn(|n| self.far() * DVec3::from_array([n & 1, n >> 1 & 1, n >> 2].map(|i| i as f64)))
     }
 
+    /// The points of the cell around index coordinates `p`, of Ω's nearest if that is outside, with the weights of
+    /// trilinear interpolation; x fastest.
+    #[inline]
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "inside the lattice")]
+    pub fn around(&self, p: DVec3) -> [(usize, f64); 8] {
+        let far = self.far();
+        let p = p.clamp(DVec3::ZERO, far);
+        let base = p.floor().min(far - 1.0);
+        let (u, v) = (p - base, DVec3::ONE - (p - base));
+        let cell = base.to_array().map(|x| x as usize);
+        std::array::from_fn(|n| {
+            let [x, y, z] = [n & 1, n >> 1 & 1, n >> 2];
+            let w = [v.x, u.x][x] * [v.y, u.y][y] * [v.z, u.z][z];
+            (self.offset(cell[0] + x, cell[1] + y, cell[2] + z), w)
+        })
+    }
+
     /// Whether index coordinates lie in Ω, or as near as rounding puts what stands on its faces (10⁻⁶ of a step).
     #[inline]
     pub fn holds(&self, p: DVec3) -> bool {

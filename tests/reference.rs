@@ -11,7 +11,9 @@ use isolume::field::{Field, Sweep};
 use isolume::flattened::{Departure, FlattenedRay, Side, Target};
 use isolume::illumination_grid::GridSize;
 use isolume::polygon::Polygon;
-use isolume::reference::{Integrator, PathTracer, ReferenceSettings, reference, subset};
+use isolume::progress::Progress;
+use isolume::reference::{Integrator, PathTracer, ReferenceSettings, path_picture, reference, subset};
+use isolume::render::Camera;
 use isolume::rng::{Rng, Stage};
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
 use isolume::stats::{normal_quantile, sidak};
@@ -521,4 +523,36 @@ fn the_same_bits_on_any_number_of_threads() {
         };
         assert_eq!(run(1), run(3));
     }
+}
+
+/// Pictures of two cameras that look the same way from places beside each other share no noise.
+#[test]
+fn pictures_from_beside_have_noise_of_their_own() {
+    let scene = bumps(17);
+    let device = device();
+    let tracer = GraphTracer::new(&device, &scene).unwrap();
+    let facing = Camera::facing(&scene, 40);
+    let beside = DVec3::new(0.003, 0.0, 0.0);
+    let moved = Camera { eye: facing.eye + beside, target: facing.target + beside, ..facing };
+    let picture = |camera: &Camera, samples| {
+        let camera = Camera { samples, ..*camera };
+        path_picture(&scene, &tracer, 0.5, &camera, Progress::Quiet).unwrap().rgb
+    };
+    let clean = picture(&facing, 256);
+    // Where nothing begins or ends, which both pictures' rays meet or miss alike.
+    let even = |&n: &usize| {
+        let [x, y] = [n % 40, n / 40];
+        let around = |m: usize| (clean[m][1] / clean[n][1] - 1.0).abs() < 0.1;
+        (1..39).contains(&x) && (1..39).contains(&y) && [n - 1, n + 1, n - 40, n + 40].into_iter().all(around)
+    };
+    let pixels: Vec<usize> = (0..1600).filter(even).collect();
+    assert!(pixels.len() > 600, "{}", pixels.len());
+    let [a, b] = [&facing, &moved].map(|camera| {
+        let noisy = picture(camera, 1);
+        pixels.iter().map(|&n| f64::from(noisy[n][1] - clean[n][1])).collect::<Vec<_>>()
+    });
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    let correlation = dot(&a, &b) / (dot(&a, &a) * dot(&b, &b)).sqrt();
+    println!("correlation {correlation:.3}");
+    assert!(correlation.abs() < 0.3, "{correlation}");
 }

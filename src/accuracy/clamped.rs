@@ -5,7 +5,7 @@ use std::f64::consts::{FRAC_2_SQRT_PI, SQRT_2};
 /// Variance of a Gaussian of this mean and variance that is clamped to [0, 1]: with z = (x − μ)/σ clamped to
 /// [a, b] = [−μ/σ, (1 − μ)/σ], σ² (⟨z²⟩ − ⟨z⟩²), where φ and Φ are the normal density and distribution,
 /// ⟨z⟩ = φ(a) − φ(b) + a Φ(a) + b Φ(−b) and ⟨z²⟩ = Φ(b) − Φ(a) + a φ(a) − b φ(b) + a² Φ(a) + b² Φ(−b).
-pub fn clamped_variance(mean: f64, variance: f64) -> f64 {
+pub(super) fn clamped_variance(mean: f64, variance: f64) -> f64 {
     if !(variance > 0.0 && variance.is_finite() && mean.is_finite()) {
         return 0.0;
     }

@@ -11,7 +11,6 @@ use crate::rng::Stage;
 use crate::scene::Scene;
 use crate::surface_mesh::SurfaceMesh;
 use crate::tracer::Tracer;
-use crate::volume::Lattice;
 use glam::DVec3;
 use rayon::prelude::*;
 
@@ -99,11 +98,11 @@ pub fn total_floor<T: Tracer>(
 
 /// Radiance at the vertices `chosen` of `mesh` as a grid gives it if its points hold `value(receiver, index)`. Only
 /// points that the vertices' cells touch are asked for; those without a level set of their own are filled from their
-/// surroundings as bakes do. `None` where no point of a cell holds anything.
+/// surroundings, by means where bakes fit. `None` where no point of a cell holds anything.
 ///
 /// # Errors
 /// `Invalid` if the grid has too many points.
-pub fn through_grid(
+fn through_grid(
     scene: &Scene,
     mesh: &SurfaceMesh,
     chosen: &[usize],
@@ -112,7 +111,7 @@ pub fn through_grid(
 ) -> Result<Vec<Option<DVec3>>> {
     let lattice = grid.lattice(scene.lattice())?;
     let scale = lattice.far() / scene.lattice().far();
-    let around = |v: usize| corners(&lattice, mesh.local[v] * scale);
+    let around = |v: usize| lattice.around(mesh.local[v] * scale);
     let mut points: Vec<usize> = chosen.iter().flat_map(|&v| around(v).map(|(o, _)| o)).collect();
     points.sort_unstable();
     points.dedup();
@@ -140,19 +139,4 @@ pub fn through_grid(
         (weight > 0.0).then(|| sum / weight)
     };
     Ok(chosen.iter().map(at).collect())
-}
-
-/// The eight lattice points around index coordinates `p`, with their linear weights.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "inside the lattice")]
-pub(super) fn corners(lattice: &Lattice, p: DVec3) -> [(usize, f64); 8] {
-    let far = lattice.far();
-    let p = p.clamp(DVec3::ZERO, far);
-    let base = p.floor().min(far - 1.0);
-    let u = p - base;
-    std::array::from_fn(|n| {
-        let bit = [n & 1, n >> 1 & 1, n >> 2];
-        let w = (0..3).map(|a| if bit[a] == 1 { u[a] } else { 1.0 - u[a] }).product();
-        let at: [usize; 3] = std::array::from_fn(|a| base[a] as usize + bit[a]);
-        (lattice.offset(at[0], at[1], at[2]), w)
-    })
 }

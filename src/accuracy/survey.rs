@@ -2,7 +2,6 @@
 //! \[BB09 §3\]
 
 use super::display;
-use super::floor::corners;
 use crate::direct::Receiver;
 use crate::error::{Error, Result};
 use crate::field::Field;
@@ -268,7 +267,7 @@ fn places(field: &Field, settings: &SurveySettings) -> Result<Vec<DVec3>> {
 /// A point of the grid around index coordinates `p` that holds light of its own level set, as likely as interpolation
 /// weighs it; `None` without any.
 fn beside(lattice: &Lattice, grid: &IlluminationGrid, p: DVec3, rng: &mut Rng) -> Option<usize> {
-    let corners = corners(lattice, p);
+    let corners = lattice.around(p);
     let valid = || corners.into_iter().filter(|&(o, w)| w > 0.0 && grid.mask[o] == Mask::Valid);
     let mut left = rng.unit() * valid().map(|c| c.1).sum::<f64>();
     let chosen = valid().find(|&(_, w)| {

@@ -63,6 +63,15 @@ fn is_by_a_face(wall: &Polygon, lattice: &Lattice) -> bool {
     wall.vertices().iter().any(|&x| beside(lattice.to_index(x)))
 }
 
+/// What a white surface reflects at a contact.
+struct Solved {
+    light: DVec3,
+    /// What errors of the light that was there before are multiplied by.
+    gain: f64,
+    /// The variance that is new, of the luminance that leaves.
+    variance: f64,
+}
+
 impl<'a> Contacts<'a> {
     /// The points of `lattice` that `holds` picks and that lie on walls. None if Ω's faces are capped.
     #[allow(clippy::cast_possible_truncation, reason = "fewer than 2¹⁶ polygons")]
@@ -121,9 +130,9 @@ impl<'a> Contacts<'a> {
     ) -> Counts {
         let light = |o: usize| Some(DVec3::from_array(white[o].map(f64::from)));
         let mut total = Counts::default();
-        for (o, light, variance, counts) in self.solved(side, wedge, light, tick) {
+        for (o, Solved { light, gain, variance }, counts) in self.solved(side, wedge, light, tick) {
             white[o] = light.as_vec3().to_array();
-            std_error.get_mut(o).into_iter().for_each(|e| *e = f64::from(*e).hypot(variance.sqrt()) as f32);
+            std_error.get_mut(o).into_iter().for_each(|e| *e = (gain * f64::from(*e)).hypot(variance.sqrt()) as f32);
             total += counts;
         }
         total
@@ -152,33 +161,34 @@ impl<'a> Contacts<'a> {
             lit.then(|| DVec3::select(albedo.cmpgt(DVec3::ZERO), reflected / albedo, DVec3::ZERO))
         };
         let mut total = Counts::default();
-        for (o, light, variance, counts) in self.solved(side, wedge, light, tick) {
+        for (o, Solved { light, gain, variance }, counts) in self.solved(side, wedge, light, tick) {
             grid.radiance[o] = (albedo(o) * light + surface.emission).as_vec3().to_array();
-            grid.std_error[o] = f64::from(grid.std_error[o]).hypot(variance.sqrt()) as f32;
+            grid.std_error[o] = (gain * f64::from(grid.std_error[o])).hypot(variance.sqrt()) as f32;
             total += counts;
         }
         total
     }
 
-    /// Points for which `white` says what a white surface would reflect, what it does, and the variance that is new.
+    /// Points for which `white` says what a white surface would reflect, and what it does.
     fn solved<T: Tracer>(
         &self,
         side: Side,
         wedge: &Wedge<T>,
         white: impl Fn(usize) -> Option<DVec3> + Sync,
         tick: &(dyn Fn(u64) -> bool + Sync),
-    ) -> Vec<(usize, DVec3, f64, Counts)> {
+    ) -> Vec<(usize, Solved, Counts)> {
         let solve = |&(o, walls): &(usize, [Option<u32>; MOST])| {
             if !tick(1) {
                 return None;
             }
-            let (mut counts, mut variance) = (Counts::default(), 0.0);
-            let mut light = white(o)?;
+            let mut counts = Counts::default();
+            let mut solved = Solved { light: white(o)?, gain: 1.0, variance: 0.0 };
             for (n, wall) in walls.into_iter().flatten().enumerate() {
-                let (met, added) = self.meet((o, side), (n, wall), wedge, light, &mut counts)?;
-                (light, variance) = (met, variance + added);
+                let met = self.meet((o, side), (n, wall), wedge, solved.light, &mut counts)?;
+                let variance = met.gain * met.gain * solved.variance + met.variance;
+                solved = Solved { light: met.light, gain: solved.gain * met.gain, variance };
             }
-            Some((o, light, variance, counts))
+            Some((o, solved, counts))
         };
         self.points.par_iter().with_max_len(64).filter_map(solve).collect()
     }
@@ -195,7 +205,7 @@ impl<'a> Contacts<'a> {
         wedge: &Wedge<T>,
         white: DVec3,
         counts: &mut Counts,
-    ) -> Option<(DVec3, f64)> {
+    ) -> Option<Solved> {
         let scene = self.scene;
         let Wedge { tracer, cache, gather_rays, shadow_rays, seed } = *wedge;
         let x = local_position(&scene.field, self.lattice, o);
@@ -227,7 +237,11 @@ impl<'a> Contacts<'a> {
         // Of white surfaces that touch face to face nothing would ever be lost.
         let lost = 1.0 - (share * share * polygon.albedo * level_set).min(DVec3::splat(MOST_KEPT));
         let met = (white + share * (polygon.albedo * opening - shown)) / lost;
-        let gain = luminance(level_set * share * polygon.albedo / lost) / PI;
-        Some((met.max(DVec3::ZERO), gain * gain * (direct.variance + gathered.variance)))
+        let opened = luminance(level_set * share * polygon.albedo / lost) / PI;
+        // By the channels' shares of the light that is there.
+        let (before, after) = (luminance(white), luminance(white / lost));
+        let gain = if before > 0.0 { after / before } else { 1.0 };
+        let variance = opened * opened * (direct.variance + gathered.variance);
+        Some(Solved { light: met.max(DVec3::ZERO), gain, variance })
     }
 }

@@ -6,7 +6,7 @@ use crate::brdf::reflected;
 use crate::checkpoint;
 use crate::direct::luminance;
 use crate::field::Field;
-use crate::fitted_grid::{PULL, Wish, draws, fit, fitted_variance};
+use crate::fitted_grid::{GridFit, Wish, draws};
 use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, local_position, own_light, stand_ins};
@@ -476,12 +476,13 @@ impl<'a> Beside<'a> {
             Some(slot) => errors[slot].0,
             None => draws(places + o as u64, grid.std_error[o]),
         };
-        let variances = fitted_variance(self.field, self.lattice, &wishes(&own), &before, &free, PULL, &|_| true);
+        let fit = GridFit::new(self.field, self.lattice, &free, &|_| true);
+        let variances = fit.variances(&wishes(&own), &before);
         for ((o, variance), (_, common)) in lit.into_iter().zip(variances).zip(errors) {
             grid.std_error[o] = (variance + common).sqrt();
         }
         let wishes = wishes(&|n| light[n].radiance);
-        grid.radiance = fit(self.field, self.lattice, &wishes, grid.radiance, &free, PULL, &|_| true);
+        grid.radiance = fit.light(&wishes, grid.radiance);
         grid.split = grid.split.map(|split| self.fit_parts(scene, side, split, light, &free));
         grid
     }
@@ -489,11 +490,13 @@ impl<'a> Beside<'a> {
     /// Fits both parts of light from their means at the places of each point. What is visible counts for as much as
     /// could be seen.
     fn fit_parts(&self, scene: &Scene, side: Side, split: Split, light: &[BesideLight], free: &NodeSet) -> Split {
-        let full = scene.reference_irradiance().max(f64::MIN_POSITIVE);
         let places = self.positions.par_iter().zip(light).with_min_len(1024);
+        let parts: Vec<Parts> =
+            places.map(|(position, l)| Parts::new(scene, position.as_dvec3(), side, l.radiance, l.direct)).collect();
+        let full = parts.iter().map(|parts| luminance(parts.open)).fold(f64::MIN_POSITIVE, f64::max);
+        let places = self.positions.par_iter().zip(light).zip(parts).with_min_len(1024);
         let parts: Vec<[Wish; 2]> = places
-            .map(|(&position, l)| {
-                let parts = Parts::new(scene, position.as_dvec3(), side, l.radiance, l.direct);
+            .map(|((&position, l), parts)| {
                 let lit = if l.variance >= 0.0 { 1.0 } else { 0.0 };
                 #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
                 let counts = lit * (luminance(parts.open) / full).powi(2) as f32;
@@ -516,7 +519,7 @@ impl<'a> Beside<'a> {
         }
         let fitted = |n: usize, start| {
             let wishes: Vec<Wish> = parts.par_iter().map(|parts| parts[n]).filter(|w| w.weight > 0.0).collect();
-            fit(self.field, self.lattice, &wishes, start, free, PULL, &|_| true)
+            GridFit::new(self.field, self.lattice, free, &|_| true).light(&wishes, start)
         };
         let (indirect, mut visible) = (fitted(0, indirect), fitted(1, visible));
         let shares = visible.as_flattened_mut().par_iter_mut().with_min_len(1 << 14);

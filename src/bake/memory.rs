@@ -255,10 +255,11 @@ struct Census {
     halves: u64,
     slices: u64,
     /// Of sweeps: places of nodes that they light, nodes that rays look at afterwards, bytes of what lines of
-    /// luminaires see.
+    /// luminaires see and of what a thread needs for its lines.
     places: u64,
     known: u64,
     seen: u64,
+    workspace: u64,
 }
 
 impl Census {
@@ -285,6 +286,7 @@ impl Census {
         if settings.engine == Engine::Sweep {
             self.places += of_grid(sweep::places(field.lattice().dims(), &lit));
             self.seen = sweep::seen(scene, &lattice).max(self.seen);
+            self.workspace = sweep::workspace(&lattice).min(MOST as u64).max(self.workspace);
             self.known += if 2 * shown > points { points } else { shown };
         }
         let sides = member.surface.stored_sides().len() as u64;
@@ -320,7 +322,8 @@ impl Census {
         let indirect = sides * (points * SETTLING_SIDE + places * settling).max(places * 2 * SUMMED_SIDE);
         let direct = sides * places * DIRECT_SIDE + self.seen;
         let walls = sweep::reports(scene, settings.wall_resolution, settings.wall_isovalues) as u64;
-        points * SWEPT + sides * points * SWEPT_SIDE + places * summed + indirect.max(direct) + walls
+        let threads = self.workspace * rayon::current_num_threads() as u64;
+        points * SWEPT + sides * points * SWEPT_SIDE + places * summed + indirect.max(direct) + walls + threads
     }
 
     /// Bytes of scattered samples, and of their interpolation.

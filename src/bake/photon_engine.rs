@@ -7,7 +7,7 @@ use super::{BakeSettings, Interpolation, Lit, PhotonCounts, stages};
 use crate::checkpoint::Checkpoint;
 use crate::embree::{Device, GraphTracer, pyramids};
 use crate::error::{Error, Result};
-use crate::fitted_grid::{PULL, Wish, draws, fit, fitted_variance};
+use crate::fitted_grid::GridFit;
 use crate::flat;
 use crate::flattened::Side;
 use crate::illumination_grid::{IlluminationGrid, shepard};
@@ -57,7 +57,7 @@ pub(super) fn light(
     let photons = trace_photons(first, &tracers[0], &settings.emission(axis), &|n| stage.tick(n));
     stage.end()?;
     lit.spend(clock, |s| &mut s.photons);
-    lit.rays = photons.rays;
+    lit.counts.rays = photons.rays;
     lit.photons = PhotonCounts {
         emitted: photons.emitted,
         stored: photons.stored(),
@@ -102,7 +102,7 @@ pub(super) fn light(
         let clock = Clock::start();
         for ((field, tracer), source) in fields.iter_mut().zip(&tracers).zip(&sources) {
             let counts = field.sample(band, tracer, (&cache, source), settings, checkpoint, &|n| stage.tick(n));
-            lit.count(counts);
+            lit.counts += counts;
         }
         lit.spend(clock, |s| &mut s.samples);
         if bands.len() > 1 && !progress.stops() {
@@ -113,7 +113,7 @@ pub(super) fn light(
     stage.end()?;
     progress.line("cache", lit.seconds.cache);
     progress.line("samples", lit.seconds.samples);
-    lit.rays += cache.rays;
+    lit.counts.rays += cache.rays;
     cache.forget_nodes();
     drop(sources);
 
@@ -268,21 +268,8 @@ impl<'a> FieldLight<'a> {
                         }
                         Interpolation::Fit => {
                             let mut grid = blended();
-                            let mut wishes: Vec<Wish> = samples.iter().map(Wish::from).collect();
-                            let errors: Vec<f32> = samples.iter().map(|s| s.variance.sqrt()).collect();
-                            drop(samples);
                             let free = NodeSet::new(lattice.len(), |o| grid.mask[o] != Mask::Empty);
-                            grid.radiance = fit(&scene.field, lattice, &wishes, grid.radiance, &free, PULL, tick);
-                            for ((n, wish), &error) in (0..).zip(&mut wishes).zip(&errors) {
-                                wish.light = draws(n, error);
-                            }
-                            let start = |o: usize| draws((errors.len() + o) as u64, grid.std_error[o]);
-                            let variances = fitted_variance(&scene.field, lattice, &wishes, &start, &free, PULL, tick);
-                            for (o, variance) in free.members(0..lattice.len()).zip(variances) {
-                                if grid.std_error[o].is_finite() {
-                                    grid.std_error[o] = variance.sqrt();
-                                }
-                            }
+                            GridFit::new(&scene.field, lattice, &free, tick).improve(&mut grid, samples);
                             grid
                         }
                     }

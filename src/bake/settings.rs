@@ -11,6 +11,7 @@ use crate::radiance_cache::CacheSettings;
 use crate::sampling::Strategy;
 use crate::scene::Scene;
 use crate::sweep::SweepSettings;
+use crate::volume::generate::bumps;
 use serde::{Deserialize, Serialize};
 
 /// More bands than this save nothing.
@@ -44,15 +45,13 @@ pub enum StrategyName {
 }
 
 impl StrategyName {
-    /// How scattered samples are placed; `None` for those at the grid's points. BB09's level sets stand at 39.0 + 17.7
-    /// k of the bumps' sweep [3.6, 95]: the same fractions of any sweep, and as many planes.
+    /// How scattered samples are placed; `None` for those at the grid's points. BB09's level sets stand at the same
+    /// fractions of any sweep, and there are as many planes.
     pub fn placed(self) -> Option<Strategy> {
-        let fractions =
-            || (-2..=3).map(|k| (39.0 + 17.7 * f64::from(k) - 3.6) / 91.4).filter(|s| (0.0..=1.0).contains(s));
         match self {
             Self::Uniform => Some(Strategy::Uniform),
-            Self::Planes => Some(Strategy::Planes(fractions().count())),
-            Self::LevelSet => Some(Strategy::LevelSets(fractions().collect())),
+            Self::Planes => Some(Strategy::Planes(bumps::level_sets().len())),
+            Self::LevelSet => Some(Strategy::LevelSets(bumps::level_sets())),
             Self::Nodes => None,
         }
     }

@@ -89,16 +89,16 @@ pub(super) fn light(
         let saved = stages(checkpoint, STAGES * number + 4)[s.side.index()];
         let mut light = beside.dark();
         let counts = beside.sample(&sampler, Band::WHOLE, &mut light, saved, &|n| stage.tick(n));
-        lit.count(counts);
+        lit.counts += counts;
         beside.smooth(scene, s.side, settings.tau, &mut light, &|n| stage.tick(n));
         let (indirect, shadow_rays) = (Indirect::Gather(&cache, rays[0]), rays[1]);
         let sampler = Sampler { indirect: &indirect, shadow_rays, ..sampler };
         // Keys of a point beside; none of these is one.
         let place = |n: usize| ((STAND_INS * near[n]) as u64, local_position(&scene.field, lattice, near[n]).as_vec3());
         let sampled = sample_places(&sampler, near.len(), &place, Stage::UNSAVED, 0, &|n| stage.tick(n));
-        lit.count(Counts::from(&sampled));
+        lit.counts += Counts::from(&sampled);
         let wedge = Wedge::new(&tracer, &cache, settings);
-        lit.count(contacts.solve(s.side, &wedge, (&mut s.irradiance, &mut s.std_error), &|n| stage.tick(n)));
+        lit.counts += contacts.solve(s.side, &wedge, (&mut s.irradiance, &mut s.std_error), &|n| stage.tick(n));
         stage.end()?;
         let mut grid = swept_grid((&own, masks), outgoing(scene, &own, s.irradiance), s.std_error);
         for (&o, sample) in near.iter().zip(&sampled.samples) {

@@ -9,7 +9,7 @@ use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{BufReader, BufWriter, ErrorKind, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
-pub(super) const MAGIC: &[u8] = b"isolume checkpoint 18\n";
+pub(super) const MAGIC: &[u8] = b"isolume checkpoint 19\n";
 /// What the magic of any version starts with.
 pub(super) const ANY_MAGIC: &[u8] = b"isolume checkpoint ";
 
@@ -25,6 +25,17 @@ pub(super) struct Log {
     /// Bytes of the file that are whole, and of those, bytes of blocks since replaced.
     pub(super) length: u64,
     dead: u64,
+    /// Bytes that were damaged when it was opened, and what stood behind them.
+    pub(super) damaged: u64,
+}
+
+/// What was read of a file, as [`Log`] has it.
+struct Contents {
+    job: String,
+    blocks: BTreeMap<Key, (u64, usize)>,
+    length: u64,
+    dead: u64,
+    damaged: u64,
 }
 
 /// Bytes before a block's own: stage, number, length, checksum of the block, checksum of these.
@@ -45,6 +56,13 @@ fn head((stage, block): Key, bytes: &[u8]) -> [u8; HEAD] {
     let own = checksum(&head[..24]);
     head[24..].copy_from_slice(&own.to_le_bytes());
     head
+}
+
+/// Key, length and checksum of the block behind a head; `None` if that is damaged.
+fn block(head: &[u8]) -> Option<(Key, u64, u32)> {
+    let whole = small(&head[24..])? == checksum(&head[..24]);
+    let key = (small(&head[..4])?, number(&head[4..12])?);
+    whole.then_some((key, number(&head[12..20])?, small(&head[20..24])?))
 }
 
 /// At most `n` bytes: fewer at the end.
@@ -181,14 +199,16 @@ impl Log {
         let _replaced =
             (old.is_none() && path.exists()).then(|| hold(path, OpenOptions::new().read(true))).transpose()?;
         out.commit()?;
-        Ok(Self { file, blocks, length, dead: 0 })
+        Ok(Self { file, blocks, length, dead: 0, damaged: 0 })
     }
 
-    /// The job of a file and its blocks; `None` if anything is wrong but an end that is missing.
+    /// The job of a file and its blocks up to the first that is damaged; `None` if its beginning is. A block that was
+    /// written half, as killed processes leave it, is no damage.
     pub(super) fn open(path: &Path) -> Result<Option<(String, Self)>> {
         let file = hold(path, OpenOptions::new().read(true).write(true))?;
         let found = Self::scan(BufReader::with_capacity(1 << 20, &file)).map_err(|e| Error::io(path, e))?;
-        Ok(found.map(|(job, blocks, length, dead)| (job, Self { file, blocks, length, dead })))
+        Ok(found
+            .map(|Contents { job, blocks, length, dead, damaged }| (job, Self { file, blocks, length, dead, damaged })))
     }
 
     /// Whether this is the file of that name.
@@ -196,42 +216,38 @@ impl Log {
         stands_at(&self.file, path)
     }
 
-    /// The job, where the blocks are, the bytes that are whole and those of blocks since replaced.
-    #[allow(clippy::type_complexity, reason = "the parts of a log")]
-    fn scan(mut from: impl Read) -> std::io::Result<Option<(String, BTreeMap<Key, (u64, usize)>, u64, u64)>> {
+    /// What `from` holds up to its end or the first damage.
+    fn scan(mut from: impl Read) -> std::io::Result<Option<Contents>> {
         if take(&mut from, MAGIC.len() as u64)? != MAGIC {
             return Ok(None);
         }
         let Some(job) = job(&mut from)? else { return Ok(None) };
-        let mut length = (MAGIC.len() + 8 + job.len() + 4) as u64;
-        let (mut blocks, mut dead) = (BTreeMap::new(), 0);
+        let length = (MAGIC.len() + 8 + job.len() + 4) as u64;
+        let mut found = Contents { job, blocks: BTreeMap::new(), length, dead: 0, damaged: 0 };
         loop {
             let head = take(&mut from, HEAD as u64)?;
             if head.len() < HEAD {
                 break;
             }
-            if small(&head[24..]) != Some(checksum(&head[..24])) {
-                return Ok(None);
-            }
-            let (Some(stage), Some(block), Some(count), sum) =
-                (small(&head[..4]), number(&head[4..12]), number(&head[12..20]), small(&head[20..24]))
-            else {
-                return Ok(None);
+            let Some((key, count, sum)) = block(&head) else {
+                found.damaged = HEAD as u64 + std::io::copy(&mut from, &mut std::io::sink())?;
+                break;
             };
             let bytes = take(&mut from, count)?;
             if (bytes.len() as u64) < count {
                 break;
             }
-            if Some(checksum(&bytes)) != sum {
-                return Ok(None);
+            if checksum(&bytes) != sum {
+                found.damaged = HEAD as u64 + count + std::io::copy(&mut from, &mut std::io::sink())?;
+                break;
             }
-            let start = length + HEAD as u64;
-            length = start + count;
-            if let Some((_, before)) = blocks.insert((stage, block), (start, bytes.len())) {
-                dead += (HEAD + before) as u64;
+            let start = found.length + HEAD as u64;
+            found.length = start + count;
+            if let Some((_, before)) = found.blocks.insert(key, (start, bytes.len())) {
+                found.dead += (HEAD + before) as u64;
             }
         }
-        Ok(Some((job, blocks, length, dead)))
+        Ok(Some(found))
     }
 
     /// Bytes of blocks that are replaced once `new` ones are written.

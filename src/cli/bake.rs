@@ -15,6 +15,7 @@ use crate::scene::{Policy, Scene};
 use crate::scene_file::{Inputs, SceneOptions, load, load_series};
 use crate::series::{Series, write_collection};
 use plan::Plan;
+use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::time::Duration;
@@ -154,12 +155,6 @@ impl Bake {
         Ok(())
     }
 
-    /// The report of the output, if that is there and whole.
-    fn whole(&self) -> Option<serde_json::Value> {
-        let found = self.output.exists().then(|| BakedVolume::read(&self.output).ok()).flatten()?;
-        Some(found.report)
-    }
-
     /// Writes the report, if that is wanted.
     fn hand_out(&self, report: &serde_json::Value) -> Result<()> {
         let Some(path) = &self.report else { return Ok(()) };
@@ -248,19 +243,24 @@ impl Bake {
     /// Where the work begins: with --resume at what is done.
     fn begin(&self, plan: &Plan, first: bool, progress: Progress) -> Result<Begun> {
         let job = job(plan.scene(), &plan.settings, &plan.device.version());
-        // Of a series, what is there.
-        let whole = (self.resume && self.scene.time.is_some()).then(|| self.whole()).flatten();
-        let same = |report: &serde_json::Value| report.get("job").and_then(|j| j.as_str()) == Some(&digest(&job));
-        let another = match whole {
-            Some(report) if same(&report) => {
+        let digest = digest(&job);
+        let checkpoint = Checkpoint::new(&self.checkpoint_path(), job, self.every()?)?;
+        let there = self.resume.then(|| BakedVolume::read(&self.output).ok()).flatten();
+        let same = |bake: &BakedVolume| bake.report.get("job").and_then(|j| j.as_str()) == Some(&digest);
+        let another = match there {
+            Some(bake) if same(&bake) => {
                 if progress.is_shown() {
                     say!("{:>14}  {} is complete", "resumed", self.output.display());
                 }
-                return Ok(Begun::Whole(report));
+                // It was killed on its last step.
+                if checkpoint.held()? == Held::This && checkpoint.resume()? {
+                    checkpoint.remove();
+                }
+                let reports: Vec<_> = [&bake].into_iter().chain(&bake.companions).map(|b| &b.report).collect();
+                return Ok(Begun::Whole(in_one(plan.scene(), &reports)));
             }
-            found => found.is_some(),
+            found => found.is_some() && self.scene.time.is_some(),
         };
-        let checkpoint = Checkpoint::new(&self.checkpoint_path(), job, self.every()?)?;
         // Had this series been begun, its first frame or a checkpoint of that would be there.
         if first && another && checkpoint.held()? != Held::This {
             return Err(Error::invalid(
@@ -321,7 +321,10 @@ impl Bake {
                 sum(|r| r.samples)
             ),
         };
-        say!("{:>14}  {:.2} s: {work} ({:.1} M/s)", "total", r.seconds.total, r.rays_per_second / 1e6);
+        // Of a resumed bake it is not known.
+        let rate = r.rays_per_second / 1e6;
+        let rate = if rate.is_finite() { format!(" ({rate:.1} M/s)") } else { String::new() };
+        say!("{:>14}  {:.2} s: {work}{rate}", "total", r.seconds.total);
         let each = |of: fn(&BakeReport) -> u64| reports.iter().map(of).sum::<u64>();
         say!(
             "{:>14}  {} masked ({} filled), {} gather misses, {} without gradient, {} not finite",
@@ -361,6 +364,13 @@ impl Bake {
         }
         if checkpoint.resume()? {
             say("resumed", format!("{} finished blocks from {}", checkpoint.blocks(), path.display()));
+            if checkpoint.damaged() > 0 {
+                say!(
+                    "warning: the last {} bytes of {} are damaged; what they held is computed again",
+                    checkpoint.damaged(),
+                    path.display()
+                );
+            }
         } else {
             say("resumed", format!("nothing: there is no {}; starting from the beginning", path.display()));
         }
@@ -377,7 +387,7 @@ enum Begun {
 }
 
 /// The reports as one: of several volumes, each by its name.
-fn in_one(scene: &Scene, reports: &[BakeReport]) -> serde_json::Value {
+fn in_one<R: Serialize>(scene: &Scene, reports: &[R]) -> serde_json::Value {
     let json = match reports {
         [report] => serde_json::to_value(report),
         all => serde_json::to_value(scene.members().iter().map(|m| &m.name).zip(all).collect::<BTreeMap<_, _>>()),

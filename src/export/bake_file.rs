@@ -368,6 +368,10 @@ impl BakedVolume {
     pub fn read(path: &Path) -> Result<Self> {
         if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("vtm")) {
             let fields = multi_block::read(path)?.iter().map(|file| Self::one(file)).collect::<Result<Vec<_>>>()?;
+            let job = |bake: &Self| bake.report.get("job").cloned();
+            if fields.iter().any(|bake| job(bake) != job(&fields[0])) {
+                return Err(Error::invalid(path, "names files of different bakes; bake anew"));
+            }
             return Self::seen_from(fields, 0).map_err(|e| e.in_file(path));
         }
         if !path.extension().is_some_and(|e| e.eq_ignore_ascii_case("vti")) {

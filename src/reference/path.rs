@@ -139,10 +139,14 @@ pub fn path_picture<T: Tracer>(
     camera: &Camera,
     progress: Progress,
 ) -> Result<Picture> {
-    // Paths are told apart by their ray: the same picture on any number of threads, and of two cameras that see the
-    // same two with noise of their own.
+    // Paths are told apart by camera and ray: the same picture on any number of threads, and of two cameras that see
+    // the same two with noise of their own.
+    let fold = |key: u64, x: DVec3| {
+        x.to_array().iter().fold(key, |k, x| (k ^ x.to_bits()).wrapping_mul(0x9e37_79b9_7f4a_7c15))
+    };
+    let camera_key = fold(0, camera.eye);
     let shade = |ray: &FlattenedRay, hit, direction: DVec3, _| {
-        let key = direction.to_array().iter().fold(0u64, |k, x| (k ^ x.to_bits()).wrapping_mul(0x9e37_79b9_7f4a_7c15));
+        let key = fold(camera_key, direction);
         path_radiance(scene, tracer, ray, hit, &mut Rng::stream(1, Stage::Path, key))
     };
     trace_picture(scene, tracer, isovalue, camera, &shade, progress)

@@ -66,14 +66,50 @@ struct MappedSurface {
 #[derive(Debug)]
 struct Share {
     grid: PointGrid,
-    /// Slot order: power and the surface's lower normal (unused on walls).
-    photons: Vec<(Vec3, Vec3)>,
+    /// Slot order.
+    photons: Vec<Mapped>,
+}
+
+/// A photon.
+#[derive(Clone, Copy, Debug)]
+struct Mapped {
+    power: Vec3,
+    on: On,
+}
+
+/// What a photon landed on.
+#[derive(Clone, Copy, Debug)]
+enum On {
+    /// A surface with this lower normal.
+    Surface(Vec3),
+    /// A wall, where it lies so of the level sets: see [`higher`].
+    Wall(u32),
+}
+
+impl On {
+    /// Whether photons there tell of what is here: a surface of a similar normal, or a wall on the same side of all
+    /// level sets.
+    fn tells_of(self, here: Self, cone: f32) -> bool {
+        match (self, here) {
+            (On::Surface(there), On::Surface(here)) => there.dot(here) >= cone,
+            (On::Wall(there), On::Wall(here)) => there == here,
+            _ => false,
+        }
+    }
+}
+
+/// On which side of each field's level set a local point lies, as bits.
+fn higher(scene: &Scene, isovalue: f32, p: DVec3) -> u32 {
+    let higher_in = |field: &Field, p: DVec3| field.lattice().holds(p) && field.value(p) >= f64::from(isovalue);
+    let others = scene.companions().iter().map(|c| higher_in(&c.member.field, c.to_index(p)));
+    others.fold(u32::from(higher_in(&scene.field, p)), |bits, higher| bits << 1 | u32::from(higher))
 }
 
 impl Share {
-    fn new(items: &[(Vec3, Vec3, Vec3)]) -> Self {
+    /// Of photons and where they landed.
+    fn new(items: &[(Vec3, Mapped)]) -> Self {
         let grid = PointGrid::new(&items.iter().map(|i| i.0).collect::<Vec<_>>(), 3.0);
-        let photons = grid.numbers().iter().map(|&n| (items[n as usize].1, items[n as usize].2)).collect();
+        let photons = grid.numbers().iter().map(|&n| items[n as usize].1).collect();
         Self { grid, photons }
     }
 }
@@ -90,7 +126,7 @@ impl MappedSurface {
                 .filter(|p| p.bounces > 0 && p.side == side && usize::from(p.field) == scene.number())
                 .map(|p| {
                     let at = p.position.as_dvec3();
-                    ((lattice.to_world(at) - origin).as_vec3(), p.power, lower(at))
+                    ((lattice.to_world(at) - origin).as_vec3(), Mapped { power: p.power, on: On::Surface(lower(at)) })
                 })
                 .collect();
             Share::new(&items)
@@ -147,7 +183,8 @@ impl SurfaceMap {
                 (scene.polygons().get(p.flat as usize), landed.get_mut(p.flat as usize))
             {
                 let x = polygon.at([f64::from(p.uvc[0]), f64::from(p.uvc[1])]);
-                items.push(((x - origin).as_vec3(), p.power, Vec3::ZERO));
+                let on = On::Wall(higher(scene, isovalue, lattice.to_index(x)));
+                items.push(((x - origin).as_vec3(), Mapped { power: p.power, on }));
             }
         }
         let walls = landed.par_iter().map(|items| Share::new(items)).collect();
@@ -207,18 +244,19 @@ impl SurfaceMap {
         let q = (world - self.origin).as_vec3();
         let cone = self.settings.cone as f32;
         let own = &self.surfaces[0];
-        let (surface, share, normal) = match at.departure {
-            Departure::Surface(side) => (own, &own.sides[side.index()], lower_normal(at, side)),
+        let (surface, share, here) = match at.departure {
+            Departure::Surface(side) => (own, &own.sides[side.index()], On::Surface(lower_normal(at, side))),
             Departure::Companion(n, side) => {
                 let surface = &self.surfaces[usize::from(n) + 1];
-                (surface, &surface.sides[side.index()], lower_normal(at, side))
+                (surface, &surface.sides[side.index()], On::Surface(lower_normal(at, side)))
             }
-            Departure::Polygon(id) => (own, &self.walls[id as usize], Vec3::ZERO),
+            Departure::Polygon(id) => {
+                (own, &self.walls[id as usize], On::Wall(higher(scene, self.isovalue, at.position.as_dvec3())))
+            }
             Departure::Free | Departure::Cap(..) => return None,
         };
-        let wall = normal == Vec3::ZERO;
         let k = self.settings.photons;
-        let accept = |slot: u32| wall || share.photons[slot as usize].1.dot(normal) >= cone;
+        let accept = |slot: u32| share.photons[slot as usize].on.tells_of(here, cone);
         share.grid.nearest(q, k, self.radius, accept, scratch);
         let found = scratch.found();
         let most = match at.departure {
@@ -239,11 +277,12 @@ impl SurfaceMap {
             return Some((DVec3::ZERO, 0.0));
         }
         let weight = |d2: f32| f64::from((1.0 - d2 / (radius * radius)).max(0.0));
-        let power: DVec3 = found.iter().map(|&(d2, slot)| share.photons[slot as usize].0.as_dvec3() * weight(d2)).sum();
+        let power: DVec3 =
+            found.iter().map(|&(d2, slot)| share.photons[slot as usize].power.as_dvec3() * weight(d2)).sum();
         let area = match at.departure {
             Departure::Polygon(id) => self.wall_area(scene, id, world, at, f64::from(radius)),
             _ => {
-                let accept = |slot: u32| surface.areas[slot as usize].1.dot(normal) >= cone;
+                let accept = |slot: u32| On::Surface(surface.areas[slot as usize].1).tells_of(here, cone);
                 surface.area_grid.nearest(q, usize::MAX, radius, accept, scratch);
                 let found = scratch.found();
                 found.iter().map(|&(d2, slot)| f64::from(surface.areas[slot as usize].0) * weight(d2)).sum()
@@ -256,20 +295,13 @@ impl SurfaceMap {
     fn wall_area(&self, scene: &Scene, id: u32, world: DVec3, at: &Receiver, radius: f64) -> f64 {
         let (polygon, lattice) = (&scene.polygons()[id as usize], scene.lattice());
         let frame = Frame::new(polygon.normal());
-        let higher_in =
-            |field: &Field, p: DVec3| field.lattice().holds(p) && field.value(p) >= f64::from(self.isovalue);
-        // On which side of each field's level set, as bits.
-        let higher = |p: DVec3| {
-            let others = scene.companions().iter().map(|c| higher_in(&c.member.field, c.to_index(p)));
-            others.fold(u32::from(higher_in(&scene.field, p)), |bits, higher| bits << 1 | u32::from(higher))
-        };
-        let side = higher(at.position.as_dvec3());
+        let side = higher(scene, self.isovalue, at.position.as_dvec3());
         let sum: f64 = self
             .disk
             .iter()
             .filter(|[u, v]| {
                 let x = world + frame.to_world(DVec3::new(*u, *v, 0.0)) * radius;
-                polygon.contains(x) && higher(lattice.to_index(x)) == side
+                polygon.contains(x) && higher(scene, self.isovalue, lattice.to_index(x)) == side
             })
             .map(|[u, v]| 1.0 - u * u - v * v)
             .sum();

@@ -5,12 +5,14 @@ use crate::accuracy::{ReferenceMesh, display, interpolation_floor, total_floor};
 use crate::bake::{Bake, BakeOptions, BakeSettings, Engine, StrategyName};
 use crate::embree::{GraphTracer, SurfaceTracer};
 use crate::error::Result;
-use crate::illumination_grid::{GridSize, IlluminationGrid};
+use crate::illumination_grid::GridSize;
+use crate::mask::Mask;
 use crate::progress::Progress;
 use crate::reference::{Reference, ReferenceSettings, path_picture, reference};
 use crate::render::Camera;
 use crate::scene::Scene;
 use crate::surface_mesh::SurfaceMesh;
+use glam::DVec3;
 use std::time::Instant;
 
 const COLUMNS: [&str; 27] = [
@@ -148,15 +150,16 @@ fn reference_picture(study: &Study, scene: &Scene, isovalue: f32) -> Result<f64>
 /// interpolated as if neighbouring points erred alike, so at most this.
 fn noise(bake: &Bake, reference: &ReferenceMesh) -> f64 {
     let grid = &bake.sides[0].1;
-    let errors = IlluminationGrid {
-        split: None,
-        radiance: grid.std_error.iter().map(|&e| [e * e; 3]).collect(),
-        std_error: Vec::new(),
-        mask: grid.mask.clone(),
+    let variance = |x: DVec3| {
+        let around =
+            bake.lattice.around(bake.lattice.to_index(x)).into_iter().filter(|(o, _)| grid.mask[*o] != Mask::Empty);
+        let (sum, weights) = around
+            .fold((0.0, 0.0), |(sum, weights), (o, w)| (sum + w * f64::from(grid.std_error[o]).powi(2), weights + w));
+        if weights > 0.0 { sum / weights } else { 0.0 }
     };
     let (mut sum, mut count) = (0.0, 0.0);
     for (&x, _) in reference.positions.iter().zip(&reference.sampled).filter(|(_, s)| **s) {
-        sum += errors.interpolate(&bake.lattice, bake.lattice.to_index(x)).x;
+        sum += variance(x);
         count += 1.0;
     }
     100.0 * bake.exposure * (3.0 * sum / f64::max(count, 1.0)).sqrt()

@@ -7,6 +7,7 @@ use crate::error::Result;
 use crate::illumination_grid::GridSize;
 use crate::mask::{Mask, masks};
 use crate::plot::{Plot, Series};
+use crate::volume::generate::bumps;
 
 const COLUMNS: [&str; 16] = [
     "scene",
@@ -146,7 +147,7 @@ fn grid_of(subject: &Subject, count: u64) -> Result<GridSize> {
 /// Whether an isovalue is among those that are read off the table rather than the plot.
 fn is_in_table(subject: &Subject, isovalue: f64) -> bool {
     // The same numbers as `isovalues` makes: those of narrow sweeps lie closer together than any tolerance.
-    let fixed = [35.0, 47.0, 80.0].map(|c| subject.at((c - 3.6) / 91.4));
+    let fixed = [35.0, 47.0, 80.0].map(|c| subject.at(bumps::fraction(c)));
     isovalue == subject.main_isovalue() || fixed.contains(&isovalue)
 }
 
@@ -156,12 +157,12 @@ fn is_in_table(subject: &Subject, isovalue: f64) -> bool {
 /// # Errors
 /// `Invalid` if there is none.
 fn isovalues(study: &Study, subject: &Subject) -> Result<Vec<f64>> {
-    let mut fractions: Vec<f64> = level_sets();
+    let mut fractions = bumps::level_sets();
     if !study.quick {
-        fractions.extend(level_sets().windows(2).map(|w| 0.5 * (w[0] + w[1])));
+        fractions.extend(bumps::level_sets().windows(2).map(|w| 0.5 * (w[0] + w[1])));
         fractions.extend((1..=9).map(|i| f64::from(i) / 10.0));
     }
-    let main = [35.0, 47.0, 80.0].map(|c| (c - 3.6) / 91.4);
+    let main = [35.0, 47.0, 80.0].map(bumps::fraction);
     fractions.retain(|f| main.iter().all(|m| (f - m).abs() > 0.008));
     fractions.extend(if study.quick { &main[1..2] } else { &main[..] });
     fractions.sort_by(f64::total_cmp);
@@ -172,11 +173,6 @@ fn isovalues(study: &Study, subject: &Subject) -> Result<Vec<f64>> {
     all.sort_by(f64::total_cmp);
     all.dedup();
     subject.with_surfaces(&all)
-}
-
-/// BB09's level sets 39.0 + 17.7 k of the sweep [3.6, 95], as fractions.
-fn level_sets() -> Vec<f64> {
-    (-2..=3).map(|k| (39.0 + 17.7 * f64::from(k) - 3.6) / 91.4).filter(|s| (0.0..=1.0).contains(s)).collect()
 }
 
 /// A number for a sentence, without the last digits of rounding.
@@ -224,7 +220,7 @@ fn summarise(study: &Study, subjects: &[Subject], table: &Table, counts: &[u64])
             y_label: "percent RMS".into(),
             log_y: true,
             series,
-            guides: level_sets().into_iter().map(|f| subject.at(f)).collect(),
+            guides: bumps::level_sets().into_iter().map(|f| subject.at(f)).collect(),
             ..Plot::default()
         };
         plot.write(&study.folder.join(format!("strategies-{}.svg", subject.name)))?;

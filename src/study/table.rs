@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 /// Rows of text under named columns; the first `keys` columns tell rows apart, the last two are the digest of their
 /// job, and what made them.
 #[derive(Debug)]
-pub struct Table {
+pub(super) struct Table {
     path: PathBuf,
     columns: Vec<&'static str>,
     keys: usize,
@@ -21,8 +21,8 @@ impl Table {
     /// Opens `path`, with the rows it holds if its columns are these; otherwise an empty table.
     ///
     /// # Errors
-    /// `Io` if the file exists and cannot be read; `Invalid` if it holds other columns.
-    pub fn open(path: PathBuf, columns: &[&'static str], keys: usize) -> Result<Self> {
+    /// `Io` if the file exists and cannot be read; `Invalid` if it holds other columns, or a row of more or fewer.
+    pub(super) fn open(path: PathBuf, columns: &[&'static str], keys: usize) -> Result<Self> {
         let mut table = Self { path, columns: columns.to_vec(), keys, rows: Vec::new() };
         if table.path.exists() {
             let text = std::fs::read_to_string(&table.path).map_err(|e| Error::io(&table.path, e))?;
@@ -30,13 +30,19 @@ impl Table {
             if rows.next().is_none_or(|found| found != columns) {
                 return Err(Error::invalid(&table.path, "holds other columns; move it away or choose another folder"));
             }
-            table.rows = rows.filter(|r| r.len() == columns.len()).collect();
+            table.rows = rows.collect();
+            if let Some((n, row)) = table.rows.iter().enumerate().find(|(_, row)| row.len() != columns.len()) {
+                return Err(Error::invalid(
+                    &table.path,
+                    format!("row {}: {} values for {} columns; mend or remove it", n + 1, row.len(), columns.len()),
+                ));
+            }
         }
         Ok(table)
     }
 
     /// Whether a row with these keys is there.
-    pub fn has(&self, keys: &[String]) -> bool {
+    pub(super) fn has(&self, keys: &[String]) -> bool {
         self.rows.iter().any(|r| r[..self.keys] == *keys)
     }
 
@@ -44,7 +50,7 @@ impl Table {
     ///
     /// # Errors
     /// `Invalid`.
-    pub fn expect(&self, scene: &str, job: &str) -> Result<()> {
+    pub(super) fn expect(&self, scene: &str, job: &str) -> Result<()> {
         let of_another = |r: &&Vec<String>| r[0] == scene && r[r.len() - 2] != job;
         match self.rows.iter().find(of_another) {
             None => Ok(()),
@@ -64,7 +70,7 @@ impl Table {
     ///
     /// # Errors
     /// `Invalid`.
-    pub fn expect_program(&self, program: &str) -> Result<()> {
+    pub(super) fn expect_program(&self, program: &str) -> Result<()> {
         match self.rows.iter().filter_map(|r| r.last()).find(|found| *found != program) {
             None => Ok(()),
             Some(found) => Err(Error::invalid(
@@ -83,7 +89,7 @@ impl Table {
     ///
     /// # Panics
     /// If the row has another number of values than there are columns.
-    pub fn push(&mut self, row: Vec<String>) -> Result<()> {
+    pub(super) fn push(&mut self, row: Vec<String>) -> Result<()> {
         assert_eq!(row.len(), self.columns.len(), "a value per column");
         self.rows.push(row);
         let mut text = self.columns.join(",") + "\n";
@@ -95,26 +101,21 @@ impl Table {
     }
 
     /// All rows.
-    pub fn rows(&self) -> &[Vec<String>] {
+    pub(super) fn rows(&self) -> &[Vec<String>] {
         &self.rows
     }
 
     /// A value as a number; NaN if it is none.
-    pub fn number(&self, row: &[String], column: &str) -> f64 {
+    pub(super) fn number(&self, row: &[String], column: &str) -> f64 {
         let at = self.columns.iter().position(|c| *c == column);
         at.and_then(|i| row[i].parse().ok()).unwrap_or(f64::NAN)
-    }
-
-    /// A value as text.
-    pub fn text<'a>(&self, row: &'a [String], column: &str) -> &'a str {
-        self.columns.iter().position(|c| *c == column).map_or("", |i| &row[i])
     }
 
     /// The table as Markdown, under `heading`, with `notes` below, which say what made all rows.
     ///
     /// # Errors
     /// `Io`.
-    pub fn write_markdown(&self, path: &Path, heading: &str, notes: &str) -> Result<()> {
+    pub(super) fn write_markdown(&self, path: &Path, heading: &str, notes: &str) -> Result<()> {
         let shown = self.columns.len() - 1;
         let mut text = format!("# {heading}\n\n| {} |\n|{}\n", self.columns[..shown].join(" | "), "---|".repeat(shown));
         for row in &self.rows {
@@ -186,7 +187,7 @@ mod tests {
         drop(t);
         let mut t = open().unwrap();
         for (row, name) in t.rows().iter().zip(names) {
-            assert_eq!(t.text(row, "name"), name);
+            assert_eq!(row[0], name);
             assert!(t.has(&[name.into(), "1".into()]) && !t.has(&[name.into(), "2".into()]), "{name:?}");
         }
         assert_eq!(t.rows().len(), names.len());
@@ -203,5 +204,8 @@ mod tests {
         let shown = std::fs::read_to_string(shown).unwrap();
         assert!(shown.contains("| error | job |\n|---|---|---|---|\n") && shown.contains("| last | 1 | 0.5 | j |\n"));
         assert!(shown.contains("| a\\|b | 1 | 0.5 | j |\n"), "{shown}");
+        // A row that was edited is not lost with the next one.
+        std::fs::write(&path, std::fs::read_to_string(&path).unwrap() + "short,1\n").unwrap();
+        assert!(open().err().unwrap().to_string().contains("row 9: 2 values for 5 columns"));
     }
 }

@@ -5,6 +5,7 @@
 use super::gather::local_bounds;
 use super::half::{Half4, encode};
 use super::incoming::{Incoming, Sink, around};
+use super::settling::Sums;
 use super::solid::{FREE, solid};
 use super::swept_sides;
 use crate::flat::{self, Flat, FlatLight, FlatTexture, Within};
@@ -47,6 +48,16 @@ impl Texture {
     /// Isovalues.
     pub(super) fn isovalues(&self) -> usize {
         self.dims[2]
+    }
+
+    /// Adds to `sums`, in the channels that are `measured`, that B was `old`.
+    fn count(&self, old: &[f32], measured: [bool; 3], sums: &mut Sums) {
+        let [nu, nv, nc] = self.dims;
+        let area = self.sink_area * (self.sink[0] * self.sink[1]) as f64 / (nu * nv) as f64;
+        let channels = old.chunks(nc).zip(self.radiance.chunks(nc)).enumerate();
+        for (n, (x, y)) in channels.filter(|(n, _)| measured[n % 3]) {
+            x.iter().zip(y).for_each(|(x, y)| sums.count(n % 3, [*x, *y], area));
+        }
     }
 
     /// Writes B at (u, v) for every isovalue to `out`: three channels of `isovalues()` numbers.
@@ -267,9 +278,17 @@ impl Flats {
         self.reflect(false);
     }
 
+    /// Sums of B in the channels that are chosen.
+    pub(super) fn light(&self, chosen: [bool; 3]) -> Sums {
+        let mut sums = Sums::default();
+        self.textures.iter().flatten().for_each(|t| t.count(&t.radiance, chosen, &mut sums));
+        sums
+    }
+
     /// As [`Flats::reflect`] while light settles, the defect included: goes ω times as far from what was before the
-    /// pass's light, which is kept for the next one. \[GV61\]
-    pub(super) fn settle(&mut self, omega: [f32; 3]) {
+    /// pass's light, which is kept for the next one. \[GV61\] Returns sums over the channels that are `measured`.
+    pub(super) fn settle(&mut self, omega: [f32; 3], measured: [bool; 3]) -> Sums {
+        let mut sums = Sums::default();
         let light: Vec<Option<Vec<f32>>> =
             self.textures.iter().map(|t| t.as_ref().map(|t| t.radiance.clone())).collect();
         for t in self.textures.iter_mut().flatten() {
@@ -279,6 +298,7 @@ impl Flats {
         self.reflect(true);
         for (t, light) in self.textures.iter_mut().zip(light) {
             let (Some(t), Some(light)) = (t, light) else { continue };
+            t.count(&light, measured, &mut sums);
             let before = std::mem::replace(&mut t.before, light);
             let nc = t.isovalues();
             let channels = t.radiance.chunks_mut(nc).zip(before.chunks(nc)).enumerate();
@@ -286,6 +306,7 @@ impl Flats {
                 y.iter_mut().zip(before).for_each(|(y, x)| *y = (x + omega[c % 3] * (*y - x)).max(0.0));
             }
         }
+        sums
     }
 
     /// Indirect irradiance of the last pass.

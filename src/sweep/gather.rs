@@ -2,7 +2,7 @@
 
 use super::accumulate::{Lines, cosine};
 use super::arrive;
-use super::directions::Shear;
+use super::directions::{Layout, Shear};
 use super::ends::{Ends, Standing};
 use super::faces::{RowEnds, Sides, Touched, Touching, inwards, note, on_side};
 use super::flats::{Flats, capped};
@@ -21,6 +21,7 @@ use super::simd::prefetch;
 use crate::flattened::Side;
 use crate::isa::Isa;
 use crate::scene::Scene;
+use crate::volume::Lattice;
 use glam::DVec3;
 use rayon::prelude::*;
 use std::sync::{Mutex, MutexGuard};
@@ -119,6 +120,16 @@ impl Family<'_> {
     }
 }
 
+/// Bytes of what a thread needs beside its rows, at most: lines are as steep as one cell a slice.
+pub(crate) fn workspace(lattice: &Lattice) -> u64 {
+    let bytes = |axis: usize| {
+        let [nu, _, na] = Layout::new(lattice.dims(), axis).dims.map(|n| n as u64);
+        // Three channels of two rows.
+        (6 * size_of::<f32>() as u64).saturating_mul(na).saturating_mul(nu + na)
+    };
+    (0..3).map(bytes).max().unwrap_or(0)
+}
+
 impl Pass<'_> {
     /// Irradiance of every node of side `n` of [`Pass::sides`] by a bounce; the flats' is added to `incoming`. `tick`
     /// is asked before every family; false stops with what is done, and is returned beside it.
@@ -130,6 +141,12 @@ impl Pass<'_> {
         tick: &mut dyn FnMut() -> bool,
     ) -> (Planes, bool) {
         let side = self.sides[n];
+        // Vectors read it at any node.
+        let nodes = self.geometry.dims.iter().product::<usize>();
+        assert!(
+            bounce.light.b.len() == self.sides.len() && bounce.light.b.iter().all(|b| b.len() == nodes),
+            "of every node"
+        );
         let of = |n: usize| bounce.light.b.get(n).map_or(&[][..], |b| &b[..]);
         let lines = bounce.lines;
         let mut e = self.spare.black(self.geometry.places());

@@ -1,4 +1,4 @@
-//! Sixteen neighbouring lines in lock-step: h and B along them, and what they end on.
+//! Sixteen neighbouring lines in lock-step: h and nodes along them, and what they end on.
 
 #![allow(clippy::needless_range_loop, reason = "a channel indexes several planes at once")]
 
@@ -258,7 +258,7 @@ impl Pack {
         }
     }
 
-    /// Reads h and B along lines (first + lane, q), where they reach the sweep. Returns whether any does.
+    /// Reads h along lines (first + lane, q), where they reach the sweep. Returns whether any does.
     #[inline(always)]
     pub(super) fn read(&mut self, plan: &Plan, source: &Source, first: isize, q: isize) -> bool {
         let nu = plan.shear.layout.dims[0];
@@ -453,7 +453,7 @@ impl Pack {
         self.node[row][lane] = (0..3).map(|a| place[a] * plan.shear.layout.node[a]).sum::<usize>() as u32;
     }
 
-    /// Finds what the lines end on and reads the radiance there. `first` and `q` as in [`Pack::read`].
+    /// Finds what the lines end on, and where its radiance is. `first` and `q` as in [`Pack::read`].
     #[inline(always)]
     pub(super) fn end(&mut self, plan: &Plan, ends: &Ends, flats: &Flats, first: isize, q: isize) {
         self.cuts.clear();

@@ -66,6 +66,12 @@ impl<'a> Mirror<'a> {
         hidden[first..].iter().take_while(|h| h.0 < nodes.end).for_each(|h| to[h.0 - nodes.start] = 0.0);
     }
 
+    /// The channels in which nodes reflect nothing.
+    pub(super) fn black(&self) -> [bool; 3] {
+        let stops = self.scene.surface.albedo.stops();
+        std::array::from_fn(|c| stops.iter().all(|stop| stop.1[c] == 0.0))
+    }
+
     /// B = Le + ρ/π Σ scale · irradiance of the sides, sharpened, and filled where no surface is; packs the flats too.
     /// `light`: one or two sets of irradiance, each with its scale; `memory`: of the same form, or empty. While light
     /// settles there is also what the pass read, and ω ≥ 1: the result goes ω times as far from `memory`, which was

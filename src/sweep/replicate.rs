@@ -12,7 +12,7 @@ use super::flats::Flats;
 use super::gather::{Bounce, Pass};
 use super::planes::{HalfPlanes, NodeLight, Planes};
 use super::reflect::{Reflected, SHARPENING};
-use super::settling::Settling;
+use super::settling::{Settling, Sums};
 use super::state::{Passes, State};
 use super::{Run, SweepSettings};
 use crate::flat;
@@ -85,7 +85,7 @@ impl Run<'_> {
     fn begin(&self, state: &State, flats: &mut Flats) -> Passes {
         let late = if self.warm(state) { LATE - 1 } else { 0 };
         let direct = (NodeLight::Half(&state.total.direct), 1.0);
-        let (light, sums) = if late > 0 {
+        let (light, mut sums) = if late > 0 {
             let share = 1.0 / state.done as f32;
             flats.take(&state.flats, share);
             let light = (NodeLight::Half(&state.total.light), share);
@@ -94,6 +94,8 @@ impl Run<'_> {
             flats.reflect_direct();
             self.mirror.reflect(flats, &[direct], Reflected::default(), None, SHARPENING)
         };
+        let black = self.mirror.black();
+        sums.take(&flats.light(black), black);
         Passes {
             light,
             before: Reflected::default(),
@@ -224,18 +226,19 @@ impl Run<'_> {
                 now.settling.again();
             }
             let omega = now.settling.omega();
-            if settles {
-                flats.settle(omega);
+            let settling = if settles {
+                Some((omega, flats.settle(omega, self.mirror.black())))
             } else {
                 now.late += usize::from(kind == Kind::Late);
                 now.settling.since += 1;
                 flats.reflect(true);
-            }
+                None
+            };
             if now.late == LATE || bounce == s.max_bounces {
                 indirect = received;
                 break;
             }
-            self.reflect(state, &mut now, flats, &received, settles.then_some(omega));
+            self.reflect(state, &mut now, flats, &received, settling);
             if let Some((nodes, flats_by_few)) = by_few {
                 // (T − T₁) x₁. [Stetter78]
                 now.defect = nodes.into_iter().zip(&received).map(|(few, all)| few.short_of(all)).collect();
@@ -278,25 +281,26 @@ impl Run<'_> {
     }
 
     /// What nodes and flats reflect of direct light and what nodes `received`; while light settles, mixed with the
-    /// bounces before by Chebyshev's `omega`.
+    /// bounces before by Chebyshev's ω, beside which stands what the pass changed on flats.
     fn reflect(
         &self,
         state: &State,
         now: &mut Passes,
         flats: &mut Flats,
         received: &[Planes],
-        omega: Option<[f32; 3]>,
+        settling: Option<([f32; 3], Sums)>,
     ) {
         let mut light = vec![(NodeLight::Half(&state.total.direct), 1.0), (NodeLight::Full(received), 1.0)];
         if !now.defect.is_empty() {
             light.push((NodeLight::Signed(&now.defect), 1.0));
         }
-        if let Some(omega) = omega {
+        if let Some((omega, on_flats)) = settling {
             let memory = std::mem::take(&mut now.before);
             // Where light is rough, along few directions, sharpening may make each bounce brighter than the last.
             let sharpening = if now.settling.grows() { 0.0 } else { SHARPENING };
             let relaxed = Some((&now.light, omega));
-            let (reflected, sums) = self.mirror.reflect(flats, &light, memory, relaxed, sharpening);
+            let (reflected, mut sums) = self.mirror.reflect(flats, &light, memory, relaxed, sharpening);
+            sums.take(&on_flats, self.mirror.black());
             now.before = std::mem::replace(&mut now.light, reflected);
             now.settling.push(sums);
         } else {

@@ -184,14 +184,20 @@ impl Segments {
         (near + g * (far - near), [i, j, k])
     }
 
-    /// What h spans along a lane of [`Segments::set`], from one gap of samples that are not finite to the next. It
+    /// What h spans along a lane, from one gap of samples that are not finite to the next. It
     /// falls to −∞ at caps, where the segment enters and leaves Ω if `caps` says so.
     pub(super) fn ranges(&self, h: &[f32], lane: usize, mut caps: [bool; 2]) -> Vec<[f32; 2]> {
         let slices = (0..self.count[lane]).map(|step| self.sample(h, lane, step).0);
         if self.falls[lane] {
             caps.reverse();
         }
-        let [before, behind] = self.ends.each_ref().map(|h| h[lane]);
+        let mut ends = self.ends.each_ref().map(|h| h[lane]);
+        // From the node on, which is where it ends.
+        if self.way[lane] < 0 {
+            ends.reverse();
+            caps.reverse();
+        }
+        let [before, behind] = ends;
         let mut ranges = vec![];
         let [enters, leaves] = [(caps[0], before), (caps[1], behind)].map(|(cap, h)| cap && !h.is_nan());
         let mut gap = true;

@@ -48,7 +48,8 @@ const APART: f64 = 10.0;
 /// Smaller changes, as a share of light, say nothing more of r once it is known: light is kept to 2⁻¹² of each number.
 const ROUNDING: f64 = 1.0 / 4096.0;
 
-/// Sums over nodes that show light of their own and over sides, per channel.
+/// Sums over nodes that show light of their own and over sides, per channel; where nodes reflect nothing, over flats,
+/// each texel times its area.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Sums {
     /// Σ y.
@@ -60,6 +61,21 @@ pub(super) struct Sums {
 }
 
 impl Sums {
+    /// Adds what a pass made `y` of light that was `x`, in channel `c`, times `scale`.
+    pub(super) fn count(&mut self, c: usize, [x, y]: [f32; 2], scale: f64) {
+        let [x, y] = [x, y].map(f64::from);
+        self.light[c] += scale * y;
+        self.change[c] += scale * (y - x).abs();
+        self.drift[c] += scale * (y - x);
+    }
+
+    /// Takes the channels that are chosen from others.
+    pub(super) fn take(&mut self, other: &Self, chosen: [bool; 3]) {
+        for c in (0..3).filter(|&c| chosen[c]) {
+            (self.light[c], self.change[c], self.drift[c]) = (other.light[c], other.change[c], other.drift[c]);
+        }
+    }
+
     /// Adds others, times `scale`.
     pub(super) fn add(&mut self, other: &Self, scale: f64) {
         for c in 0..3 {

@@ -104,7 +104,7 @@ impl State {
         out.count(self.bounces);
         out.real(self.residual);
         let c = self.counts;
-        for n in [c.gather_rays, c.shadow_rays, c.families, c.valid, c.masked] {
+        for n in [c.gather_rays, c.shadow_rays, c.families, c.valid] {
             out.bytes.extend(n.to_le_bytes());
         }
         out.count(self.total.lit);
@@ -176,13 +176,8 @@ impl State {
         state.bounces = from.count()?;
         state.residual = from.real()?;
         let mut count = || from.count().map(|n| n as u64);
-        state.counts = SweepCounts {
-            gather_rays: count()?,
-            shadow_rays: count()?,
-            families: count()?,
-            valid: count()?,
-            masked: count()?,
-        };
+        state.counts =
+            SweepCounts { gather_rays: count()?, shadow_rays: count()?, families: count()?, valid: count()? };
         state.flats = flats.textures.iter().map(|_| None).collect();
         state.total.lit = from.count()?;
         let mut direct = Vec::new();
@@ -203,9 +198,11 @@ impl State {
                 direct.push(from.numbers(t.direct.len())?);
             }
         }
+        // Of every side or of none.
+        let of = |count: usize| (count == 0 || count == sides).then_some(count);
         let bounced = from.count()?;
         if state.done > 0 {
-            state.total.light = from.half_planes(bounced.min(sides), places)?;
+            state.total.light = from.half_planes(of(bounced)?, places)?;
             for (sum, texture) in state.flats.iter_mut().zip(&flats.textures) {
                 if let Some(t) = texture {
                     *sum = Some(from.numbers(t.radiance.len())?);
@@ -217,16 +214,20 @@ impl State {
             let (bounce, late) = (from.count()?, from.count()?);
             let mut reflected = || {
                 let [unit] = from.numbers(1)?.try_into().ok()?;
-                let b = (0..from.count()?.min(sides)).map(|_| from.four_halves(nodes)).collect::<Option<_>>()?;
+                let b = (0..of(from.count()?)?).map(|_| from.four_halves(nodes)).collect::<Option<_>>()?;
                 Some(Reflected { b, unit })
             };
             let (light, before) = (reflected()?, reflected()?);
+            // What is gathered next is read without looking.
+            if light.b.len() != sides {
+                return None;
+            }
             let mut settling = Settling::new([0.0; 3]);
             (settling.passes, settling.since) = (from.count()?, from.count()?);
             for three in settling.reals() {
                 *three = from.three()?;
             }
-            let (corrected, defects) = (from.count()? == 1, from.count()?.min(sides));
+            let (corrected, defects) = (from.count()? == 1, of(from.count()?)?);
             let mut three = || Some([from.halves(places)?, from.halves(places)?, from.halves(places)?]);
             let defect = (0..defects).map(|_| three()).collect::<Option<_>>()?;
             let mut textures = Vec::new();
@@ -365,6 +366,7 @@ impl Reader<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::isovalue_axis::IsovalueAxis;
 
     /// Runs of zeros, numbers that are not, minus zero among zeros, and an end within a run.
     #[test]
@@ -389,6 +391,37 @@ mod tests {
         assert_eq!(back.1, halves);
         for cut in [1, 17, out.bytes.len() / 2, out.bytes.len()] {
             assert_eq!(read(&out.bytes[..out.bytes.len() - cut]), None);
+        }
+    }
+
+    /// Gathering reads light by number without looking: a state without it, or of another number of sides, is none.
+    #[test]
+    fn passes_under_way_have_light_of_all_sides() {
+        let none = || Flats {
+            textures: Vec::new(),
+            count: 0,
+            solid: Vec::new(),
+            isovalues: 1,
+            axis: IsovalueAxis::around(0.5),
+            centres: Vec::new(),
+            packed: Vec::new(),
+        };
+        let read = |lit: usize, before: usize, defects: usize| {
+            let (sides, size) = ([Side::Lower, Side::Higher], [4, 3]);
+            let of = |count: usize| Reflected { b: vec![vec![[1, 2, 3, 0]; size[0]]; count], unit: 1.0 };
+            let defect = (0..defects).map(|_| [0, 1, 2].map(|_| vec![0; size[1]])).collect();
+            let settling = Settling::new([1.0; 3]);
+            let passes =
+                Passes { light: of(lit), before: of(before), settling, corrected: false, defect, late: 0, bounce: 1 };
+            let mut state = State::new(&sides, 2, size, 1);
+            let bytes = state.bytes(Some(&passes), &none());
+            state.restore(&bytes, 2, &mut none()).map(|p| [p.light.b.len(), p.before.b.len(), p.defect.len()])
+        };
+        for whole in [[2, 0, 0], [2, 2, 0], [2, 2, 2]] {
+            assert_eq!(read(whole[0], whole[1], whole[2]), Some(whole));
+        }
+        for wrong in [[0, 0, 0], [1, 2, 0], [3, 2, 0], [2, 1, 0], [2, 3, 0], [2, 2, 1], [2, 2, 3]] {
+            assert_eq!(read(wrong[0], wrong[1], wrong[2]), None, "{wrong:?}");
         }
     }
 }

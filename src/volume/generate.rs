@@ -1,6 +1,7 @@
 //! Analytic fields on `[0,1]³` with exact value and gradient: what the tests know the answers of. Simulated ones stand
 //! in the modules.
 
+pub mod bumps;
 pub mod fluid;
 pub mod molecular_dynamics;
 pub mod neighbours;

@@ -1,6 +1,6 @@
 //! `compare`: what it takes for a reference of a bake, what it finds without, and what it writes.
 
-use super::{QUICK, isolume, ok, refused, text};
+use super::{Folder, QUICK, isolume, ok, refused, text};
 use glam::DVec3;
 use isolume::accuracy::SurveySettings;
 use isolume::embree::{Device, GraphTracer};
@@ -40,7 +40,7 @@ fn unsigned(dir: &Path, from: &str, to: &str) {
 
 #[test]
 fn references_of_other_volumes_and_isovalues_are_refused() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "15", "-o", "b.vti", "-q"]);
     cone(1.0).write(dir.join("cone.vti")).unwrap();
@@ -75,7 +75,7 @@ fn references_of_other_volumes_and_isovalues_are_refused() {
 
 #[test]
 fn bakes_of_any_grid_and_sweep_take_the_volumes_references() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "15", "-o", "b.vti", "-q"]);
     for isovalue in ["30", "90"] {
@@ -95,7 +95,7 @@ fn bakes_of_any_grid_and_sweep_take_the_volumes_references() {
 
 #[test]
 fn another_material_or_box_is_warned_of() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
     bake(dir, "b.vti", "lit.vti", &RANGE);
@@ -144,7 +144,7 @@ fn survey(dir: &Path, file: &str, more: &[&str]) -> serde_json::Value {
 /// threads; and farther if some of its light is missing.
 #[test]
 fn all_isosurfaces_are_compared_with_paths() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "31", "-o", "b.vti", "-q"]);
     ok(dir, &[&["bake", "b.vti", "-o", "lit.vti", "--preset", "preview", "-q"], &RANGE[..]].concat());
@@ -192,7 +192,7 @@ fn all_isosurfaces_are_compared_with_paths() {
 /// Paths see the volume's normals, not those of a grid twice as fine, as long as the file tells them.
 #[test]
 fn finer_grids_are_compared_on_the_volume_they_are_of() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
     let field = |file: &str| BakedVolume::read(&dir.join(file)).unwrap().source().unwrap();
@@ -222,7 +222,7 @@ fn finer_grids_are_compared_on_the_volume_they_are_of() {
 /// Slices four voxels apart: without a grid of its own a bake warns of that, and cubes have a fraction of the error.
 #[test]
 fn cubic_grids_suit_long_voxels() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     let lattice = Lattice::aligned([21, 21, 6], DVec3::ZERO, DVec3::new(0.05, 0.05, 0.2)).unwrap();
     let bumps =
@@ -267,7 +267,7 @@ fn cubic_grids_suit_long_voxels() {
 
 #[test]
 fn several_volumes_are_compared_one_by_one_with_all_of_them_there() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
     let volume = |name: &str, origin: &str| {
@@ -282,13 +282,17 @@ fn several_volumes_are_compared_one_by_one_with_all_of_them_there() {
     assert!(first == left && left != right, "{left} {right}");
     refused(dir, &["compare", "two-left.vti"], &["two-left.vti", "name the .vtm"]);
     refused(dir, &["compare", "two.vtm", "--field", "middle"], &["two.vtm", "left", "right"]);
+    // A bake that was killed while its files took their names leaves a mixture with the one before.
+    bake(dir, "two.toml", "other.vtm", &["--engine", "photon", "--seed", "2"]);
+    fs::copy(dir.join("other-right.vti"), dir.join("two-right.vti")).unwrap();
+    refused(dir, &["compare", "two.vtm"], &["two.vtm", "of different bakes"]);
 }
 
 /// Errors are measured in the colours of the bake. Its exposure is that of the brighter volume, too, which path tracing
 /// the other one does not need.
 #[test]
 fn volumes_that_see_nothing_of_each_other_are_compared_in_the_colours_of_both() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
     let volume = |name: &str, albedo: f64| {
@@ -312,7 +316,7 @@ fn volumes_that_see_nothing_of_each_other_are_compared_in_the_colours_of_both() 
 
 #[test]
 fn what_is_for_the_other_way_to_compare_is_refused() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
     bake(dir, "b.vti", "lit.vti", &RANGE);
@@ -335,7 +339,7 @@ fn what_is_for_the_other_way_to_compare_is_refused() {
 /// Surfaces that shine brighter than what is displayed show no error, however wrong they are.
 #[test]
 fn what_is_too_bright_to_show_an_error_is_told() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
     let few = ["--points", "100", "--paths", "4"];
@@ -357,7 +361,7 @@ fn what_is_too_bright_to_show_an_error_is_told() {
 /// `error` and colour of every vertex of `compare -o`, from the two files that were compared.
 #[test]
 fn the_mesh_of_errors_holds_them() {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = Folder::new();
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
     bake(dir, "b.vti", "lit.vti", &RANGE);

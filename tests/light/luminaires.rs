@@ -2,7 +2,7 @@
 
 use crate::support::*;
 use glam::DVec3;
-use isolume::bake::{BakeSettings, Engine};
+use isolume::bake::{BakeOptions, BakeSettings, Engine, Preset};
 use isolume::direct::{Receiver, direct_irradiance, direct_once};
 use isolume::embree::{Device, GraphTracer};
 use isolume::flattened::{Departure, Side, SurfacePoint};
@@ -12,7 +12,7 @@ use isolume::mask::Mask;
 use isolume::polygon::Polygon;
 use isolume::reference::PathTracer;
 use isolume::rng::{Rng, Stage};
-use isolume::scene::{Scene, Surface};
+use isolume::scene::{Boundary, Scene, Surface};
 use std::f64::consts::PI;
 
 const RED: DVec3 = DVec3::new(9.0, 0.0, 0.0);
@@ -251,5 +251,36 @@ fn plateaus_emit_nothing() {
         println!("{outside:?}: {} landings, {} rays, {total:?}", photons.stored(), photons.rays);
         assert!(total.emitted > 0.0 && total.imbalance() < 1e-12);
         assert!(photons.rays <= 2 * photons.emitted, "{} rays", photons.rays);
+    }
+}
+
+/// A luminaire whose light does not reach the middle of the volume counts as any other, where points are fitted, too.
+#[test]
+fn light_that_the_middle_does_not_see_is_split() {
+    let lattice = lattice([20; 3], DVec3::ZERO, DVec3::splat(19.0));
+    let middle = DVec3::splat(9.5);
+    // A ball with a front of less than a step.
+    let ball = field(lattice, 0.2, 0.8, |x| (0.5 + (6.0 - x.distance(middle))).clamp(0.0, 1.0));
+    let lamp = rectangle("lamp", DVec3::new(25.5, 9.5, 11.0), 4.5 * DVec3::X, 9.5 * DVec3::Y, 0.0, 1.0);
+    let surface = Surface { outside: Side::Lower, ..Surface::default() };
+    let scene = Scene::new(ball, surface, Boundary::Open, vec![lamp]).unwrap();
+    assert_eq!(scene.reference_irradiance(), 0.0);
+    for engine in [Engine::Photon, Engine::Sweep] {
+        let options = BakeOptions {
+            engine: Some(engine),
+            preset: Some(Preset::Preview),
+            split: Some(true),
+            photons: Some(1 << 14),
+            ..BakeOptions::default()
+        };
+        let settings = BakeSettings::new(&options, &scene).unwrap();
+        let baked = run(&scene, &settings);
+        let grid = &baked.sides[0].1;
+        let split = grid.split.as_ref().unwrap();
+        let lit = |o: &usize| grid.mask[*o] == Mask::Filled && grid.radiance[*o][1] > 0.01;
+        let filled: Vec<usize> = (0..grid.mask.len()).filter(lit).collect();
+        let seen = filled.iter().filter(|&&o| split.visible[o][1] > 0.0).count();
+        println!("{engine:?}: {seen} of {} filled points see the luminaire", filled.len());
+        assert!(filled.len() > 50 && seen * 10 >= filled.len() * 9);
     }
 }

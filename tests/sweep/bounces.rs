@@ -260,3 +260,26 @@ fn what_bounces_is_the_light_of_all_replicates() {
     println!("direct {direct:.4}, indirect {indirect:.4} {errors:.4?}");
     assert!(indirect < direct, "{indirect} of indirect, {direct} of direct light");
 }
+
+/// Black balls that shine in bright walls that shine as much as they absorb: everything sends 1 everywhere, where light
+/// settles on walls alone; in the green channel balls reflect, too.
+#[test]
+fn walls_settle_around_black_surfaces() {
+    let f = bumps(21);
+    let albedo = DVec3::new(0.93, 0.8, 0.93);
+    let mut walls = emissive_box(f.lattice(), 0.0, 1.0);
+    for wall in &mut walls {
+        (wall.albedo, wall.emission) = (albedo, DVec3::ONE - albedo);
+    }
+    let black = DVec3::new(0.0, 0.5, 0.0);
+    let surface = Surface { albedo: black.into(), emission: DVec3::ONE - black, ..Surface::default() };
+    let scene = Scene::new(f, surface, Boundary::Open, walls).unwrap();
+    let got = run(&scene, SweepSettings { max_bounces: 128, target: 4e-3, flat_resolution: (8, 12), ..ONE_BOUNCE });
+    println!("{} bounces, {} left out", got.bounces, got.residual);
+    for (wall, polygon) in got.flats.iter().zip(scene.polygons()) {
+        let texels = &wall.as_ref().unwrap().outside.texels;
+        let mean = [0, 1, 2].map(|c| texels.iter().map(|t| f64::from(t[c])).sum::<f64>() / texels.len() as f64);
+        println!("{}: {mean:.4?}", polygon.name);
+        assert!(mean.iter().all(|m| (m - 1.0).abs() < 0.02), "{}: {mean:?}", polygon.name);
+    }
+}

@@ -12,6 +12,7 @@ use crate::rng::{Sobol, Stage};
 use crate::scene::Scene;
 use crate::sweep::blockers::Blockers;
 use crate::sweep::flats::capped;
+use crate::sweep::grid::Geometry;
 use crate::sweep::pack::LANES;
 use crate::sweep::points::Points;
 use crate::sweep::segments::Segments;
@@ -39,7 +40,7 @@ impl Direct<'_> {
             }
             let (first, _) = lit.run(row);
             let mut looks =
-                Looks { isa, h: geometry.h, sums, segments: Segments::NONE, taken: 0, looks: [Look::NONE; LANES] };
+                Looks { isa, geometry, sums, segments: Segments::NONE, taken: 0, looks: [Look::NONE; LANES] };
             geometry.lit_nodes(row, |i| {
                 let x = DVec3::new(i as f64, j, k);
                 let world = lattice.to_world(x);
@@ -90,7 +91,7 @@ impl Look {
 /// Looks of the nodes of a row, as many at a time as there are lanes.
 struct Looks<'a> {
     isa: Isa,
-    h: &'a [f32],
+    geometry: &'a Geometry<'a>,
     sums: &'a mut [[f32; 2]],
     segments: Segments,
     taken: usize,
@@ -115,10 +116,18 @@ impl Looks<'_> {
 
     /// Adds what those that were taken see.
     fn finish(&mut self) {
-        self.isa.extrema(self.h, &mut self.segments, None);
+        let (h, gaps) = (self.geometry.h, self.geometry.has_gaps());
+        if !gaps {
+            self.isa.extrema(h, &mut self.segments, None);
+        }
         let Segments { least, most, .. } = &self.segments;
         for (lane, look) in self.looks[..self.taken].iter().enumerate() {
             let open = match look.side {
+                // Only what holds the isovalue itself between two gaps hides it.
+                _ if gaps => {
+                    let ranges = self.segments.ranges(h, lane, [false; 2]);
+                    !ranges.iter().any(|[least, most]| *least < look.h && *most >= look.h)
+                }
                 Side::Lower => most[lane] < look.h,
                 Side::Higher => least[lane] >= look.h,
             };
