@@ -378,6 +378,18 @@ mod tests {
     }
 
     #[test]
+    fn areas_and_centroids_have_no_winding() {
+        let mut square = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]].map(DVec2::from_array);
+        for _ in 0..2 {
+            assert_eq!(area_and_centroid(&square), (1.0, DVec2::splat(0.5)));
+            assert_eq!(area_and_centroid(&square[..2]), (0.0, DVec2::splat(0.5)));
+            square.reverse();
+        }
+        let (area, centroid) = area_and_centroid(&[DVec2::ZERO, DVec2::new(0.9, 0.0), DVec2::new(0.0, 0.6)]);
+        assert!((area - 0.27).abs() < 1e-15 && centroid.distance(DVec2::new(0.3, 0.2)) < 1e-15, "{area} {centroid}");
+    }
+
+    #[test]
     fn long_walls_have_more_texels_across() {
         let wall = |u: f64, v: f64, span: f64| Flat {
             corner: DVec3::ZERO,

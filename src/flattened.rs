@@ -271,6 +271,16 @@ mod tests {
     }
 
     #[test]
+    fn faces_keep_whose_they_are() {
+        for face in 0..6 {
+            assert_eq!(split_face(face), (None, face));
+            for n in 0..MAX_COMPANIONS {
+                assert_eq!(split_face(face_of(n, face)), (Some(n), face));
+            }
+        }
+    }
+
+    #[test]
     fn rays_enter_through_the_nearest_face_that_all_slabs_share() {
         let of = |o: [f64; 2], d: [f64; 2], reach| enter([4, 2], o, d, d.map(|x| 1.0 / x), reach);
         let at = |t, axis| Some(Entry { t, axis });

@@ -311,7 +311,11 @@ mod tests {
             let normal = scene.normal(position, side).unwrap();
             let departure = Departure::Surface(side);
             let receiver = Receiver { position: position.as_vec3(), normal, isovalue: 0.47, departure };
-            gathered_irradiance(&scene, &tracer, &cache, &receiver, 1024, Stage::Gather.key(1, 1)).estimate.mean.x
+            let found = gathered_irradiance(&scene, &tracer, &cache, &receiver, 1024, Stage::Gather.key(1, 1));
+            let [a, b] = found.halves.map(|half| half.x);
+            // Two halves, of which the whole is the mean.
+            assert!(a != b && (0.5 * (a + b) / found.estimate.mean.x - 1.0).abs() < 1e-12, "{found:?}");
+            found.estimate.mean.x
         });
         println!("{light:?}");
         assert!((light[0] / light[1] / 4.0 - 1.0).abs() < 0.05, "{light:?}");

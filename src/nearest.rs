@@ -218,7 +218,7 @@ impl PointGrid {
                                     out.replace_top((d2, slot));
                                 }
                                 if out.heap.len() == k {
-                                    limit = out.heap[0].0.min(limit);
+                                    limit = out.heap[0].0;
                                 }
                             }
                         }
@@ -249,7 +249,8 @@ mod tests {
         let mut point = |flat: bool| {
             Vec3::new(rng.unit() as f32 * 3.0, rng.unit() as f32, if flat { 0.5 } else { rng.unit() as f32 * 0.2 })
         };
-        for flat in [false, true] {
+        for (flat, away) in [(false, Vec3::ZERO), (true, Vec3::ZERO), (false, Vec3::new(-7.0, 100.0, 3.0))] {
+            let mut point = |flat: bool| away + point(flat);
             let points: Vec<Vec3> = (0..5000).map(|_| point(flat)).collect();
             let grid = PointGrid::new(&points, 4.0);
             let mut out = Neighbours::default();

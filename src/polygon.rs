@@ -417,18 +417,22 @@ mod tests {
 
     #[test]
     fn distances_to_face_edge_and_corner() {
-        let p = square();
-        let [a, b, _, d] = p.vertices().try_into().unwrap();
-        let (s, t) = ((b - a).normalize(), (d - a).normalize());
-        let middle = 0.5 * (b + d);
-        for (x, expected) in [
-            (middle + 0.3 * p.normal(), 0.3),
-            (middle - 0.3 * p.normal(), 0.3),
-            (0.5 * (a + d) - 0.3 * s + 0.4 * p.normal(), 0.5),
-            (a - 0.2 * s - 0.2 * t + 0.1 * p.normal(), 0.3),
-        ] {
-            assert!((p.distance(x) - expected).abs() < 1e-12, "{x}: {} {expected}", p.distance(x));
-            assert!(p.is_nearer(x, expected + 1e-9) && !p.is_nearer(x, expected - 1e-9), "{x}");
+        let turned = DMat3::from_axis_angle(DVec3::new(2.0, -1.0, 3.0).normalize(), 1.1);
+        for (turn, away) in [(DMat3::IDENTITY, DVec3::ZERO), (turned, DVec3::new(40.0, -70.0, 90.0))] {
+            let vertices = square().vertices().iter().map(|v| away + turn * *v).collect();
+            let p = Polygon::new("s", vertices, DVec3::ONE, DVec3::ZERO).unwrap();
+            let [a, b, _, d] = p.vertices().try_into().unwrap();
+            let (s, t) = ((b - a).normalize(), (d - a).normalize());
+            let middle = 0.5 * (b + d);
+            for (x, expected) in [
+                (middle + 0.3 * p.normal(), 0.3),
+                (middle - 0.3 * p.normal(), 0.3),
+                (0.5 * (a + d) - 0.3 * s + 0.4 * p.normal(), 0.5),
+                (a - 0.2 * s - 0.2 * t + 0.1 * p.normal(), 0.3),
+            ] {
+                assert!((p.distance(x) - expected).abs() < 1e-12, "{x}: {} {expected}", p.distance(x));
+                assert!(p.is_nearer(x, expected + 1e-9) && !p.is_nearer(x, expected - 1e-9), "{x}");
+            }
         }
     }
 

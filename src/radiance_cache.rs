@@ -483,6 +483,27 @@ mod tests {
         SurfacePoint { target: Target::Surface(Side::Lower), within: false, position, isovalue }
     }
 
+    /// On one level set light is read between nodes as it is, along each axis alike.
+    #[test]
+    fn light_is_linear_between_nodes_of_one_isovalue() {
+        let lattice = Lattice::aligned([4, 5, 6], DVec3::ZERO, DVec3::ONE).unwrap();
+        let volume = Volume::new("x", lattice.clone(), Samples::F32(vec![0.5; lattice.len()])).unwrap();
+        let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+        let scene =
+            Scene::new(field, Surface { albedo: DVec3::ONE.into(), ..Surface::default() }, Boundary::Open, vec![]);
+        let scene = scene.unwrap();
+        let light = |p: DVec3| 1.0 + p.dot(DVec3::new(0.1, 0.3, 0.7));
+        let at = |o: usize| DVec3::from_array(lattice.ijk(o).map(|i| i as f64));
+        let nodes: Vec<_> = (0..lattice.len()).map(|o| [light(at(o)) as f32; 3]).collect();
+        let stored = NodeSet::all(nodes.len());
+        let field = FieldNodes { stored, filled: Nodes::default(), sides: [Some(nodes), None] };
+        let cache = RadianceCache { nodes: vec![Some(field)], flats: vec![], shown: None, rays: 0 };
+        for p in [DVec3::new(0.2, 0.3, 0.9), DVec3::new(2.9, 1.5, 2.1), DVec3::new(1.5, 3.9, 4.5)] {
+            let found = cache.lookup(&scene, on_surface(p, 0.5), &mut 0).x;
+            assert!((found - light(p)).abs() < 2e-5, "{p}: {found} {}", light(p));
+        }
+    }
+
     /// Σ|found − there| and Σ|trilinear − there| over places whose light is a function of the isovalue.
     fn off(light: impl Fn(f64) -> f64) -> [f64; 2] {
         let scene = planes();

@@ -158,6 +158,16 @@ mod tests {
     use crate::stats::{normal_quantile, sidak};
     use crate::volume::{Lattice, Samples, Volume};
 
+    /// The first cell is one as any other.
+    #[test]
+    fn cells_are_counted_from_the_first() {
+        let lattice = Lattice::aligned([2; 3], DVec3::ZERO, DVec3::ONE).unwrap();
+        let samples = (0..8).map(|o| o as f32).collect();
+        let volume = Volume::new("x", lattice, Samples::F32(samples)).unwrap();
+        let on = |lo, hi| cells_on_sweep(&Field::new(&volume, Sweep::new(lo, hi).unwrap()).unwrap());
+        assert_eq!(on(2.0, 3.0), [0]);
+    }
+
     /// Of 10⁶ points one lies on such a sweep: a search for all would take minutes.
     #[test]
     fn what_is_at_hand_takes_no_search() {

@@ -132,6 +132,8 @@ mod tests {
         // NIST tables: χ²(0.05; 10) = 18.307, χ²(0.01; 100) = 135.807; two-sided normal 1.959964 and 2.575829.
         assert!((chi_square_p(18.307, 10) - 0.05).abs() < 1e-5);
         assert!((chi_square_p(135.807, 100) - 0.01).abs() < 1e-6);
+        // Four degrees: e^(−x/2) (1 + x/2).
+        assert!((chi_square_p(2.0, 4) - 2.0 * (-1f64).exp()).abs() < 1e-13);
         assert!((normal_p(1.959_964) - 0.05).abs() < 1e-7);
         assert!((normal_quantile(0.01) - 2.575_829).abs() < 1e-5);
         assert!((sidak(0.05, 10) - 0.005_116_2).abs() < 1e-7);

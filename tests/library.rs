@@ -189,3 +189,43 @@ fn errors_of_scene_files_keep_their_kind() {
     let error = found("[volume]\ngenerator = \"none\"\n");
     assert!(matches!(&error, Error::Invalid(m) if m.contains("scene.toml:2: generator: ")), "{error:?}");
 }
+
+/// Walls in the faces that caps close, on either side, and voxels of which a side is too long.
+#[test]
+fn what_cannot_stand_together_is_refused() {
+    let good = scene(9);
+    let walls = cornell_box(good.lattice(), 0.0).unwrap();
+    let mut faces = 0;
+    for wall in walls.into_iter().filter(|wall| wall.emission == DVec3::ZERO) {
+        let with = |boundary| Scene::new(good.field.clone(), Surface::default(), boundary, vec![wall.clone()]);
+        assert!(with(Boundary::Open).is_ok(), "{}", wall.name);
+        assert!(matches!(with(Boundary::Capped), Err(Error::Invalid(_))), "{}", wall.name);
+        faces += 1;
+    }
+    assert_eq!(faces, 5);
+    for long in [DVec3::new(1e17, 1.0, 1.0), DVec3::new(1.0, 1.0, 1e17), DVec3::new(1.0, 1e-17, 1.0)] {
+        let lattice = Lattice::aligned([3; 3], DVec3::ZERO, long).unwrap();
+        let volume = Volume::new("x", lattice, Samples::F32((0..27).map(|o| o as f32).collect())).unwrap();
+        let field = Field::new(&volume, Sweep::new(2.0, 20.0).unwrap()).unwrap();
+        let found = Scene::new(field, Surface::default(), Boundary::Open, Vec::new());
+        assert!(matches!(found, Err(Error::Invalid(_))), "{long}");
+    }
+}
+
+/// A sweep holds its ends.
+#[test]
+fn the_ends_of_a_sweep_are_drawn_and_extracted() {
+    let scene = scene(13);
+    let device = Device::new(1).unwrap();
+    let camera = Camera { samples: 1, ..Camera::facing(&scene, 8) };
+    for isovalue in [0.2, 0.4] {
+        render(&scene, isovalue, &camera, Shading::Local(1.0), &device, Progress::Quiet).unwrap();
+        let unit = scene.field.sweep().isovalue(isovalue);
+        let mesh = isosurface::extract(scene.lattice().dims(), scene.field.samples(), unit).unwrap();
+        assert!(!SurfaceMesh::new(&scene, mesh).unwrap().triangles.is_empty());
+    }
+    for outside in [0.199, 0.401] {
+        let drawn = render(&scene, outside, &camera, Shading::Local(1.0), &device, Progress::Quiet);
+        assert!(matches!(drawn, Err(Error::Invalid(_))), "{outside}");
+    }
+}

@@ -546,7 +546,7 @@ fn pictures_from_beside_have_noise_of_their_own() {
         (1..39).contains(&x) && (1..39).contains(&y) && [n - 1, n + 1, n - 40, n + 40].into_iter().all(around)
     };
     let pixels: Vec<usize> = (0..1600).filter(even).collect();
-    assert!(pixels.len() > 600, "{}", pixels.len());
+    assert!(pixels.len() > 150, "{}", pixels.len());
     let [a, b] = [&facing, &moved].map(|camera| {
         let noisy = picture(camera, 1);
         pixels.iter().map(|&n| f64::from(noisy[n][1] - clean[n][1])).collect::<Vec<_>>()

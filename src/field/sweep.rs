@@ -17,7 +17,8 @@ impl Sweep {
     /// # Errors
     /// `Invalid` unless both are finite and lo < hi.
     pub fn new(lo: f64, hi: f64) -> Result<Self> {
-        if lo.is_finite() && hi.is_finite() && lo < hi && (hi - lo).is_finite() {
+        // Which it is not if one of them is infinite.
+        if lo < hi && (hi - lo).is_finite() {
             Ok(Self { lo, hi })
         } else {
             Err(Error::Invalid(format!(
@@ -70,8 +71,23 @@ mod tests {
     use super::*;
 
     #[test]
+    fn the_ends_are_kept_bit_for_bit() {
+        let mut rounded = 0;
+        for n in 1..1000 {
+            let (lo, hi) = (f64::from(n).sqrt(), 1e3 / f64::from(n) + 40.0);
+            let sweep = Sweep::new(lo, hi).unwrap();
+            assert_eq!([0.0, 1.0].map(|s| sweep.from_unit(s)), [lo, hi]);
+            rounded += u32::from(lo + (hi - lo) != hi);
+        }
+        assert!(rounded > 10, "{rounded}");
+    }
+
+    #[test]
     fn sweeps_are_written_with_all_digits() {
         assert_eq!(Sweep::new(-3.5, 1e20).unwrap().to_string(), "-3.5 … 1e20");
+        for [lo, hi] in [[1.0, f64::INFINITY], [f64::NEG_INFINITY, 1.0], [f64::NAN, 1.0], [-1e308, 1e308], [1.0, 1.0]] {
+            assert!(Sweep::new(lo, hi).is_err(), "{lo} {hi}");
+        }
         assert!(Sweep::new(1e300, 1.0).unwrap_err().to_string().contains("isovalues 1e300 1:"));
     }
 }

@@ -55,8 +55,9 @@ fn ray(field: &Field, rng: &mut Rng, levels: f64) -> FlattenedRay {
 
 #[test]
 fn with_and_without_simd_hits_are_the_same_bits() {
-    // Below and above one node of the top level, thin, and off the grid of blocks.
-    for (dims, levels) in [([70, 66, 67], 1e4), ([5, 4, 9], 7.0), ([300, 30, 21], 40.0), ([2, 101, 33], 1e3)] {
+    // Below and above one node of the top level along each axis, thin, and off the grid of blocks.
+    let along = [([300, 30, 21], 40.0), ([21, 300, 30], 40.0), ([30, 21, 300], 40.0)];
+    for (dims, levels) in [([70, 66, 67], 1e4), ([5, 4, 9], 7.0), ([2, 101, 33], 1e3)].into_iter().chain(along) {
         let field = field(dims, levels);
         let mut rng = Rng::stream(3, Stage::Test, dims[0] as u64);
         for capped in [false, true] {
@@ -319,16 +320,17 @@ fn wrong_hits(field: &Field, count: u64) -> (u64, u64) {
     (0..count).into_par_iter().map(judge).reduce(|| (0, 0), |a, b| (a.0 + b.0, a.1 + b.1))
 }
 
-/// Smooth, noise, plateaus of four levels, and a range that is a hundred thousandth of its place.
-fn hard_fields() -> [Field; 4] {
-    [field([70, 66, 67], 1e4), noise(255, 0.0), noise(4, 0.0), noise(255, 2.55e7)]
+/// Smooth, also with several nodes of the top level, noise, plateaus of four levels, and a range that is a hundred
+/// thousandth of its place.
+fn hard_fields() -> [Field; 5] {
+    [field([70, 66, 67], 1e4), field([21, 300, 300], 1e4), noise(255, 0.0), noise(4, 0.0), noise(255, 2.55e7)]
 }
 
 #[test]
 fn first_hits_are_those_of_a_plain_walk_in_f64() {
     for (n, field) in hard_fields().iter().enumerate() {
         let (wrong, hits) = wrong_hits(field, 30_000);
-        assert!(wrong == 0 && hits > 6_000, "field {n}: {wrong} of {hits} hits are wrong");
+        assert!(wrong == 0 && hits > 5_000, "field {n}: {wrong} of {hits} hits are wrong");
     }
 }
 
@@ -338,7 +340,7 @@ fn first_hits_are_those_of_a_plain_walk_in_f64() {
 fn of_ten_million_first_hits_at_most_one_is_wrong() {
     let (mut wrong, mut hits) = (0, 0);
     for field in &hard_fields() {
-        let found = wrong_hits(field, 2_500_000);
+        let found = wrong_hits(field, 2_000_000);
         println!("{} of {} hits are wrong", found.0, found.1);
         (wrong, hits) = (wrong + found.0, hits + found.1);
     }

@@ -269,6 +269,7 @@ pub(super) fn inside(scene: &Scene) -> Vec<bool> {
 mod tests {
     use super::*;
     use crate::field::{Field, Sweep};
+    use crate::polygon::Polygon;
     use crate::rng::{Rng, Stage};
     use crate::scene::{Boundary, Surface, cornell_box};
     use crate::sweep::pack::Plan;
@@ -325,5 +326,61 @@ mod tests {
         println!("{lit} lines end on walls, {black} on nothing; the mean of texels is off by at most {worst:.1e}");
         // Steps of 1 / draws, and halves.
         assert!(black > 20 && lit > 200 && worst < 2e-3);
+    }
+
+    /// A luminaire within the volume cuts the lines that pass through it, and shows its front to those that come from
+    /// there; the wall that it covers is seen from behind only.
+    #[test]
+    fn luminaires_cut_lines_within_their_edges() {
+        let volume = Generator::from_name("bumps").and_then(|g| g.sample([12; 3])).unwrap();
+        let field = Field::new(&volume, Sweep::new(3.6, 95.0).unwrap()).unwrap();
+        let (middle, half) = (DVec3::new(5.2, 5.7, 5.5), 2.0);
+        let corners = [(-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0), (1.0, -1.0)]
+            .map(|(x, y)| field.lattice().to_world(middle + half * DVec3::new(x, y, 0.0)));
+        let lamp = Polygon::new("lamp", corners.to_vec(), DVec3::ONE, DVec3::ONE).unwrap();
+        let down = lamp.normal().z < 0.0;
+        let scene = crate::scene::Scene::new(field, Surface::default(), Boundary::Open, vec![lamp]).unwrap();
+        let flats = Flats::new(&scene, &[Side::Lower], 8, 5);
+        let standing = [Standing { place: Place::Inside, covers: Some(7) }];
+        let mut rng = Rng::stream(6, Stage::Test, 0);
+        let (mut through, mut beside, mut out) = (0, 0, Vec::new());
+        for _ in 0..400 {
+            let shear = Shear::new(scene.lattice(), crate::warp::sphere(rng.unit2()), rng.unit2());
+            let ends = Ends::new(&scene, (&flats, Side::Lower), &shear, &standing);
+            let axes = shear.layout.axes;
+            for _ in 0..50 {
+                let [p, q] = [(); 2].map(|()| (24.0 * rng.unit() - 12.0).floor());
+                let place = |tau: f64| {
+                    let mut x = DVec3::ZERO;
+                    x[axes[0]] = p + shear.offset[0] + shear.slope[0] * tau;
+                    x[axes[1]] = q + shear.offset[1] + shear.slope[1] * tau;
+                    x[axes[2]] = tau;
+                    x
+                };
+                // Where it passes the luminaire's plane.
+                let rise = place(1.0).z - place(0.0).z;
+                let tau = (middle.z - place(0.0).z) / rise;
+                let off = (place(tau) - middle).abs();
+                let farthest = off.x.max(off.y) - half;
+                if farthest.abs() < 1e-6 || !(1e-3..=10.999).contains(&tau) {
+                    continue;
+                }
+                ends.cuts(p, q, 0.0, 11.0, &mut out);
+                if farthest > 0.0 {
+                    assert!(out.is_empty(), "{farthest} beside: {out:?}");
+                    beside += 1;
+                    continue;
+                }
+                let [(at, [before, behind])] = out[..] else { panic!("{out:?}") };
+                assert!((at - tau).abs() < 1e-9);
+                // From before it looks towards +τ.
+                let front_first = (rise > 0.0) == down;
+                let (front, back) = if front_first { (before, behind) } else { (behind, before) };
+                assert_eq!((front.covers, back.covers), (None, Some(7)));
+                assert!(front.flat.is_some() && back.flat.is_none());
+                through += 1;
+            }
+        }
+        assert!(through > 200 && beside > 2000, "{through}, {beside}");
     }
 }

@@ -8,7 +8,7 @@ use isolume::flattened::{Departure, Side};
 use isolume::gather::gathered_irradiance;
 use isolume::isovalue_axis::IsovalueAxis;
 use isolume::nearest::Neighbours;
-use isolume::photon::{ENERGY_BINS, PhotonSettings, Photons, octant};
+use isolume::photon::{ENERGY_BINS, Energy, PhotonSettings, Photons, octant};
 use isolume::photon_map::{EstimateSettings, Estimator, Normalisation, PhotonMap};
 use isolume::radiance_cache::{CacheSettings, NodeBand, NodePhotons, RadianceCache};
 use isolume::rng::{Rng, Stage};
@@ -308,4 +308,23 @@ fn photons_know_to_where_their_level_sets_fall() {
     }
     println!("{seen:?}");
     assert!(seen.iter().all(|side| side.iter().filter(|n| **n > 100).count() >= 4), "{seen:?}");
+}
+
+/// Photons of the sweep's last isovalue count in the last bin; as many carry as much wherever isovalue texels stand.
+#[test]
+fn photons_of_one_isovalue_carry_all_of_it() {
+    let scene = bumps(lattice([13; 3], DVec3::ZERO, DVec3::ONE));
+    let sent = |isovalue, axis| -> Vec<f64> {
+        let settings = PhotonSettings { fixed_isovalue: Some(isovalue), axis, ..emission(1000, 1) };
+        photons(&scene, &settings).energy.iter().map(|e| e.emitted).collect()
+    };
+    let last = sent(1.0, IsovalueAxis::EVEN);
+    let (end, others) = last.split_last().unwrap();
+    assert!(*end > 0.0 && others.iter().all(|e| *e == 0.0), "{last:?}");
+    for isovalue in [0.2, 0.9] {
+        let [even, crowded] = [IsovalueAxis::EVEN, IsovalueAxis::around(0.2)].map(|axis| sent(isovalue, axis));
+        assert!((even.iter().sum::<f64>() / crowded.iter().sum::<f64>() - 1.0).abs() < 1e-12, "{even:?} {crowded:?}");
+    }
+    let energy = Energy { emitted: 2.0, absorbed: 1.0, ..Energy::default() };
+    assert_eq!((energy.imbalance(), Energy::default().imbalance()), (0.5, 0.0));
 }
