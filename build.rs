@@ -41,25 +41,25 @@ fn commit(root: &Path) -> Option<String> {
         }
     }
     let commit = git(&["rev-parse", "--short", "HEAD"])?;
-    let parts = ["src", "wrapper", "Cargo.toml", "Cargo.lock"];
+    let parts = ["build.rs", "src", "wrapper", "Cargo.toml", "Cargo.lock"];
     parts.iter().for_each(|part| println!("cargo:rerun-if-changed={part}"));
     let changed = git(&[&["--no-optional-locks", "status", "--porcelain", "--"], &parts[..]].concat())?;
     if changed.is_empty() {
         return Some(commit);
     }
     let mut hasher = DefaultHasher::new();
-    parts.iter().for_each(|part| hash(&root.join(part), &mut hasher));
+    parts.iter().for_each(|part| hash(root, Path::new(part), &mut hasher));
     Some(format!("{commit}+{:08x}", hasher.finish() >> 32))
 }
 
-/// Hashes a file, or all of a folder.
-fn hash(path: &Path, hasher: &mut DefaultHasher) {
-    if let Ok(entries) = path.read_dir() {
-        let mut entries: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).collect();
+/// Hashes a file, or all of a folder, with its path.
+fn hash(root: &Path, path: &Path, hasher: &mut DefaultHasher) {
+    if let Ok(entries) = root.join(path).read_dir() {
+        let mut entries: Vec<PathBuf> = entries.flatten().map(|entry| path.join(entry.file_name())).collect();
         entries.sort();
-        entries.iter().for_each(|entry| hash(entry, hasher));
+        entries.iter().for_each(|entry| hash(root, entry, hasher));
     } else {
-        std::fs::read(path).ok().hash(hasher);
+        (path, std::fs::read(root.join(path)).ok()).hash(hasher);
     }
 }
 

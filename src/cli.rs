@@ -12,7 +12,6 @@ mod init;
 mod reference;
 mod render;
 mod selftest;
-#[cfg(unix)]
 mod signals;
 mod study;
 mod view;
@@ -166,7 +165,6 @@ impl Cli {
         if let Some(name) = &self.isa {
             Isa::from_name(name)?.choose();
         }
-        #[cfg(unix)]
         signals::heed();
         let progress = if self.quiet { Progress::Quiet } else { Progress::Shown };
         match self.verb {

@@ -242,6 +242,7 @@ pub fn reference<T: Tracer>(
     }
     Ok(out)
 }
+
 /// The seed of a batch: photons are keyed by nothing else.
 fn seed_of(seed: u64, batch: u64) -> u64 {
     Rng::stream(seed, Stage::Photon, u64::MAX - batch).bits()

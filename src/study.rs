@@ -65,7 +65,7 @@ impl Subject {
 
     /// The isovalue reported first.
     pub fn main_isovalue(&self) -> f64 {
-        self.isovalue.unwrap_or_else(|| self.at(bumps::fraction(47.0)))
+        self.isovalue.unwrap_or_else(|| self.at(bumps::fraction(bumps::TABLE[1])))
     }
 }
 

@@ -159,7 +159,7 @@ pub struct SweepCounts {
     pub valid: u64,
 }
 
-/// Points along an axis that a sweep takes.
+/// Points along an axis that a sweep takes: blocks of nodes are found by a reciprocal in 32 bits.
 const MOST_ALONG: usize = 1 << 19;
 
 /// Polygons that a sweep takes.

@@ -52,7 +52,8 @@ pub(super) struct Bake {
     /// Seconds between checkpoints; shorter bakes write none
     #[arg(long, value_name = "SECONDS", default_value_t = 60.0)]
     checkpoint_every: f64,
-    /// Go on where an interrupted bake of the same settings stopped; from the beginning if there is no checkpoint
+    /// Go on where an interrupted bake of the same settings stopped, and leave a finished one as it is; from the
+    /// beginning if there is neither
     #[arg(long)]
     resume: bool,
     /// The estimated memory is to be at most this, such as 8G or 500M: by the photon engine if sweeps need more, its

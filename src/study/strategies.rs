@@ -147,7 +147,7 @@ fn grid_of(subject: &Subject, count: u64) -> Result<GridSize> {
 /// Whether an isovalue is among those that are read off the table rather than the plot.
 fn is_in_table(subject: &Subject, isovalue: f64) -> bool {
     // The same numbers as `isovalues` makes: those of narrow sweeps lie closer together than any tolerance.
-    let fixed = [35.0, 47.0, 80.0].map(|c| subject.at(bumps::fraction(c)));
+    let fixed = bumps::TABLE.map(|c| subject.at(bumps::fraction(c)));
     isovalue == subject.main_isovalue() || fixed.contains(&isovalue)
 }
 
@@ -162,7 +162,7 @@ fn isovalues(study: &Study, subject: &Subject) -> Result<Vec<f64>> {
         fractions.extend(bumps::level_sets().windows(2).map(|w| 0.5 * (w[0] + w[1])));
         fractions.extend((1..=9).map(|i| f64::from(i) / 10.0));
     }
-    let main = [35.0, 47.0, 80.0].map(bumps::fraction);
+    let main = bumps::TABLE.map(bumps::fraction);
     fractions.retain(|f| main.iter().all(|m| (f - m).abs() > 0.008));
     fractions.extend(if study.quick { &main[1..2] } else { &main[..] });
     fractions.sort_by(f64::total_cmp);

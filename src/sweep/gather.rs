@@ -141,11 +141,11 @@ impl Pass<'_> {
         tick: &mut dyn FnMut() -> bool,
     ) -> (Planes, bool) {
         let side = self.sides[n];
-        // Vectors read it at any node.
+        // Vector kernels read it without looking.
         let nodes = self.geometry.dims.iter().product::<usize>();
         assert!(
             bounce.light.b.len() == self.sides.len() && bounce.light.b.iter().all(|b| b.len() == nodes),
-            "of every node"
+            "light of all sides and nodes"
         );
         let of = |n: usize| bounce.light.b.get(n).map_or(&[][..], |b| &b[..]);
         let lines = bounce.lines;

@@ -72,6 +72,12 @@ impl Segments {
         (self.enough[0][lane], self.enough[1][lane]) = enough.into();
     }
 
+    /// Gives a lane of [`Segments::set_before`] a value at its node after all: for [`Segments::ranges`].
+    #[inline]
+    pub(super) fn set_node(&mut self, lane: usize, h: f32) {
+        self.ends[usize::from(!self.falls[lane])][lane] = h;
+    }
+
     #[allow(
         clippy::cast_possible_truncation,
         clippy::cast_possible_wrap,
@@ -184,8 +190,8 @@ impl Segments {
         (near + g * (far - near), [i, j, k])
     }
 
-    /// What h spans along a lane, from one gap of samples that are not finite to the next. It
-    /// falls to −∞ at caps, where the segment enters and leaves Ω if `caps` says so.
+    /// What h spans along a lane, from one gap of samples that are not finite to the next, in the order of its slices.
+    /// It falls to −∞ at caps, where the segment enters and leaves Ω if `caps` says so.
     pub(super) fn ranges(&self, h: &[f32], lane: usize, mut caps: [bool; 2]) -> Vec<[f32; 2]> {
         let slices = (0..self.count[lane]).map(|step| self.sample(h, lane, step).0);
         if self.falls[lane] {

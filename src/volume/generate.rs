@@ -1,5 +1,5 @@
 //! Analytic fields on `[0,1]³` with exact value and gradient: what the tests know the answers of. Simulated ones stand
-//! in the modules.
+//! in the modules, and where BB09 looks at the bumps.
 
 pub mod bumps;
 pub mod fluid;

@@ -41,10 +41,11 @@ fn every_instruction_set_bakes_the_same_light() {
     let dir = dir.path();
     ok(dir, &["generate", "bumps", "--size", "21", "-o", "b.nrrd", "--quiet"]);
     // A lamp within the volume cuts lines.
-    fs::write(dir.join("lamp.mtl"), "newmtl lamp\nKd 0 0 0\nKe 5 5 5\n").unwrap();
+    fs::write(dir.join("lamp.mtl"), "newmtl lamp\nKd 0 0 0\nKe 5 5 5\nnewmtl floor\nKd 0.5 0.6 0.7\n").unwrap();
     let corners = "v 0.2 0.2 0.62\nv 0.2 0.45 0.62\nv 0.45 0.45 0.62\nv 0.45 0.2 0.62\n";
-    fs::write(dir.join("lamp.obj"), format!("mtllib lamp.mtl\n{corners}usemtl lamp\nf 1 2 3 4\n")).unwrap();
-    let scene = "[volume]\nfile = \"b.nrrd\"\n[surface]\nsides = \"both\"\n[[context]]\nfile = \"lamp.obj\"\n";
+    let floor = "v 0 0 -0.1\nv 1 0 -0.1\nv 1 1 -0.1\nv 0 1 -0.1\nusemtl floor\nf 5 6 7 8\n";
+    fs::write(dir.join("lamp.obj"), format!("mtllib lamp.mtl\n{corners}usemtl lamp\nf 1 2 3 4\n{floor}")).unwrap();
+    let scene = "[volume]\nfile = \"b.nrrd\"\n[surface]\nsides = \"both\"\n[box]\nkind = \"lamp.obj\"\n";
     fs::write(dir.join("lamp.toml"), scene).unwrap();
     let found = isolume::isa::Isa::found();
     for (input, engine) in [("b.nrrd", "sweep"), ("lamp.toml", "sweep"), ("b.nrrd", "photon")] {

@@ -225,11 +225,13 @@ fn what_nohup_started_outlives_its_terminal() {
     let mut command = Command::new("sh");
     command.current_dir(dir).args(["-c", "trap '' HUP; exec \"$0\" \"$@\"", PROGRAM]).args(BAKE);
     command.args(["-o", "out.vti"]).envs(TWO_THREADS).stdout(Stdio::null()).stderr(Stdio::piped());
-    let child = command.spawn().unwrap();
+    let mut child = command.spawn().unwrap();
     while !dir.join("out.vti.checkpoint").exists() {
-        std::thread::sleep(Duration::from_millis(5));
+        assert!(child.try_wait().unwrap().is_none(), "it ended before it could be asked to");
+        std::thread::sleep(Duration::from_millis(1));
     }
     assert!(Command::new("kill").args(["-HUP", &child.id().to_string()]).status().unwrap().success());
+    assert!(!dir.join("out.vti").exists(), "it was done before it was asked");
     let (output, text) = finish(child);
     assert!(output.status.success(), "{text}");
     assert!(dir.join("out.vti").exists());

@@ -61,9 +61,10 @@ impl Direct<'_> {
                         looks.sums[place + s][1] += g as f32;
                         let y = lattice.to_index(y);
                         // Caps let no light into solids.
-                        let closed = side == Side::Higher && capped(scene) && y.clamp(DVec3::ZERO, lattice.far()) != y;
+                        let cap = capped(scene) && y.clamp(DVec3::ZERO, lattice.far()) != y;
+                        let closed = side == Side::Higher && cap;
                         if g > 0.0 && !closed && !blockers.block(number, None, y, x) {
-                            looks.add(&scene.field, [y, x], Look { place: place + s, side, h, g: g as f32 });
+                            looks.add(&scene.field, [y, x], Look { place: place + s, side, h, g: g as f32, cap });
                         }
                     }
                 }
@@ -82,10 +83,12 @@ struct Look {
     h: f32,
     /// What the point gives if it is seen.
     g: f32,
+    /// Whether a cap may stand between.
+    cap: bool,
 }
 
 impl Look {
-    const NONE: Self = Self { place: 0, side: Side::Lower, h: 0.0, g: 0.0 };
+    const NONE: Self = Self { place: 0, side: Side::Lower, h: 0.0, g: 0.0, cap: false };
 }
 
 /// Looks of the nodes of a row, as many at a time as there are lanes.
@@ -107,6 +110,10 @@ impl Looks<'_> {
         #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
         let h = |p: DVec3| field.value(p) as f32;
         self.segments.set_before(self.taken, field.lattice(), h, [y, x], enough);
+        if self.geometry.has_gaps() {
+            // On the side that looks.
+            self.segments.set_node(self.taken, if look.side == Side::Lower { look.h.next_down() } else { look.h });
+        }
         self.looks[self.taken] = look;
         self.taken += 1;
         if self.taken == LANES {
@@ -125,7 +132,7 @@ impl Looks<'_> {
             let open = match look.side {
                 // Only what holds the isovalue itself between two gaps hides it.
                 _ if gaps => {
-                    let ranges = self.segments.ranges(h, lane, [false; 2]);
+                    let ranges = self.segments.ranges(h, lane, [look.cap, false]);
                     !ranges.iter().any(|[least, most]| *least < look.h && *most >= look.h)
                 }
                 Side::Lower => most[lane] < look.h,

@@ -3,6 +3,9 @@
 /// The sweep of the bumps.
 const SWEEP: [f64; 2] = [3.6, 95.0];
 
+/// The isovalues of its tables, of which the second, midway between two level sets of strategy 1, is reported first.
+pub const TABLE: [f64; 3] = [35.0, 47.0, 80.0];
+
 /// Where isovalue `c` of the bumps lies in their sweep.
 pub fn fraction(c: f64) -> f64 {
     (c - SWEEP[0]) / (SWEEP[1] - SWEEP[0])
