@@ -153,12 +153,16 @@ fn files_and_names_beside_equations_exist() {
                     !next.is_alphanumeric() && next != '_'
                 })
             });
-            // A field, or a variant of an enum: in a line of its own, with its type.
+            // A field or a variant: in a line of its own among those of a struct or an enum.
+            let mut item = false;
             let declared = code.lines().any(|line| {
-                let line = line.trim_start().trim_start_matches("pub ").trim_start_matches("pub(super) ");
-                line.strip_prefix(name)
-                    .is_some_and(|rest| rest.starts_with(": ") || rest == "," || rest == " {" || rest.starts_with('('))
-                    && !line.ends_with(';')
+                let own =
+                    line.trim_start_matches("pub ").trim_start_matches("pub(crate) ").trim_start_matches("pub(super) ");
+                item = own.starts_with("struct ") || own.starts_with("enum ") || item && line != "}";
+                let rest = line.trim_start().trim_start_matches("pub ").strip_prefix(name);
+                let ends = [": ", ",", " {", "("];
+                item && line.starts_with("    ")
+                    && rest.is_some_and(|rest| ends.iter().any(|end| rest.starts_with(end)))
             });
             let defined = defined || declared;
             assert!(defined, "{file} defines no {name}, which docs/equations.md names");
