@@ -159,7 +159,8 @@ fn noise(reference: &ReferenceMesh, v: usize, exposure: f64) -> f64 {
 /// numbers and |Δ| per vertex against the references' mean (0 where not sampled).
 ///
 /// # Errors
-/// `Invalid` without references, with more than two, or without common vertices, if meshes differ, or if something is missing or no finite number.
+/// `Invalid` without references, with more than two, or without common vertices, if meshes differ, or if something is
+/// missing or no finite number.
 pub fn compare(texture: &[DVec3], references: &[ReferenceMesh], exposure: f64) -> Result<(Accuracy, Vec<f64>)> {
     let Some(first) = references.first() else {
         return Err(Error::Invalid("no reference given".into()));

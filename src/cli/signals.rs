@@ -18,8 +18,8 @@ fn on_signal() -> impl FnMut() {
     }
 }
 
-/// Interrupts all work when the process is asked to end. What `nohup` started lives on when its terminal goes, where the
-/// system tells of it (Linux does).
+/// Interrupts all work when the process is asked to end. What `nohup` started lives on when its terminal goes, where
+/// the system tells of it (Linux does).
 #[cfg(unix)]
 pub(super) fn heed() {
     use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
