@@ -158,7 +158,7 @@ impl<'a> Around<'a> {
         move |k| f32::from(u8::from(few || faces(k)))
     }
 
-    /// Standard error at a point with unit `normal`, as if all of the samples' were of indirect light.
+    /// Standard error at a point with unit `normal`, as if all of the samples' were of indirect light. \[Loader99\]
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     fn std_error(&self, normal: Vec3) -> f32 {
         let counts = self.facing(normal);

@@ -322,7 +322,7 @@ impl Census {
         let indirect = sides * (points * SETTLING_SIDE + places * settling).max(places * 2 * SUMMED_SIDE);
         let direct = sides * places * DIRECT_SIDE + self.seen;
         let walls = sweep::reports(scene, settings.wall_resolution, settings.wall_isovalues) as u64;
-        let threads = self.workspace * (rayon::current_num_threads() as u64).min(1 << 7);
+        let threads = self.workspace.saturating_mul(rayon::current_num_threads() as u64).min(MOST as u64);
         points * SWEPT + sides * points * SWEPT_SIDE + places * summed + indirect.max(direct) + walls + threads
     }
 
