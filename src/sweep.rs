@@ -140,8 +140,6 @@ pub struct SweepResult {
     /// The share of all indirect light, up to 1, that later bounces would bring or take, as far as their decay is
     /// known; NaN where bounces were cut before it was.
     pub residual: f64,
-    /// Whether `tick` stopped the work.
-    pub stopped: bool,
     /// Counts for the report.
     pub counts: SweepCounts,
 }
@@ -240,10 +238,10 @@ fn numbered([nx, ny, nz]: [usize; 3]) -> bool {
 }
 
 /// Lights every node of the lattice for every isovalue of the sweep. `tick` receives the fraction done (an estimate
-/// while bounces converge); returning false stops early with what there is.
+/// while bounces converge), and ends the work by returning false.
 ///
 /// # Errors
-/// `NotSupported` for several fields that light each other, if a polygon that is not a luminaire stands inside the
+/// `Interrupted` if `tick` ended it. `NotSupported` for several fields that light each other, if a polygon that is not a luminaire stands inside the
 /// volume, if there are more than [`MOST_POLYGONS`], or about 2³¹ points or more, and for the inside of capped solids
 /// if there may be light in it: that needs the photon engine.
 pub fn sweep(scene: &Scene, settings: &SweepSettings, tick: &(dyn Fn(f64) -> bool + Sync)) -> Result<SweepResult> {
@@ -291,30 +289,21 @@ pub fn sweep_resumable(
     };
     let dims = scene.lattice().dims();
     let focus = Focus { dims, lit: |at| geometry.lit(at) };
-    let mut stopped = !run.direct(&mut state, &mut flats, tick);
-    while state.done < replicates && !stopped {
-        let done = state.done as f64;
+    run.direct(&mut state, &mut flats, tick).ok_or(Error::Interrupted)?;
+    while state.done() < replicates {
+        let done = state.done() as f64;
         let progress = |x: f64| tick(DIRECT_SHARE + (1.0 - DIRECT_SHARE) * (done + x) / replicates as f64);
-        let Some(indirect) = run.replicate(&mut state, passes.take(), &mut flats, &progress) else {
-            stopped = true;
-            break;
-        };
+        let indirect = run.replicate(&mut state, passes.take(), &mut flats, &progress).ok_or(Error::Interrupted)?;
         state.add(&indirect, &flats, (scene, geometry.lit_rows(), &focus));
         spare.keep(indirect.into_iter().flatten());
     }
     spare.clear();
-    if state.done == 0 {
-        // What there is.
-        state.flats = flats.textures.iter().map(|t| t.as_ref().map(|t| t.radiance.clone())).collect();
-    }
     let (lit, rows) = (geometry.all_lit(), geometry.into_lit_rows());
-    if !stopped {
-        saved.save(0, || state.bytes(None, &flats));
-    }
-    let State { done, total, flats: mut sums, bounces, residual, counts } = state;
-    sums.iter_mut().flatten().flatten().for_each(|x| *x /= done.max(1) as f32);
+    saved.save(0, || state.bytes(None, &flats));
+    let State { total, flats: mut sums, bounces, residual, counts, .. } = state;
+    sums.iter_mut().flatten().flatten().for_each(|x| *x /= replicates as f32);
     let flats = flats.export(&sums, &sides, scene.surface.outside);
-    let mut sides = total.finish(&rows, &Focus { dims, lit: |at| lit[at] }, done, settings.direct);
+    let mut sides = total.finish(&rows, &Focus { dims, lit: |at| lit[at] }, settings.direct);
     let world = |o: usize| scene.lattice().to_world(DVec3::from_array(scene.lattice().ijk(o).map(|i| i as f64)));
     let dark = slits.hidden.iter().map(|hidden| hidden.0).filter(|&o| scene.covers(world(o)));
     for o in dark {
@@ -324,7 +313,7 @@ pub fn sweep_resumable(
             side.std_error.get_mut(o).into_iter().for_each(|e| *e = 0.0);
         }
     }
-    Ok(SweepResult { sides, lit, flats, bounces, residual, stopped, counts })
+    Ok(SweepResult { sides, lit, flats, bounces, residual, counts })
 }
 
 /// The sides that are swept: the stored ones, and the other one if light passes to it, if the luminaires mostly light
@@ -368,16 +357,15 @@ struct Run<'a> {
 
 impl Run<'_> {
     /// Direct light of all replicates, on the flats too: each has luminaire points of its own, and what bounces is
-    /// their mean, so that no replicate spreads the light of few points. False if `tick` stopped it.
-    fn direct(&self, state: &mut State, flats: &mut Flats, tick: &(dyn Fn(f64) -> bool + Sync)) -> bool {
+    /// their mean, so that no replicate spreads the light of few points. `None` if `tick` stopped it.
+    fn direct(&self, state: &mut State, flats: &mut Flats, tick: &(dyn Fn(f64) -> bool + Sync)) -> Option<()> {
         let s = self.settings;
         let replicates = s.replicates.max(1);
         let points = s.light_points.max(1);
         let lights = points * self.scene.luminaires().len();
-        let mut complete = true;
         let clearance = direct::clearance(self.scene, self.geometry, self.sides);
         let first = state.total.lit;
-        while state.total.lit < replicates && complete {
+        while state.total.lit < replicates {
             let number = state.total.lit;
             if self.saved.due() {
                 self.saved.save(0, || state.bytes(None, flats));
@@ -396,18 +384,13 @@ impl Run<'_> {
                 isa: self.isa,
                 spare: self.spare,
             };
-            let (direct, all) = direct.light(flats, &mut ask);
-            complete = all;
-            if complete {
-                state.counts.shadow_rays += state.counts.valid * lights as u64;
-            } else {
+            let Some(direct) = direct.light(flats, &mut ask) else {
                 self.saved.save(0, || state.bytes(None, flats));
-            }
-            // Of the first one what there is.
-            if complete || number == 0 {
-                let rest = state.total.add_direct(direct, self.scene, self.geometry.lit_rows());
-                self.spare.keep(rest.into_iter().flatten());
-            }
+                return None;
+            };
+            state.counts.shadow_rays += state.counts.valid * lights as u64;
+            let rest = state.total.add_direct(direct, self.scene, self.geometry.lit_rows());
+            self.spare.keep(rest.into_iter().flatten());
         }
         if first < replicates {
             state.total.average_direct();
@@ -415,10 +398,7 @@ impl Run<'_> {
             self.spare.clear();
             flats.average_direct(state.total.lit);
         }
-        if !complete {
-            flats.reflect_direct();
-        }
-        complete
+        Some(())
     }
 }
 

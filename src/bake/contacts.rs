@@ -117,31 +117,11 @@ impl<'a> Contacts<'a> {
         self.points.binary_search_by_key(&o, |p| p.0).is_ok()
     }
 
-    /// Solves for the light of `side` at all points. `white` holds what a white surface would reflect at every node of
-    /// the lattice, with walls as their textures show them, which is also what the cache of `wedge` holds; `std_error`,
-    /// unless it is empty, the standard error of the luminance that leaves.
+    /// Solves for the light of `side` at those points of `grid` that `holds` picks and that hold light, which was
+    /// gathered with walls as their textures show them, as the cache of `wedge` does. Of channels that points do not
+    /// reflect nothing is known, nor needed.
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     pub(super) fn solve<T: Tracer>(
-        &self,
-        side: Side,
-        wedge: &Wedge<T>,
-        (white, std_error): (&mut [[f32; 3]], &mut [f32]),
-        tick: &(dyn Fn(u64) -> bool + Sync),
-    ) -> Counts {
-        let light = |o: usize| Some(DVec3::from_array(white[o].map(f64::from)));
-        let mut total = Counts::default();
-        for (o, Solved { light, gain, variance }, counts) in self.solved(side, wedge, light, tick) {
-            white[o] = light.as_vec3().to_array();
-            std_error.get_mut(o).into_iter().for_each(|e| *e = (gain * f64::from(*e)).hypot(variance.sqrt()) as f32);
-            total += counts;
-        }
-        total
-    }
-
-    /// As [`Contacts::solve`], for those points of `grid` that `holds` picks and that hold light; of channels that they
-    /// do not reflect nothing is known, nor needed.
-    #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-    pub(super) fn solve_in<T: Tracer>(
         &self,
         grid: &mut IlluminationGrid,
         holds: impl Fn(usize) -> bool + Sync,

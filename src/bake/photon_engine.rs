@@ -227,7 +227,7 @@ impl<'a> FieldLight<'a> {
                     counts += grid.sample(&sampler, band, at_points, &apart, saved(2), &|n| tick(n * each));
                     let wedge = Wedge::new(tracer, cache, settings);
                     let own = |o: usize| band.holds(grid.isovalue(o));
-                    counts += contacts.solve_in(at_points.grid(), own, *side, &wedge, &|n| tick(n * each));
+                    counts += contacts.solve(at_points.grid(), own, *side, &wedge, &|n| tick(n * each));
                     let fewer @ [gather_rays, shadow_rays] = rays_beside(rays);
                     let sampler = Sampler { indirect: &indirect(gather_rays), shadow_rays, ..sampler };
                     counts += beside.sample(&sampler, band, at_beside, saved(4), &|n| tick(n * rays_of(fewer)));

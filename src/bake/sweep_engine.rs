@@ -97,9 +97,6 @@ pub(super) fn light(
         let place = |n: usize| ((STAND_INS * near[n]) as u64, local_position(&scene.field, lattice, near[n]).as_vec3());
         let sampled = sample_places(&sampler, near.len(), &place, Stage::UNSAVED, 0, &|n| stage.tick(n));
         lit.counts += Counts::from(&sampled);
-        let wedge = Wedge::new(&tracer, &cache, settings);
-        lit.counts += contacts.solve(s.side, &wedge, (&mut s.irradiance, &mut s.std_error), &|n| stage.tick(n));
-        stage.end()?;
         let mut grid = swept_grid((&own, masks), outgoing(scene, &own, s.irradiance), s.std_error);
         for (&o, sample) in near.iter().zip(&sampled.samples) {
             if let Some(sample) = sample {
@@ -108,6 +105,9 @@ pub(super) fn light(
                 s.direct.get_mut(o).into_iter().for_each(|d| *d = sample.direct.to_array());
             }
         }
+        let wedge = Wedge::new(&tracer, &cache, settings);
+        lit.counts += contacts.solve(&mut grid, |_| true, s.side, &wedge, &|n| stage.tick(n));
+        stage.end()?;
         grid.split = settings.split.then(|| split(scene, lattice, s.side, &grid, &s.direct));
         drop(s.direct);
         sides.push((s.side, beside.fit(scene, s.side, grid, &light)));

@@ -61,15 +61,15 @@ type Sums = Vec<[f32; 2]>;
 
 impl Direct<'_> {
     /// Direct irradiance of every node, one set of planes per side; that of the flats is added to theirs at the end.
-    /// `tick` is asked before every point; false stops with what is done, and is returned beside it.
-    pub(super) fn light(&self, flats: &mut Flats, tick: &mut dyn FnMut() -> bool) -> (Vec<Planes>, bool) {
+    /// `tick` is asked before every point; `None` if it stopped the work.
+    pub(super) fn light(&self, flats: &mut Flats, tick: &mut dyn FnMut() -> bool) -> Option<Vec<Planes>> {
         let mut planes: Vec<Planes> = self.sides.iter().map(|_| self.spare.black(self.geometry.places())).collect();
         let corners = self.scene.lattice().corners().map(|p| self.scene.lattice().to_world(p));
         let lights = (0..).zip(self.scene.luminaires());
         let shares: Vec<OpenShare> = lights.clone().map(|light| self.points.open_share(self.scene, light)).collect();
         for ((number, light), open) in lights.zip(&shares) {
             let blockers = Blockers::new(self.scene, number, &corners);
-            let Some(mut sums) = self.seen((number, light), &blockers, tick) else { return (planes, false) };
+            let mut sums = self.seen((number, light), &blockers, tick)?;
             if !open.whole() {
                 self.correct(open, &mut sums);
             }
@@ -79,7 +79,7 @@ impl Direct<'_> {
         for (number, open) in (0..).zip(&shares) {
             self.light_flats(flats, number, open);
         }
-        (planes, true)
+        Some(planes)
     }
 
     /// What nodes see of a luminaire's points along fans of lines; `None` if `tick` stopped it.

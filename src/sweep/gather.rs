@@ -132,14 +132,14 @@ pub(crate) fn workspace(lattice: &Lattice) -> u64 {
 
 impl Pass<'_> {
     /// Irradiance of every node of side `n` of [`Pass::sides`] by a bounce; the flats' is added to `incoming`. `tick`
-    /// is asked before every family; false stops with what is done, and is returned beside it.
+    /// is asked before every family; `None` if it stopped the work.
     pub(super) fn gather(
         &self,
         bounce: &Bounce,
         n: usize,
         incoming: &mut Incoming,
         tick: &mut dyn FnMut() -> bool,
-    ) -> (Planes, bool) {
+    ) -> Option<Planes> {
         let side = self.sides[n];
         // Vector kernels read it without looking.
         let nodes = self.geometry.dims.iter().product::<usize>();
@@ -152,7 +152,6 @@ impl Pass<'_> {
         let mut e = self.spare.black(self.geometry.places());
         let touched = self.touching.now(self.geometry, bounce.flats, side);
         let split = lines.partition_point(|s| !s.layout.transposed);
-        let mut complete = true;
         // Walls receive what one family brought while the next is under way.
         let mut arrivals = Vec::new();
         // Darkness is the same in both orders.
@@ -168,10 +167,10 @@ impl Pass<'_> {
                 rows: node_rows(&mut e, self.geometry.lit_rows_of(&any.layout)),
             };
             for shear in some {
-                complete = complete && tick();
-                if complete {
-                    arrivals = self.family(bounce, &receivers, shear, incoming, arrivals);
+                if !tick() {
+                    return None;
                 }
+                arrivals = self.family(bounce, &receivers, shear, incoming, arrivals);
             }
             drop(receivers);
             if let Some(turned) = turned {
@@ -181,7 +180,7 @@ impl Pass<'_> {
         }
         incoming.receive(self.isa, &arrivals);
         self.normalise(lines, &mut e);
-        (e, complete)
+        Some(e)
     }
 
     /// Divides by the sum of cosines that the directions gave each node's normal, which is π only in the mean: equal

@@ -86,7 +86,7 @@ impl Run<'_> {
         let late = if self.warm(state) { LATE - 1 } else { 0 };
         let direct = (NodeLight::Half(&state.total.direct), 1.0);
         let (light, mut sums) = if late > 0 {
-            let share = 1.0 / state.done as f32;
+            let share = 1.0 / state.done() as f32;
             flats.take(&state.flats, share);
             let light = (NodeLight::Half(&state.total.light), share);
             self.mirror.reflect(flats, &[direct, light], Reflected::default(), None, SHARPENING)
@@ -111,7 +111,7 @@ impl Run<'_> {
     /// is all it needs. What replicates share in this way are the bounces before their last, which the last one
     /// averages over the sphere.
     fn warm(&self, state: &State) -> bool {
-        state.done > 0 && self.settings.settles()
+        state.done() > 0 && self.settings.settles()
     }
 
     /// What the next pass is for.
@@ -189,8 +189,8 @@ impl Run<'_> {
                 now.defect = Vec::new();
                 flats.no_defect();
             }
-            let lines = self.lines(kind, &now, state.done);
-            let few = if kind == Kind::Level { self.lines(Kind::Coarse, &now, state.done) } else { Vec::new() };
+            let lines = self.lines(kind, &now, state.done());
+            let few = if kind == Kind::Level { self.lines(Kind::Coarse, &now, state.done()) } else { Vec::new() };
             let more = if kind == Kind::Late && now.late + 1 == LATE { 0.0 } else { 3.0 };
             let total = (few.len() + lines.len()) * self.sides.len();
             let bounce = now.bounce + 1;
@@ -204,7 +204,7 @@ impl Run<'_> {
                 None
             } else {
                 let Some(received) = self.bounce(&pass, &now.light, (&few, false), flats, &mut ask) else {
-                    self.stop(state, &now, flats);
+                    self.saved.save(0, || state.bytes(Some(&now), flats));
                     return None;
                 };
                 let nodes: Vec<_> = received.iter().map(|e| HalfPlanes::new(e, 1.0, None)).collect();
@@ -215,7 +215,7 @@ impl Run<'_> {
             // until light has settled, that does.
             let goes_on = kind != Kind::Coarse;
             let Some(received) = self.bounce(&pass, &now.light, (&lines, goes_on), flats, &mut ask) else {
-                self.stop(state, &now, flats);
+                self.saved.save(0, || state.bytes(Some(&now), flats));
                 return None;
             };
             now.bounce = bounce;
@@ -263,21 +263,10 @@ impl Run<'_> {
     ) -> Option<Vec<Planes>> {
         let bounce = Bounce { lines, goes_on, light, flats };
         let mut incoming = flats.open();
-        let (received, complete): (Vec<_>, Vec<_>) =
-            (0..self.sides.len()).map(|n| pass.gather(&bounce, n, &mut incoming, ask)).unzip();
-        if complete.contains(&false) {
-            // Half a pass is not kept, and may be as large as what is.
-            self.spare.keep(received.into_iter().flatten());
-            return None;
-        }
+        let sides = 0..self.sides.len();
+        let received = sides.map(|n| pass.gather(&bounce, n, &mut incoming, ask)).collect::<Option<_>>()?;
         flats.close(&incoming);
         Some(received)
-    }
-
-    /// Keeps the passes that were done before one was stopped.
-    fn stop(&self, state: &mut State, now: &Passes, flats: &Flats) {
-        self.saved.save(0, || state.bytes(Some(now), flats));
-        state.see(now);
     }
 
     /// What nodes and flats reflect of direct light and what nodes `received`; while light settles, mixed with the

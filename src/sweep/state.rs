@@ -14,8 +14,6 @@ use ::half::bf16;
 
 /// What the finished replicates of a sweep gave.
 pub(super) struct State {
-    /// Replicates that are finished.
-    pub done: usize,
     /// Light of the nodes; the direct light is that of all replicates before the first of them bounces it.
     pub total: Totals,
     /// Sums of the flats' reflected radiance.
@@ -47,13 +45,17 @@ impl State {
     /// Of so many nodes with so many places in planes.
     pub(super) fn new(sides: &[Side], stored: usize, size: [usize; 2], replicates: usize) -> Self {
         Self {
-            done: 0,
             total: Totals::new(sides, stored, size, replicates),
             flats: Vec::new(),
             bounces: 0,
             residual: 0.0,
             counts: SweepCounts::default(),
         }
+    }
+
+    /// Replicates that are finished.
+    pub(super) fn done(&self) -> usize {
+        self.total.done
     }
 
     /// Adds the indirect light of a replicate and what it left on the flats.
@@ -65,7 +67,7 @@ impl State {
     ) {
         self.total.add(indirect, (scene, rows), focus);
         let radiance = || flats.textures.iter().map(|t| t.as_ref().map(|t| &t.radiance));
-        if self.done == 0 {
+        if self.done() == 1 {
             self.flats = radiance().map(Option::<&Vec<f32>>::cloned).collect();
         } else {
             for (sum, new) in self.flats.iter_mut().zip(radiance()) {
@@ -74,7 +76,6 @@ impl State {
                 }
             }
         }
-        self.done += 1;
     }
 
     /// Takes note of how far a replicate came.
@@ -100,7 +101,7 @@ impl State {
         let under_way = passes.map_or(0, |p| 6 * (p.light.b.len() + p.before.b.len() + p.defect.len()));
         // The flats are small beside it.
         let mut out = Writer { bytes: Vec::with_capacity(places * (numbers + under_way) + (1 << 16)) };
-        out.count(self.done);
+        out.count(self.done());
         out.count(self.bounces);
         out.real(self.residual);
         let c = self.counts;
@@ -119,7 +120,7 @@ impl State {
         }
         // None where nothing bounces.
         out.count(light.len());
-        if self.done > 0 {
+        if self.done() > 0 {
             light.iter().for_each(|l| out.half_planes(l));
             self.flats.iter().flatten().for_each(|f| out.numbers(f));
         }
@@ -157,7 +158,7 @@ impl State {
         for (texture, direct) in flats.textures.iter_mut().flatten().zip(direct) {
             texture.direct = direct;
         }
-        (self.done, self.flats) = (state.done, state.flats);
+        self.flats = state.flats;
         (self.bounces, self.residual, self.counts) = (state.bounces, state.residual, state.counts);
         let (passes, light) = passes?;
         for (texture, light) in flats.textures.iter_mut().flatten().zip(light) {
@@ -171,8 +172,7 @@ impl State {
         let [nodes, places] = self.total.size();
         let replicates = if self.total.spread.is_empty() { 1 } else { 2 };
         let mut state = Self::new(self.total.sides(), self.total.stored(), [nodes, places], replicates);
-        state.done = from.count()?;
-        state.total.count = state.done;
+        state.total.done = from.count()?;
         state.bounces = from.count()?;
         state.residual = from.real()?;
         let mut count = || from.count().map(|n| n as u64);
@@ -201,7 +201,7 @@ impl State {
         // Of every side or of none.
         let of = |count: usize| (count == 0 || count == sides).then_some(count);
         let bounced = from.count()?;
-        if state.done > 0 {
+        if state.done() > 0 {
             state.total.light = from.half_planes(of(bounced)?, places)?;
             for (sum, texture) in state.flats.iter_mut().zip(&flats.textures) {
                 if let Some(t) = texture {

@@ -58,8 +58,8 @@ pub(super) struct Totals {
     pub(super) spread: Vec<Vec<bf16>>,
     /// That luminance of each replicate at every [`stride`]th node.
     pub(super) parts: Vec<Vec<f32>>,
-    /// Replicates in `light`.
-    pub(super) count: usize,
+    /// Replicates that are finished: those in `light`, if anything bounces.
+    pub(super) done: usize,
 }
 
 impl Totals {
@@ -67,7 +67,7 @@ impl Totals {
     pub(super) fn new(sides: &[Side], stored: usize, [nodes, places]: [usize; 2], replicates: usize) -> Self {
         let spread = if replicates > 1 { vec![vec![bf16::ZERO; places]; stored] } else { Vec::new() };
         let (lighting, direct, light, parts) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-        Self { sides: sides.to_vec(), stored, nodes, places, lighting, lit: 0, direct, light, spread, parts, count: 0 }
+        Self { sides: sides.to_vec(), stored, nodes, places, lighting, lit: 0, direct, light, spread, parts, done: 0 }
     }
 
     pub(super) fn stored(&self) -> usize {
@@ -103,7 +103,7 @@ impl Totals {
 
     /// Makes the sum of direct light its mean.
     pub(super) fn average_direct(&mut self) {
-        let share = 1.0 / self.lit.max(1) as f32;
+        let share = 1.0 / self.lit as f32;
         let lighting = std::mem::take(&mut self.lighting);
         self.direct = lighting.iter().map(|planes| HalfPlanes::new(planes, share, None)).collect();
     }
@@ -115,14 +115,14 @@ impl Totals {
         (scene, rows): (&Scene, &LitRows),
         focus: &Focus<L>,
     ) {
-        self.count += 1;
+        self.done += 1;
         if new.is_empty() {
             return;
         }
-        let before = 1.0 / (self.count - 1) as f32;
+        let before = 1.0 / (self.done - 1) as f32;
         let light = std::mem::take(&mut self.light);
         let mean = |s: usize, i: usize| light[s].all(i).map(|x| before * x);
-        self.deviate((scene, rows), new, self.count, mean, Some(focus));
+        self.deviate((scene, rows), new, self.done, mean, Some(focus));
         let mut old = light.into_iter();
         self.light = new.iter().map(|new| HalfPlanes::new(new, 1.0, old.next())).collect();
     }
@@ -201,20 +201,20 @@ impl Totals {
         }
     }
 
-    /// What `done` replicates gave at the nodes that are lit, gathered light in focus; of fewer than all the direct
-    /// light of all that were lit, as it is, since borders of shadows would ring; `apart`: that on its own, too.
+    /// What all replicates gave at the nodes that are lit: gathered light in focus, direct light as it is, since
+    /// borders of shadows would ring; `apart`: that on its own, too.
     #[allow(clippy::cast_possible_truncation, reason = "a factor of at most 1")]
     pub(super) fn finish<L: Fn(usize) -> bool + Sync>(
         self,
         rows: &LitRows,
         focus: &Focus<L>,
-        done: usize,
         apart: bool,
     ) -> Vec<SweptSide> {
-        let scale = 1.0 / done.max(1) as f32;
-        let together = together(&self.parts[..done.min(self.parts.len())]) as f32;
+        let done = self.done;
+        let scale = 1.0 / done as f32;
+        let together = together(&self.parts) as f32;
         let mut indirect = self.light.into_iter();
-        let mut spread = self.spread.into_iter().filter(|_| done > 1);
+        let mut spread = self.spread.into_iter();
         let side = |(&side, direct): (&Side, HalfPlanes)| {
             let light = indirect.next();
             let own = |place: usize| [0, 1, 2].map(|c| direct.at(c, place));
@@ -223,8 +223,9 @@ impl Totals {
                 let (direct, gathered) = (own(place), light.as_ref().map_or([0.0; 3], gathered));
                 std::array::from_fn(|c| direct[c] + scale * gathered[c].max(0.0))
             });
-            let factor = (together * scale / (done.max(2) - 1) as f32).sqrt();
+            // Of two replicates or more.
             let error = |roots: Vec<bf16>| -> Vec<f32> {
+                let factor = (together * scale / (done - 1) as f32).sqrt();
                 all_nodes(self.nodes, rows, focus, |_, place| factor * roots[place].to_f32())
             };
             let direct = if apart { all_nodes(self.nodes, rows, focus, |_, place| own(place)) } else { Vec::new() };
