@@ -10,6 +10,7 @@
 use crate::field::Field;
 use crate::illumination_grid::IlluminationGrid;
 use crate::node_set::NodeSet;
+use crate::progress::Tick;
 use crate::radiance::RadianceSample;
 use crate::rng::Stage;
 use crate::volume::Lattice;
@@ -80,18 +81,13 @@ pub struct GridFit<'a> {
     free: &'a NodeSet,
     /// As [`PULL`].
     pull: f32,
-    tick: &'a (dyn Fn(u64) -> bool + Sync),
+    tick: Tick<'a>,
 }
 
 impl<'a> GridFit<'a> {
     /// A fit of light at the nodes of `lattice` that `free` holds. `tick(n)` reports n nodes done; returning false
     /// stops early.
-    pub fn new(
-        field: &'a Field,
-        lattice: &'a Lattice,
-        free: &'a NodeSet,
-        tick: &'a (dyn Fn(u64) -> bool + Sync),
-    ) -> Self {
+    pub fn new(field: &'a Field, lattice: &'a Lattice, free: &'a NodeSet, tick: Tick<'a>) -> Self {
         Self { field, lattice, free, pull: PULL, tick }
     }
 

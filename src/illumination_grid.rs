@@ -7,6 +7,7 @@ use crate::field::Field;
 use crate::flattened::Side;
 use crate::mask::Mask;
 use crate::nearest::{Neighbours, PointGrid};
+use crate::progress::Tick;
 use crate::radiance::RadianceSample;
 use crate::scene::Scene;
 use crate::split::{self, Split};
@@ -186,7 +187,7 @@ pub fn shepard(
     masks: &[Mask],
     samples: &[RadianceSample],
     neighbours: usize,
-    tick: &(dyn Fn(u64) -> bool + Sync),
+    tick: Tick,
 ) -> IlluminationGrid {
     let grid = point_grid(field, samples);
     let light = |&n: &u32| (samples[n as usize].radiance, samples[n as usize].variance);
@@ -211,7 +212,7 @@ pub(crate) fn from_nearest(
     lattice: &Lattice,
     masks: &[Mask],
     (grid, neighbours): (&PointGrid, usize),
-    tick: &(dyn Fn(u64) -> bool + Sync),
+    tick: Tick,
     value: impl Fn(usize, Vec3, &[(f32, u32)]) -> ([f32; 3], f32) + Sync,
 ) -> IlluminationGrid {
     let step = lattice.axes();

@@ -12,6 +12,7 @@ use crate::flattened::Side;
 use crate::illumination_grid::{IlluminationGrid, from_nearest, point_grid};
 use crate::linear_fit::{NormalMatrix, Sums};
 use crate::mask::{Mask, local_position};
+use crate::progress::Tick;
 use crate::radiance::RadianceSample;
 use crate::scene::Scene;
 use crate::split::share;
@@ -59,7 +60,7 @@ pub fn interpolate(
     masks: &[Mask],
     samples: &[RadianceSample],
     neighbours: usize,
-    tick: &(dyn Fn(u64) -> bool + Sync),
+    tick: Tick,
 ) -> IlluminationGrid {
     let field = &scene.field;
     let points = masks.iter().filter(|&&m| m != Mask::Empty).count();

@@ -7,6 +7,7 @@ use crate::flat;
 use crate::flattened::{FlattenedRay, Side, Target};
 use crate::isovalue_axis::IsovalueAxis;
 use crate::landing::{Landing, MOST_LANDINGS, landing};
+use crate::progress::Tick;
 use crate::rng::{Rng, Stage};
 use crate::scene::Scene;
 use crate::tracer::Tracer;
@@ -219,12 +220,7 @@ const ROUND: usize = 32;
 
 /// Emits and traces `settings.count` photons. `tick` is called with the number of photons done, from any thread;
 /// returning false stops the work early with what is done.
-pub fn trace_photons<T: Tracer>(
-    scene: &Scene,
-    tracer: &T,
-    settings: &PhotonSettings,
-    tick: &(dyn Fn(u64) -> bool + Sync),
-) -> Photons {
+pub fn trace_photons<T: Tracer>(scene: &Scene, tracer: &T, settings: &PhotonSettings, tick: Tick) -> Photons {
     let photons = PhotonTracer { emitter: Emitter::new(scene, settings), tracer };
     if !photons.emitter.shines() || settings.count == 0 {
         return Photons::default();

@@ -40,6 +40,10 @@ pub fn unless_interrupted() -> Result<()> {
     if interrupted() { Err(Error::Interrupted) } else { Ok(()) }
 }
 
+/// How work tells how far it is: called from any of its threads with the units that were done since the last call;
+/// returning false ends the work early.
+pub type Tick<'a> = &'a (dyn Fn(u64) -> bool + Sync);
+
 /// Watches work, from any of its threads, and may end it.
 ///
 /// ```

@@ -7,6 +7,7 @@ use crate::flattened::Side;
 use crate::gather::gathered_irradiance;
 use crate::nearest::Neighbours;
 use crate::photon_map::PhotonMap;
+use crate::progress::Tick;
 use crate::radiance_cache::RadianceCache;
 use crate::rng::Stage;
 use crate::scene::Scene;
@@ -108,7 +109,7 @@ pub struct Sampler<'a, T> {
 impl<T: Tracer> Sampler<'_, T> {
     /// The samples at `positions`, random numbers keyed by their place in the list. `tick(n)` reports n samples done;
     /// returning false stops early.
-    pub fn samples(&self, positions: &[Vec3], tick: &(dyn Fn(u64) -> bool + Sync)) -> RadianceSamples {
+    pub fn samples(&self, positions: &[Vec3], tick: Tick) -> RadianceSamples {
         let place = |n: usize| (n as u64, positions[n]);
         sample_places(self, positions.len(), &place, checkpoint::Stage::UNSAVED, 0, tick)
     }
@@ -197,7 +198,7 @@ pub fn sample_places<T: Tracer>(
     place: &(dyn Fn(usize) -> (u64, Vec3) + Sync),
     saved: checkpoint::Stage<'_>,
     first: usize,
-    tick: &(dyn Fn(u64) -> bool + Sync),
+    tick: Tick,
 ) -> RadianceSamples {
     let (rays, misses) = (AtomicU64::new(0), AtomicU64::new(0));
     let mut samples = vec![None; count];

@@ -19,6 +19,7 @@ use crate::nearest::Neighbours;
 use crate::node_set::NodeSet;
 use crate::photon::{Photons, SurfacePhoton};
 use crate::photon_map::{EstimateSettings, PhotonMap};
+use crate::progress::Tick;
 use crate::rng::Stage;
 use crate::scene::Scene;
 use crate::sharpening::sharpen;
@@ -159,13 +160,7 @@ pub struct RadianceCache {
 impl RadianceCache {
     /// A cache of what walls and caps show; its nodes are for [`RadianceCache::fill`]. `tick(n)` reports n of their
     /// [`flat::lit_texels`] done; returning false stops early.
-    pub fn new<T: Tracer>(
-        scene: &Scene,
-        tracer: &T,
-        photons: &Photons,
-        settings: &CacheSettings,
-        tick: &(dyn Fn(u64) -> bool + Sync),
-    ) -> Self {
+    pub fn new<T: Tracer>(scene: &Scene, tracer: &T, photons: &Photons, settings: &CacheSettings, tick: Tick) -> Self {
         let rays = AtomicU64::new(0);
         let photons_of = ByFlat::new(&photons.flat, flat::count(scene));
         let pools = Pools::new(scene, settings.flat_resolution);
@@ -189,7 +184,7 @@ impl RadianceCache {
         source: &NodePhotons<'_>,
         settings: &CacheSettings,
         NodeBand { range: band, saved, first }: NodeBand<'_>,
-        tick: &(dyn Fn(u64) -> bool + Sync),
+        tick: Tick,
     ) {
         let rays = AtomicU64::new(0);
         let (points, dims) = (scene.lattice().len(), scene.lattice().dims());
@@ -369,7 +364,7 @@ struct Fill<'a, T> {
     filled: &'a NodeSet,
     stored: &'a NodeSet,
     first: usize,
-    tick: &'a (dyn Fn(u64) -> bool + Sync),
+    tick: Tick<'a>,
     rays: &'a AtomicU64,
 }
 

@@ -18,6 +18,7 @@ use crate::export::ply;
 use crate::isosurface;
 use crate::isovalue_axis::IsovalueAxis;
 use crate::photon::{PhotonSettings, trace_photons};
+use crate::progress::Tick;
 use crate::rng::{Rng, Stage};
 use crate::scene::Scene;
 use crate::surface_mesh::{SurfaceMesh, channel};
@@ -165,7 +166,7 @@ pub fn reference<T: Tracer>(
     mesh: &SurfaceMesh,
     isovalue: f32,
     settings: &ReferenceSettings,
-    tick: &(dyn Fn(u64) -> bool + Sync),
+    tick: Tick,
 ) -> Result<Reference> {
     settings.integrator.check(scene)?;
     let side = scene.surface.outside;

@@ -7,6 +7,7 @@ use crate::error::{Error, Result};
 use crate::field::Field;
 use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, local_position};
+use crate::progress::Tick;
 use crate::reference::PathTracer;
 use crate::rng::{Rng, Stage};
 use crate::sampling::{Strategy, positions};
@@ -109,7 +110,7 @@ pub fn survey<T: Tracer>(
     shown: &(dyn Fn(DVec3, u64) -> DVec3 + Sync),
     exposure: f64,
     settings: &SurveySettings,
-    tick: &(dyn Fn(u64) -> bool + Sync),
+    tick: Tick,
 ) -> Result<Survey> {
     let chosen = places(&scene.field, settings)?;
     if chosen.is_empty() {

@@ -14,6 +14,7 @@ use crate::gather::gathered_irradiance;
 use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, local_position};
 use crate::polygon::Polygon;
+use crate::progress::Tick;
 use crate::radiance_cache::RadianceCache;
 use crate::rng::Stage;
 use crate::scene::{Boundary, ON, Scene};
@@ -127,7 +128,7 @@ impl<'a> Contacts<'a> {
         holds: impl Fn(usize) -> bool + Sync,
         side: Side,
         wedge: &Wedge<T>,
-        tick: &(dyn Fn(u64) -> bool + Sync),
+        tick: Tick,
     ) -> Counts {
         let surface = &self.scene.surface;
         let albedo = |o: usize| {
@@ -155,7 +156,7 @@ impl<'a> Contacts<'a> {
         side: Side,
         wedge: &Wedge<T>,
         white: impl Fn(usize) -> Option<DVec3> + Sync,
-        tick: &(dyn Fn(u64) -> bool + Sync),
+        tick: Tick,
     ) -> Vec<(usize, Solved, Counts)> {
         let solve = |&(o, walls): &(usize, [Option<u32>; MOST])| {
             if !tick(1) {

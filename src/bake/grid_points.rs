@@ -11,6 +11,7 @@ use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, local_position, own_light, stand_ins};
 use crate::node_set::NodeSet;
+use crate::progress::Tick;
 use crate::radiance::{BLOCK, RadianceSample, RadianceSamples, Sampler, sample_places};
 use crate::scene::Scene;
 use crate::smoothing::{Halves, Scattered, Smoothed, smooth, smooth_scattered};
@@ -170,7 +171,7 @@ impl<'a> GridPoints<'a> {
         light: &mut PointLight,
         apart: &(dyn Fn(usize) -> bool + Sync),
         saved: checkpoint::Stage<'_>,
-        tick: &(dyn Fn(u64) -> bool + Sync),
+        tick: Tick,
     ) -> Counts {
         let PointLight { grid, halves, direct } = light;
         let smoothing = halves.is_some();
@@ -233,7 +234,7 @@ impl<'a> GridPoints<'a> {
         side: Side,
         tau: f64,
         PointLight { mut grid, halves, direct }: PointLight,
-        tick: &(dyn Fn(u64) -> bool + Sync),
+        tick: Tick,
     ) -> IlluminationGrid {
         if let Some(packed) = halves {
             self.smooth(scene, side, tau, (&mut grid, &packed), tick);
@@ -250,7 +251,7 @@ impl<'a> GridPoints<'a> {
         side: Side,
         tau: f64,
         (grid, packed): (&mut IlluminationGrid, &[Packed]),
-        tick: &(dyn Fn(u64) -> bool + Sync),
+        tick: Tick,
     ) {
         let halves = |o: usize| self.set.slot(o).map_or([Vec3::NAN; 2], |slot| packed[slot].unpack());
         smooth(scene, self.lattice, side, tau, &halves, &mut |z, smoothed| {
@@ -391,7 +392,7 @@ impl<'a> Beside<'a> {
         band: Band,
         light: &mut [BesideLight],
         saved: checkpoint::Stage<'_>,
-        tick: &(dyn Fn(u64) -> bool + Sync),
+        tick: Tick,
     ) -> Counts {
         let isovalue = |n: usize| (self.field.value(self.positions[n].as_dvec3()) as f32).clamp(0.0, 1.0);
         let own: Vec<u32> =
@@ -416,14 +417,7 @@ impl<'a> Beside<'a> {
 
     /// Smooths what was gathered over the places around ([`smooth_scattered`]): where little arrives, few rays bring
     /// it, and the fit would show them as specks. Leaves all as it is if `tick` says stop.
-    pub(super) fn smooth(
-        &self,
-        scene: &Scene,
-        side: Side,
-        tau: f64,
-        light: &mut [BesideLight],
-        tick: &(dyn Fn(u64) -> bool + Sync),
-    ) {
+    pub(super) fn smooth(&self, scene: &Scene, side: Side, tau: f64, light: &mut [BesideLight], tick: Tick) {
         let scattered =
             Scattered { lattice: self.lattice, owners: &self.points, starts: &self.starts, positions: &self.positions };
         let halves = |n: usize| light[n].halves.unpack();

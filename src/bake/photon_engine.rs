@@ -16,7 +16,7 @@ use crate::isovalue_axis::IsovalueAxis;
 use crate::mask::Mask;
 use crate::node_set::NodeSet;
 use crate::photon::trace_photons;
-use crate::progress::{Clock, Progress};
+use crate::progress::{Clock, Progress, Tick};
 use crate::radiance::{BLOCK, Indirect, RadianceSample, Sampler, sample_places};
 use crate::radiance_cache::{NodeBand, NodePhotons, RadianceCache};
 use crate::sampling::{Strategy, positions};
@@ -210,7 +210,7 @@ impl<'a> FieldLight<'a> {
         (cache, source): (&RadianceCache, &NodePhotons<'_>),
         settings: &BakeSettings,
         checkpoint: Option<&Checkpoint>,
-        tick: &(dyn Fn(u64) -> bool + Sync),
+        tick: Tick,
     ) -> Counts {
         let Job { scene, number, .. } = self.job;
         let mut counts = Counts::default();
@@ -248,7 +248,7 @@ impl<'a> FieldLight<'a> {
     }
 
     /// The grids of all sides.
-    fn finish(self, settings: &BakeSettings, tick: &(dyn Fn(u64) -> bool + Sync)) -> Vec<(Side, IlluminationGrid)> {
+    fn finish(self, settings: &BakeSettings, tick: Tick) -> Vec<(Side, IlluminationGrid)> {
         let Self { job: Job { scene, lattice, masks, .. }, places, sides } = self;
         let each = |SideLight { side, points, scattered }: SideLight| {
             let grid = match (&places, points) {

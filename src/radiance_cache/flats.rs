@@ -9,6 +9,7 @@ use crate::direct::{Estimate, Receiver, direct_irradiance};
 use crate::flat::{self, Flat, FlatLight, FlatTexture, Texel, Within};
 use crate::neighbourhood::neighbourhood;
 use crate::photon::FlatPhoton;
+use crate::progress::Tick;
 use crate::rng::Stage;
 use crate::scene::Scene;
 use crate::tracer::Tracer;
@@ -31,9 +32,6 @@ pub(super) struct Filled {
     pub shown: Option<FlatLight>,
 }
 
-/// Reports texels done; returning false stops early.
-pub(super) type Tick<'a> = &'a (dyn Fn(u64) -> bool + Sync);
-
 /// Direct light of texels and photons of later landings, on so many times the flat's area.
 pub(super) fn fill_flat<T: Tracer>(
     scene: &Scene,
@@ -42,7 +40,7 @@ pub(super) fn fill_flat<T: Tracer>(
     photons: impl Iterator<Item = FlatPhoton>,
     areas: f64,
     settings: &CacheSettings,
-    (rays, tick): (&AtomicU64, Tick<'_>),
+    (rays, tick): (&AtomicU64, Tick),
 ) -> Filled {
     let Some(flat) = flat::flat(scene, number).filter(|f| !f.albedo.black()) else { return Filled::default() };
     let dims = flat.resolution(settings.flat_resolution, settings.isovalue_resolution);
@@ -231,7 +229,7 @@ fn direct_light(
     [nu, nv, nc]: [usize; 3],
     estimate: impl Fn(usize, u32) -> Option<Estimate> + Sync,
     [few, many]: [u32; 2],
-    tick: Tick<'_>,
+    tick: Tick,
 ) -> Vec<Option<DVec3>> {
     let texels = nu * nv;
     let isovalue = |first: usize| {

@@ -3,6 +3,7 @@
 use super::{CONE, Halves, Smoothed, Surroundings, shortest};
 use crate::flattened::Side;
 use crate::node_set::NodeSet;
+use crate::progress::Tick;
 use crate::scene::Scene;
 use crate::volume::Lattice;
 use glam::{DVec3, Vec3};
@@ -60,7 +61,7 @@ pub fn smooth_scattered(
     side: Side,
     tau: f64,
     halves: &(dyn Fn(usize) -> Halves + Sync),
-    tick: &(dyn Fn(u64) -> bool + Sync),
+    tick: Tick,
 ) -> Option<Vec<Smoothed>> {
     let cloud = Cloud::new(scene, scattered, side, tau, halves);
     let once = cloud.each(tick, |n| cloud.fit(n, halves))?;
@@ -124,11 +125,7 @@ impl<'a> Cloud<'a> {
     }
 
     /// `f` of every place with light, nothing of the others; none once `tick` says stop.
-    fn each<T: Default + Send>(
-        &self,
-        tick: &(dyn Fn(u64) -> bool + Sync),
-        f: impl Fn(usize) -> T + Sync,
-    ) -> Option<Vec<T>> {
+    fn each<T: Default + Send>(&self, tick: Tick, f: impl Fn(usize) -> T + Sync) -> Option<Vec<T>> {
         let of = |n: usize| match self.places[n].normal {
             Vec3::ZERO => Some(T::default()),
             _ => tick(0).then(|| f(n)),
