@@ -120,11 +120,6 @@ impl AtomicFile {
         self.complete()
     }
 
-    /// Commits what `written` says was written well; its failure becomes an [`Error::Io`] at the file.
-    pub(crate) fn finish(self, written: io::Result<()>) -> Result<()> {
-        self.complete_if(written)?.commit()
-    }
-
     fn open(&mut self) -> io::Result<&mut BufWriter<File>> {
         self.file.as_mut().ok_or_else(|| io::Error::other("the file is closed"))
     }
@@ -273,10 +268,6 @@ mod tests {
         let second = AtomicFile::create(folder.path().join("a.bin")).unwrap();
         assert_eq!(entries(folder.path()).len(), 2, "two writers, two files");
         drop((file, second));
-        assert!(entries(folder.path()).is_empty());
-        let failed =
-            AtomicFile::create(folder.path().join("a.bin")).unwrap().finish(Err(io::Error::other("disk full")));
-        assert!(failed.unwrap_err().to_string().contains("a.bin: disk full"));
         assert!(entries(folder.path()).is_empty());
     }
 

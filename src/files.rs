@@ -5,7 +5,7 @@ use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
 use flate2::bufread::{GzDecoder, ZlibDecoder};
 use std::fs::File;
-use std::io::{BufRead, BufReader, Read, Seek, SeekFrom};
+use std::io::{BufRead, BufReader, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
 /// What may be allocated on the word of a header alone, beyond twice the file's size.
@@ -261,6 +261,14 @@ fn broken(path: &Path, section: Section, found: u64, total: u64, source: std::io
 /// `Io` with the path, or what `write` returns; the temporary file is removed then.
 pub(crate) fn write_atomically(path: &Path, write: impl FnOnce(&mut AtomicFile) -> std::io::Result<()>) -> Result<()> {
     completed(path, write)?.commit()
+}
+
+/// [`write_atomically`] of a text.
+///
+/// # Errors
+/// `Io` with the path.
+pub(crate) fn write_text(path: &Path, text: &str) -> Result<()> {
+    write_atomically(path, |out| out.write_all(text.as_bytes()))
 }
 
 /// As [`write_atomically`], but the name is left to the caller.

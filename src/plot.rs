@@ -1,9 +1,8 @@
 //! Line and scatter plots as SVG: what the tables of a study look like.
 
-use crate::atomic::AtomicFile;
 use crate::error::Result;
+use crate::files;
 use std::fmt::Write as _;
-use std::io::Write as _;
 use std::path::Path;
 
 /// Points of one colour, joined or not.
@@ -249,9 +248,7 @@ impl Plot {
     /// # Errors
     /// `Io`.
     pub fn write(&self, path: &Path) -> Result<()> {
-        let mut file = AtomicFile::create(path)?;
-        let written = file.write_all(self.to_svg().as_bytes());
-        file.finish(written)
+        files::write_text(path, &self.to_svg())
     }
 }
 

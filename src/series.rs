@@ -1,12 +1,11 @@
 //! A volume that changes with time: frames in files, linear in between.
 
-use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
+use crate::files;
 use crate::volume::statistics::VolumeStatistics;
 use crate::volume::vti::escape;
 use crate::volume::{Samples, Volume};
 use rayon::prelude::*;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 /// Frames at rising times, two or more.
@@ -196,9 +195,7 @@ pub fn write_collection(path: &Path, frames: &[(f64, PathBuf)]) -> Result<()> {
         text += &format!("    <DataSet timestep=\"{time}\" group=\"\" part=\"0\" file=\"{name}\"/>\n");
     }
     text += "  </Collection>\n</VTKFile>\n";
-    let mut file = AtomicFile::create(path)?;
-    file.write_all(text.as_bytes()).map_err(|e| Error::io(path, e))?;
-    file.commit()
+    files::write_text(path, &text)
 }
 
 #[cfg(test)]

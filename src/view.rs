@@ -3,9 +3,9 @@
 
 pub mod codec;
 
-use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
+use crate::files;
 use crate::flat::{self, FlatLight, FlatTexture, Within};
 use crate::flattened::Side;
 use crate::mask::Mask;
@@ -256,9 +256,7 @@ fn histogram(samples: &[f32]) -> Vec<u64> {
 /// `NotSupported` for a bake too large for browsers; `Io`.
 pub fn write(path: &Path, baked: &BakedVolume, title: &str) -> Result<usize> {
     let html = Payload::new(baked, title)?.to_html();
-    let mut file = AtomicFile::create(path)?;
-    file.write_all(html.as_bytes()).map_err(|e| Error::io(path, e))?;
-    file.commit()?;
+    files::write_text(path, &html)?;
     Ok(html.len())
 }
 

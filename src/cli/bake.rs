@@ -10,6 +10,7 @@ use crate::checkpoint::{Checkpoint, Held};
 use crate::error::{Error, Result};
 use crate::export::bake_file::{self, BakedVolume};
 use crate::field::Sweep;
+use crate::files;
 use crate::progress::{Clock, Progress, say};
 use crate::scene::{Policy, Scene};
 use crate::scene_file::{Inputs, SceneOptions, load, load_series};
@@ -159,9 +160,7 @@ impl Bake {
     /// Writes the report, if that is wanted.
     fn hand_out(&self, report: &serde_json::Value) -> Result<()> {
         let Some(path) = &self.report else { return Ok(()) };
-        let mut file = crate::atomic::AtomicFile::create(path)?;
-        serde_json::to_writer_pretty(&mut file, report).map_err(|e| Error::io(path, e.into()))?;
-        file.commit()
+        files::write_atomically(path, |out| Ok(serde_json::to_writer_pretty(out, report)?))
     }
 
     /// Prints reports or estimates, if that is wanted.

@@ -1,8 +1,8 @@
 //! `isolume completions` and `isolume man`: what the command line says about itself, for shells and readers.
 
 use super::Cli;
-use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
+use crate::files;
 use crate::progress::{Progress, say};
 use clap::CommandFactory;
 use std::io::Write;
@@ -57,10 +57,8 @@ impl ManualPages {
 /// The page of `command` and those of its verbs; how many.
 fn write_pages(folder: &Path, command: &clap::Command, name: &str) -> Result<usize> {
     let path = folder.join(format!("{name}.1"));
-    let mut file = AtomicFile::create(&path)?;
     let page = clap_mangen::Man::new(command.clone().name(name.to_owned()).bin_name(name.replace('-', " ")));
-    page.render(&mut file).map_err(|e| Error::io(&path, e))?;
-    file.commit()?;
+    files::write_atomically(&path, |out| page.render(out))?;
     let mut count = 1;
     for verb in command.get_subcommands().filter(|v| v.get_name() != "help") {
         count += write_pages(folder, verb, &format!("{name}-{}", verb.get_name()))?;

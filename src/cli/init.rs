@@ -1,15 +1,14 @@
 //! `isolume init`: a scene file for a volume, with every key, its default and what it does.
 
 use super::{expect_extension, export, one_frame};
-use crate::atomic::AtomicFile;
 use crate::digits::brief_span;
 use crate::error::{Error, Result};
+use crate::files;
 use crate::illumination_grid::GridSize;
 use crate::progress::{Progress, say};
 use crate::scene_file::RawOptions;
 use crate::volume::Lattice;
 use crate::volume::statistics::VolumeStatistics;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 #[derive(clap::Args, Debug)]
@@ -42,9 +41,7 @@ impl Init {
         let statistics = VolumeStatistics::of(&volume);
         let named = relative(&self.file, &output)?;
         let text = scene_text(&named, &self.raw, &statistics, &volume.lattice);
-        let mut file = AtomicFile::create(&output)?;
-        file.write_all(text.as_bytes()).map_err(|e| Error::io(&output, e))?;
-        file.commit()?;
+        files::write_text(&output, &text)?;
         if progress.is_shown() {
             say!("{}: edit it, then: isolume bake {} -o lit.vti", output.display(), for_shell(&output));
         }

@@ -6,8 +6,8 @@
 
 use super::Mesh;
 use super::picture::srgb_decode;
-use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
+use crate::files;
 use glam::{DVec3, Vec3};
 use serde_json::{Value, json};
 use std::io::Write;
@@ -87,8 +87,7 @@ pub fn write(path: impl AsRef<Path>, mesh: &Mesh) -> Result<()> {
     let mut text = document.to_string().into_bytes();
     // Chunks end at multiples of 4: the text with spaces; the data does so by itself.
     text.resize(text.len().next_multiple_of(4), b' ');
-    let mut file = AtomicFile::create(path)?;
-    let mut write = || -> std::io::Result<()> {
+    files::write_atomically(path, |file| {
         let total = 12 + 8 + text.len() + 8 + data.bytes.len();
         let word = |n: usize| (n as u32).to_le_bytes();
         file.write_all(&[*b"glTF", word(2), word(total)].concat())?;
@@ -96,9 +95,7 @@ pub fn write(path: impl AsRef<Path>, mesh: &Mesh) -> Result<()> {
         file.write_all(&text)?;
         file.write_all(&[word(data.bytes.len()), *b"BIN\0"].concat())?;
         file.write_all(&data.bytes)
-    };
-    let written = write();
-    file.finish(written)
+    })
 }
 
 /// The binary chunk, and what describes it.

@@ -8,15 +8,7 @@ use std::fmt::Write as _;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
-/// Writes a `.vtm` that names `parts`, (name, file beside it).
-///
-/// # Errors
-/// `Io`.
-pub fn write(path: &Path, parts: &[(String, String)]) -> Result<()> {
-    completed(path, parts)?.commit()
-}
-
-/// As [`write()`], but the file's name is left to the caller.
+/// A `.vtm` that names `parts`, (name, file beside it); the file's own name is left to the caller.
 ///
 /// # Errors
 /// `Io`.
@@ -58,7 +50,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a&b.vtm");
         let parts = [("one".to_owned(), "a&b-one.vti".to_owned()), ("two".to_owned(), "a\"b<.vti".to_owned())];
-        write(&path, &parts).unwrap();
+        completed(&path, &parts).and_then(AtomicFile::commit).unwrap();
         assert_eq!(read(&path).unwrap(), parts.map(|p| dir.path().join(p.1)));
         std::fs::write(&path, "<VTKFile/>").unwrap();
         assert!(read(&path).unwrap_err().to_string().contains("names no files"));

@@ -1,8 +1,8 @@
 //! Wavefront OBJ with vertex colours, for tools that read nothing better. Positions keep all digits of f64.
 
 use super::Mesh;
-use crate::atomic::AtomicFile;
 use crate::error::Result;
+use crate::files;
 use std::io::{self, Write};
 use std::path::Path;
 
@@ -14,9 +14,7 @@ use std::path::Path;
 /// triangles; `Io`.
 pub fn write(path: impl AsRef<Path>, mesh: &Mesh) -> Result<()> {
     mesh.check(path.as_ref())?;
-    let mut file = AtomicFile::create(path)?;
-    let written = write_to(&mut file, mesh);
-    file.finish(written)
+    files::write_atomically(path.as_ref(), |out| write_to(out, mesh))
 }
 
 fn write_to(out: &mut impl Write, mesh: &Mesh) -> io::Result<()> {

@@ -2,6 +2,7 @@
 
 use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
+use crate::files;
 use exr::meta::attribute::{AttributeValue, Text};
 use exr::prelude::WritableImage;
 use exr::prelude::{Blocks, Compression, Encoding, Image, Layer, LayerAttributes, LineOrder, SpecificChannels, Vec2};
@@ -80,9 +81,8 @@ impl Picture {
         if !exposure.is_finite() || exposure <= 0.0 {
             return Err(Error::invalid(path, format!("exposure {exposure}: it must be positive and finite")));
         }
-        let mut file = AtomicFile::create(path)?;
-        let mut write = || -> std::result::Result<(), png::EncodingError> {
-            let mut encoder = png::Encoder::new(&mut file, width, height);
+        let write = |out: &mut AtomicFile| -> std::result::Result<(), png::EncodingError> {
+            let mut encoder = png::Encoder::new(out, width, height);
             encoder.set_color(png::ColorType::Rgb);
             encoder.set_depth(png::BitDepth::Eight);
             encoder.set_source_srgb(png::SrgbRenderingIntent::Perceptual);
@@ -91,11 +91,12 @@ impl Picture {
             writer.write_image_data(&self.to_srgb8(exposure))?;
             writer.finish()
         };
-        let written = write().map_err(|e| match e {
-            png::EncodingError::IoError(e) => e,
-            e => std::io::Error::other(e),
-        });
-        file.finish(written)
+        files::write_atomically(path, |out| {
+            write(out).map_err(|e| match e {
+                png::EncodingError::IoError(e) => e,
+                e => std::io::Error::other(e),
+            })
+        })
     }
 
     /// Writes a 32-bit float EXR of the linear values (scan lines, ZIP, channels B G R), with custom string attributes
@@ -133,13 +134,13 @@ impl Picture {
         let encoding =
             Encoding { compression: Compression::ZIP16, blocks: Blocks::ScanLines, line_order: LineOrder::Increasing };
         let layer = Layer::new((self.width, self.height), own, encoding, SpecificChannels::rgb(pixel));
-        let mut file = AtomicFile::create(path)?;
         // On this thread: the crate would start a thread pool of its own beside rayon's.
-        let written = Image::from_layer(layer).write().non_parallel().to_buffered(&mut file).map_err(|e| match e {
-            exr::error::Error::Io(e) => e,
-            e => std::io::Error::other(e),
-        });
-        file.finish(written)
+        files::write_atomically(path, |out| {
+            Image::from_layer(layer).write().non_parallel().to_buffered(out).map_err(|e| match e {
+                exr::error::Error::Io(e) => e,
+                e => std::io::Error::other(e),
+            })
+        })
     }
 
     /// The size as PNG counts it, if there is a picture.

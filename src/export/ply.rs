@@ -5,7 +5,6 @@
 //! of `float` are to be seen.
 
 use super::{Mesh, coarse_in_f32, colour_bytes};
-use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
 use crate::files;
 use glam::DVec3;
@@ -43,9 +42,7 @@ pub fn write_with_comments(path: impl AsRef<Path>, mesh: &Mesh, comments: &[Stri
             ));
         }
     }
-    let mut file = AtomicFile::create(path)?;
-    let written = write_to(&mut file, mesh, comments);
-    file.finish(written)
+    files::write_atomically(path, |out| write_to(out, mesh, comments))
 }
 
 fn write_to(out: &mut impl Write, mesh: &Mesh, comments: &[String]) -> io::Result<()> {

@@ -1,7 +1,7 @@
 //! A grid as an OpenEXR of several layers, one per slice: for compositing programs and for pipelines that read EXR.
 
-use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
+use crate::files;
 use crate::volume::vti::SamplesRef;
 use crate::volume::{ElementType, Lattice};
 use exr::meta::attribute::{AttributeValue, Text};
@@ -63,14 +63,14 @@ pub fn write(path: &Path, lattice: &Lattice, components: usize, values: SamplesR
         })
         .collect();
     let attributes = ImageAttributes::new(IntegerBounds::from_dimensions((nx, ny)));
-    let mut file = AtomicFile::create(path)?;
     // On this thread: the crate would start a thread pool of its own beside rayon's.
     let image = Image::from_layers(attributes, layers);
-    let written = image.write().non_parallel().to_buffered(&mut file).map_err(|e| match e {
-        exr::error::Error::Io(e) => e,
-        e => std::io::Error::other(e),
-    });
-    file.finish(written)
+    files::write_atomically(path, |file| {
+        image.write().non_parallel().to_buffered(file).map_err(|e| match e {
+            exr::error::Error::Io(e) => e,
+            e => std::io::Error::other(e),
+        })
+    })
 }
 /// Whether [`ELEMENT`] is too coarse for what 64-bit values, or 32-bit integers, differ by, as it is for small
 /// differences on a large offset.

@@ -3,10 +3,10 @@
 use super::contour::level_curve;
 use super::solution::lookup;
 use super::{GraphSurface, HeightField, Landing, Receiver, Solution, Transport, World};
-use crate::atomic::AtomicFile;
 use crate::embree::Device;
 use crate::error::Result;
 use crate::export::picture::Picture;
+use crate::files;
 use crate::flattened::{FlattenedRay, Target};
 use crate::progress::{interrupted, unless_interrupted};
 use crate::rng::{Sobol, Stage};
@@ -14,7 +14,6 @@ use crate::tracer::Tracer;
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 use std::fmt::Write as _;
-use std::io::Write as _;
 use std::path::Path;
 
 /// What to draw.
@@ -430,9 +429,7 @@ fn write_svg(path: &Path, scene: &super::FlatScene, levels: &[f64]) -> Result<()
         );
     }
     svg.push_str("</svg>\n");
-    let mut file = AtomicFile::create(path)?;
-    let written = file.write_all(svg.as_bytes());
-    file.finish(written)
+    files::write_text(path, &svg)
 }
 
 /// A map of the field from above, `factor` pixels per cell, of display values.

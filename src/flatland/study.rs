@@ -5,17 +5,16 @@ use super::contour::level_curve;
 use super::pictures::{map, side_by_side, stacked};
 use super::solution::lookup;
 use super::{FlatScene, HeightField, Solution, SolveSettings, Transport, World};
-use crate::atomic::AtomicFile;
 use crate::embree::Device;
 use crate::error::{Error, Result};
 use crate::field::Sweep;
+use crate::files;
 use crate::nearest::{Neighbours, PointGrid};
 use crate::progress::{Progress, say};
 use crate::rng::{Rng, Sobol, Stage};
 use glam::{DVec2, DVec3, Vec3};
 use rayon::prelude::*;
 use std::fmt::Write as _;
-use std::io::Write as _;
 use std::path::Path;
 use std::time::Instant;
 
@@ -256,8 +255,8 @@ pub fn flatland(folder: &Path, device: &Device, settings: &StudySettings, progre
     for m in &table {
         let _ = writeln!(csv, "{},{},{:.4},{:.4}", m.placement.name(), m.samples, m.percent_rms, m.seconds);
     }
-    write(&folder.join("study.csv"), &csv)?;
-    write(&folder.join("study.svg"), &plot(&table))?;
+    files::write_text(&folder.join("study.csv"), &csv)?;
+    files::write_text(&folder.join("study.svg"), &plot(&table))?;
     let mut text = markdown(&bench, &table, solved, device);
     let mut figure = "";
     if !rows.is_empty() {
@@ -265,17 +264,11 @@ pub fn flatland(folder: &Path, device: &Device, settings: &StudySettings, progre
         text += "\n![samples and grids: level sets above, uniform below](figure5.png)\n";
         figure = ", figure5.png";
     }
-    write(&folder.join("study.md"), &text)?;
+    files::write_text(&folder.join("study.md"), &text)?;
     if progress.is_shown() {
         say!("{}: study.csv, study.md, study.svg{figure}", folder.display());
     }
     Ok(())
-}
-
-fn write(path: &Path, text: &str) -> Result<()> {
-    let mut file = AtomicFile::create(path)?;
-    let written = file.write_all(text.as_bytes());
-    file.finish(written)
 }
 
 /// Samples as dots of the grid's radiance there, and the grid made from them.

@@ -1,10 +1,9 @@
 //! A table that grows row by row: CSV on disk after each, so that an interrupted study goes on where it stopped.
 
-use crate::atomic::AtomicFile;
 use crate::error::{Error, Result};
+use crate::files;
 use std::borrow::Cow;
 use std::fmt::Write as _;
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 /// Rows of text under named columns; the first `keys` columns tell rows apart, the last two are the digest of their
@@ -97,7 +96,7 @@ impl Table {
             text += &row.iter().map(|v| quoted(v)).collect::<Vec<_>>().join(",");
             text.push('\n');
         }
-        write_text(&self.path, &text)
+        files::write_text(&self.path, &text)
     }
 
     /// All rows.
@@ -124,7 +123,7 @@ impl Table {
             writeln!(text, "| {} |", cells.join(" | ")).expect("strings take all that is written");
         }
         write!(text, "\n{notes}\n").expect("strings take all that is written");
-        write_text(path, &text)
+        files::write_text(path, &text)
     }
 }
 
@@ -158,13 +157,6 @@ fn records(text: &str) -> Vec<Vec<String>> {
         records.push(record);
     }
     records
-}
-
-/// Writes a text file, whole or not at all.
-pub(super) fn write_text(path: &Path, text: &str) -> Result<()> {
-    let mut file = AtomicFile::create(path)?;
-    let written = file.write_all(text.as_bytes());
-    file.finish(written)
 }
 
 #[cfg(test)]
