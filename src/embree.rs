@@ -28,6 +28,7 @@ mod triangles;
 pub use abi::{Hit, Hit16, INVALID_ID, Ray, Ray16, RayHit, RayHit16, Valid16};
 pub use bvh::{Bvh, BvhBuilder, Quality};
 pub use device::Device;
+pub(crate) use extrusions::{embree_ray, flattened_ray, padded};
 pub use hexahedra::{GraphTracer, pyramids};
 pub use triangles::SurfaceTracer;
 pub use user::{UserGeometry, UserHit, UserHits16};

@@ -84,8 +84,6 @@ pub struct Irradiance {
     pub mean: DVec3,
     /// Variance of the luminance, from the accepted photons' powers (Poisson).
     pub variance: f64,
-    /// Radius used, world units.
-    pub radius: f64,
 }
 
 /// The photons of one side, arranged for estimates.

@@ -19,7 +19,7 @@ pub(super) struct Extrusions {
 
 /// The ray as Embree carries it.
 #[inline]
-pub(super) fn embree_ray(ray: &FlattenedRay) -> Ray {
+pub(crate) fn embree_ray(ray: &FlattenedRay) -> Ray {
     let mut r = Ray::new(ray.origin.to_array(), ray.direction.to_array(), 0.0, ray.reach);
     r.id = ray.isovalue.to_bits();
     r.time = ray.pack_ends();
@@ -28,7 +28,7 @@ pub(super) fn embree_ray(ray: &FlattenedRay) -> Ray {
 
 /// The inverse of [`embree_ray`].
 #[inline]
-pub(super) fn flattened_ray(r: &Ray) -> FlattenedRay {
+pub(crate) fn flattened_ray(r: &Ray) -> FlattenedRay {
     let Ends { departure, target, with_light } = FlattenedRay::unpack_ends(r.time);
     FlattenedRay {
         origin: Vec3::from_array(r.org),
@@ -43,7 +43,7 @@ pub(super) fn flattened_ray(r: &Ray) -> FlattenedRay {
 
 /// Box corners for Embree, grown by [`PADDING`].
 #[allow(clippy::cast_possible_truncation, reason = "the padding covers f32 rounding")]
-pub(super) fn padded(lo: DVec3, hi: DVec3) -> ([f32; 3], [f32; 3]) {
+pub(crate) fn padded(lo: DVec3, hi: DVec3) -> ([f32; 3], [f32; 3]) {
     // Far from the origin an f32 step outgrows the padding in cells.
     let pad = PADDING.max(4.0 * f64::from(f32::EPSILON) * lo.abs().max(hi.abs()).max_element());
     ((lo - pad).as_vec3().to_array(), (hi + pad).as_vec3().to_array())

@@ -10,15 +10,13 @@
 
 use super::{FlatScene, HeightField, Segment};
 use crate::cubic::Cubic;
-use crate::embree::{Bvh, BvhBuilder, Device, Ray, RayHit, UserGeometry, UserHit};
+use crate::embree::{Bvh, BvhBuilder, Device, Ray, RayHit, UserGeometry, UserHit, embree_ray, flattened_ray, padded};
 use crate::error::Result;
 use crate::flattened::{Departure, Ends, Entry, FlattenedHit, FlattenedRay, Side, Target, enter};
 use crate::tracer::Tracer;
-use glam::{DVec2, DVec3, Vec3};
+use glam::{DVec2, DVec3};
 use std::sync::Arc;
 
-/// Boxes grow by this many cells, as in three dimensions: Embree tests user geometry without its ROBUST care.
-const PADDING: f64 = 1e-3;
 /// log₂ of the cells along an edge of a min/max block.
 const BLOCK: usize = 3;
 
@@ -276,33 +274,6 @@ impl UserGeometry for Extrusions {
     #[inline]
     fn occluded(&self, prim: u32, ray: &Ray) -> bool {
         self.meet(prim, ray).is_some()
-    }
-}
-
-/// Box corners for Embree, grown by [`PADDING`].
-fn padded(lo: DVec3, hi: DVec3) -> ([f32; 3], [f32; 3]) {
-    let pad = PADDING.max(4.0 * f64::from(f32::EPSILON) * lo.abs().max(hi.abs()).max_element());
-    ((lo - pad).as_vec3().to_array(), (hi + pad).as_vec3().to_array())
-}
-
-#[inline]
-fn embree_ray(ray: &FlattenedRay) -> Ray {
-    let mut r = Ray::new(ray.origin.to_array(), ray.direction.to_array(), 0.0, ray.reach);
-    (r.id, r.time) = (ray.isovalue.to_bits(), ray.pack_ends());
-    r
-}
-
-#[inline]
-fn flattened_ray(r: &Ray) -> FlattenedRay {
-    let Ends { departure, target, with_light } = FlattenedRay::unpack_ends(r.time);
-    FlattenedRay {
-        origin: Vec3::from_array(r.org),
-        direction: Vec3::from_array(r.dir),
-        isovalue: f32::from_bits(r.id),
-        reach: r.tfar,
-        departure,
-        target,
-        with_light,
     }
 }
 

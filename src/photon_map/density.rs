@@ -68,8 +68,6 @@ pub(super) struct PhotonDensity<'a> {
     bins: Vec<Bin>,
     /// As many as bins.
     light: Vec<Light>,
-    /// World edge of a cube of a cell's volume.
-    edge: f64,
     /// The mean measure of a bin.
     enough: f32,
 }
@@ -135,11 +133,10 @@ impl<'a> PhotonDensity<'a> {
         let factor: [usize; 3] = std::array::from_fn(|a| ((wanted / spacing[a]).round() as usize).clamp(1, dims[a]));
         let cells = Cells::new(factor, dims);
         let (starts, bins) = measure::bins(field, &cells, settings.tau);
-        let edge = (volume * factor.iter().product::<usize>() as f64).cbrt();
         // In f64: f32 would lose bins of a sum over millions.
         let enough = bins.iter().map(|bin| f64::from(bin.measure)).sum::<f64>() / bins.len().max(1) as f64;
         let enough = enough as f32;
-        let mut density = Self { field, settings, cells, starts, bins, light: Vec::new(), edge, enough };
+        let mut density = Self { field, settings, cells, starts, bins, light: Vec::new(), enough };
         let tallies = density.tallies(photons, keep, lattice.unit().powi(-2) as f32);
         let (mut light, isa) = (vec![Light::default(); density.bins.len()], Isa::current());
         let runs = light.par_chunks_mut(RUN).zip(density.bins.par_chunks(RUN));
@@ -310,7 +307,7 @@ impl<'a> PhotonDensity<'a> {
     /// `normal` is towards falling h.
     pub(super) fn irradiance(&self, position: DVec3, isovalue: f32, normal: Vec3) -> Irradiance {
         let place = self.cells.place(position);
-        let (mut mean, mut variance, mut radius, mut weight) = (Vec3::ZERO, 0.0, 0.0, 0.0);
+        let (mut mean, mut variance, mut weight) = (Vec3::ZERO, 0.0, 0.0);
         let [across, rows, layers] = [self.beside(0, place.x), self.beside(1, place.y), self.beside(2, place.z)];
         for (k, z) in layers {
             for (j, y) in rows {
@@ -327,25 +324,18 @@ impl<'a> PhotonDensity<'a> {
                         let (d, w) = (place - bin.centroid, part * bin.measure);
                         mean += w * (light.value + d.x * light.slope[0] + d.y * light.slope[1] + d.z * light.slope[2]);
                         variance += w * light.variance;
-                        radius += w * light.radius;
                         weight += w;
                     }
                 }
             }
         }
         if weight > 0.0 {
-            (mean, variance, radius) = (mean / weight, variance / weight, radius / weight);
+            (mean, variance) = (mean / weight, variance / weight);
         } else if let Some(own) = self.own(position, octant(normal), || normal) {
             // A tip or a crease, whose bin has another mean normal than the place itself.
-            Light { value: mean, variance, radius, .. } = self.light[own];
-        } else {
-            radius = MOST;
+            Light { value: mean, variance, .. } = self.light[own];
         }
-        Irradiance {
-            mean: mean.max(Vec3::ZERO).as_dvec3(),
-            variance: f64::from(variance),
-            radius: f64::from(radius) * self.edge,
-        }
+        Irradiance { mean: mean.max(Vec3::ZERO).as_dvec3(), variance: f64::from(variance) }
     }
 }
 

@@ -103,7 +103,7 @@ impl<'a> PhotonPoints<'a> {
         self.grid.nearest((world - self.origin).as_vec3(), k, self.radius, accept, scratch);
         let found = scratch.found();
         if found.is_empty() {
-            return Irradiance { radius: f64::from(self.radius), ..Irradiance::default() };
+            return Irradiance::default();
         }
         let farthest = found.iter().map(|e| e.0).fold(0.0, f32::max);
         // The k-th photon sets the radius and, by its kernel weight 0, does not count: the estimate is unbiased.
@@ -123,9 +123,9 @@ impl<'a> PhotonPoints<'a> {
             Normalisation::WithoutGradient => 8.0 * std::f64::consts::PI * radius.powi(3) / 15.0,
         };
         if !(measure > 0.0) {
-            return Irradiance { radius, ..Irradiance::default() };
+            return Irradiance::default();
         }
-        Irradiance { mean: power / measure, variance: squares / (measure * measure), radius }
+        Irradiance { mean: power / measure, variance: squares / (measure * measure) }
     }
 
     /// ∫_A K |∇h| dV over the accepted part of the ball, by low-discrepancy points.
