@@ -13,7 +13,7 @@ use glam::DVec3;
 /// ½ Σ θ_i (n · γ_i) over the edges, after clipping at the receiver's horizon. 0 behind the polygon or below the
 /// horizon; 2π·½ = π where the polygon fills the hemisphere. \[Lambert1760; Nishita85\]
 pub fn unoccluded(polygon: &Polygon, x: DVec3, n: DVec3) -> f64 {
-    if (x - polygon.vertices()[0]).dot(polygon.normal()) <= 0.0 {
+    if polygon.height(x) <= 0.0 {
         return 0.0;
     }
     // Edges are summed as the clipped vertices come.

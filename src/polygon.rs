@@ -146,6 +146,12 @@ impl Polygon {
         self.normal
     }
 
+    /// How far world point `x` is before the polygon's plane; negative behind it.
+    #[inline]
+    pub fn height(&self, x: DVec3) -> f64 {
+        (x - self.vertices[0]).dot(self.normal)
+    }
+
     /// World area.
     pub fn area(&self) -> f64 {
         self.area
@@ -199,7 +205,7 @@ impl Polygon {
     /// Distance of a point of the world.
     pub fn distance(&self, x: DVec3) -> f64 {
         let (v, n) = (&self.vertices, self.vertices.len());
-        let height = (x - v[0]).dot(self.normal);
+        let height = self.height(x);
         if self.contains(x - height * self.normal) {
             return height.abs();
         }
@@ -214,7 +220,7 @@ impl Polygon {
     /// Whether a point of the world is less than `reach` away.
     pub fn is_nearer(&self, x: DVec3, reach: f64) -> bool {
         // Its plane is no farther.
-        (x - self.vertices[0]).dot(self.normal).abs() < reach && self.distance(x) < reach
+        self.height(x).abs() < reach && self.distance(x) < reach
     }
 
     /// Whether texture coordinates cover the polygon exactly.

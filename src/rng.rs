@@ -2,6 +2,8 @@
 //! never depends on how many threads made it. Independent streams for photons; Owen-scrambled Sobol points for
 //! everything that is averaged.
 
+use glam::DVec3;
+
 /// What a stream is used for: streams of different stages never share numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u64)]
@@ -88,6 +90,12 @@ fn mix(mut z: u64) -> u64 {
 }
 
 const GOLDEN: u64 = 0x9e37_79b9_7f4a_7c15;
+
+/// `key` with the bits of a point folded in, for streams that belong to places or directions.
+#[inline]
+pub fn folded(key: u64, x: DVec3) -> u64 {
+    x.to_array().iter().fold(key, |k, x| (k ^ x.to_bits()).wrapping_mul(GOLDEN))
+}
 
 /// A stream of independent numbers, SplitMix64 keyed by (seed, stage, index). \[Steele14\]
 #[derive(Clone, Debug)]

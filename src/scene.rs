@@ -238,6 +238,25 @@ impl Scene {
         self.interior
     }
 
+    /// Whether caps close Ω's faces.
+    #[inline]
+    pub fn is_capped(&self) -> bool {
+        self.boundary == Boundary::Capped
+    }
+
+    /// Bounds of Ω and of all polygons, in units of voxels.
+    pub fn local_bounds(&self) -> [DVec3; 2] {
+        let bounds = [DVec3::ZERO, self.lattice().far()];
+        let vertices = self.polygons.iter().flat_map(|p| p.vertices()).map(|&x| self.lattice().to_index(x));
+        vertices.fold(bounds, |[lo, hi], p| [lo.min(p), hi.max(p)])
+    }
+
+    /// Whether polygons leave room around Ω.
+    pub fn has_margin(&self) -> bool {
+        let [lo, hi] = self.local_bounds();
+        lo.min(self.lattice().far() - hi).min_element() < -1e-6
+    }
+
     /// The lattice, whose index coordinates are the local frame.
     pub fn lattice(&self) -> &Lattice {
         self.field.lattice()

@@ -206,7 +206,7 @@ impl<'a> Points<'a> {
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     fn new(scene: &'a Scene, lattice: &'a Lattice, side: Side, tau: f64) -> Self {
         let axes = lattice.axes();
-        let radius = RADIUS * shortest(lattice);
+        let radius = RADIUS * lattice.spacing().min_element();
         let inverse = axes.inverse();
         let reach: [isize; 3] = std::array::from_fn(|a| (inverse.row(a).length() * radius).floor() as isize);
         let mut taps = Vec::new();
@@ -272,11 +272,6 @@ impl Surroundings for Points<'_> {
             }
         }
     }
-}
-
-/// The shortest step of a lattice.
-fn shortest(lattice: &Lattice) -> f64 {
-    (0..3).map(|a| lattice.axes().col(a).length()).fold(f64::INFINITY, f64::min)
 }
 
 #[cfg(test)]

@@ -16,7 +16,7 @@ use crate::bake::{Bake, BakeOptions, BakeSettings, Engine, bake, digest, scene_j
 use crate::embree::{Device, SurfaceTracer};
 use crate::error::{Error, Result};
 use crate::export::ply;
-use crate::progress::{Progress, processor_seconds, say};
+use crate::progress::{Clock, Progress, say};
 use crate::reference::{Origin, ReferenceSettings, VERSION, reference};
 use crate::scene::Scene;
 use crate::surface_mesh::SurfaceMesh;
@@ -24,7 +24,6 @@ use crate::volume::generate::bumps;
 use glam::DVec3;
 use rayon::prelude::*;
 use std::path::PathBuf;
-use std::time::Instant;
 
 /// A named scene.
 #[derive(Debug)]
@@ -191,9 +190,9 @@ impl<'a> Study<'a> {
     /// # Errors
     /// As [`bake`].
     pub fn bake(&self, subject: &Subject, settings: &BakeSettings) -> Result<(Bake, [f64; 2])> {
-        let (begun, worked) = (Instant::now(), processor_seconds());
+        let clock = Clock::start();
         let result = bake(&subject.scene, settings, &self.device, self.progress)?;
-        Ok((result, [begun.elapsed().as_secs_f64(), processor_seconds() - worked]))
+        Ok((result, clock.seconds()))
     }
 }
 

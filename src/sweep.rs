@@ -53,7 +53,7 @@ use crate::error::{Error, Result};
 use crate::flat::FlatLight;
 use crate::flattened::Side;
 use crate::isa::Isa;
-use crate::scene::{Boundary, Scene};
+use crate::scene::Scene;
 pub(crate) use arrive::reports;
 use direct::Direct;
 pub(crate) use fans::seen;
@@ -198,7 +198,7 @@ pub fn supported(scene: &Scene) -> Result<()> {
     // Stored, or seen through gaps.
     let within = scene.surface.stored_sides().contains(&Side::Higher) && lit_within_solids(scene)
         || scene.field.has_gaps() && glows(scene);
-    if scene.boundary == Boundary::Capped && within {
+    if scene.is_capped() && within {
         return Err(Error::NotSupported(
             "boundary = \"capped\": sweeps take caps for black from within, where this scene has light; use --engine photon"
                 .into(),
@@ -320,11 +320,8 @@ pub fn sweep_resumable(
 /// it, or if the stored one lies within caps: walls and caps are seen there.
 pub(crate) fn swept_sides(scene: &Scene) -> Vec<Side> {
     // Only around the open rims of level sets: outside Ω, or beside samples that are not finite.
-    let margin = {
-        let [lo, hi] = gather::local_bounds(scene);
-        lo.min(scene.lattice().far() - hi).min_element() < -1e-6
-    };
-    let (open, lit) = (scene.boundary == Boundary::Open, !scene.polygons().is_empty());
+    let margin = scene.has_margin();
+    let (open, lit) = (!scene.is_capped(), !scene.polygons().is_empty());
     // Surfaces that emit light what is beyond gaps without any luminaire.
     let coupled = open && (lit && (margin || scene.field.has_gaps()) || glows(scene) && scene.field.has_gaps());
     let walls = open && scene.polygons().iter().any(|p| p.albedo != DVec3::ZERO);

@@ -11,7 +11,7 @@ use crate::flattened::Side;
 use crate::mask::Mask;
 use crate::polygon::Polygon;
 use crate::render::Camera;
-use crate::scene::{Boundary, Scene};
+use crate::scene::Scene;
 use crate::split::{MOST_VISIBLE, Split};
 use base64::Engine;
 use flate2::{Compression, write::ZlibEncoder};
@@ -118,7 +118,7 @@ impl Payload {
             "world": { "bounds": [lo.to_array(), hi.to_array()] },
             "camera": { "eye": frame.point(camera.eye), "fov": camera.fov },
             "outside_lower": scene.surface.outside == Side::Lower,
-            "capped": scene.boundary == Boundary::Capped,
+            "capped": scene.is_capped(),
             "albedo": scene.surface.albedo.stops(),
             "lights": lights,
             "split": {

@@ -17,7 +17,7 @@ use crate::polygon::Polygon;
 use crate::progress::Tick;
 use crate::radiance_cache::RadianceCache;
 use crate::rng::Stage;
-use crate::scene::{Boundary, ON, Scene};
+use crate::scene::{ON, Scene};
 use crate::tracer::Tracer;
 use crate::volume::Lattice;
 use glam::DVec3;
@@ -83,7 +83,7 @@ impl<'a> Contacts<'a> {
         let walls: Vec<u32> = (0..scene.polygons().len() as u32)
             .filter(|&w| {
                 let wall = &scene.polygons()[w as usize];
-                wall.albedo != DVec3::ZERO && scene.boundary == Boundary::Open && is_by_a_face(wall, lattice)
+                wall.albedo != DVec3::ZERO && !scene.is_capped() && is_by_a_face(wall, lattice)
             })
             .collect();
         let touching = |o: usize| {

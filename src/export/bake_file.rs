@@ -148,7 +148,7 @@ fn completed(path: &Path, scene: &Scene, volume: &Volume, bake: &Bake) -> Result
         emission: scene.surface.emission,
         outside: scene.surface.outside,
         both_sides: scene.surface.both_sides,
-        capped: scene.boundary == Boundary::Capped,
+        capped: scene.is_capped(),
         polygons: scene
             .polygons()
             .iter()

@@ -56,7 +56,7 @@ impl<'a> Aim<'a> {
     /// 2π. Of what is near only the part above the horizon of `x` with unit normal `n` is taken. `None` behind the
     /// polygon, and if nothing near is above the horizon.
     pub fn new(polygon: &'a Polygon, x: DVec3, n: DVec3) -> Option<Self> {
-        if !is_before(polygon, x) {
+        if !(polygon.height(x) > 0.0) {
             return None;
         }
         if may_be_near(polygon, x) {
@@ -71,7 +71,7 @@ impl<'a> Aim<'a> {
     /// any point uniform over the area falls on what a receiver there looks at, otherwise over the area; in either case
     /// of the part above the horizon. `None` as for [`Aim::new`].
     pub fn best(polygon: &'a Polygon, x: DVec3, n: DVec3) -> Option<Self> {
-        if !is_before(polygon, x) {
+        if !(polygon.height(x) > 0.0) {
             return None;
         }
         Self::above(polygon, x, n, may_be_near(polygon, x).then_some(NEAR))
@@ -104,10 +104,6 @@ impl<'a> Aim<'a> {
         };
         (self.x + to, self.spread.solid_angle() * (to.normalize().dot(self.n)).max(0.0))
     }
-}
-
-fn is_before(polygon: &Polygon, x: DVec3) -> bool {
-    (x - polygon.vertices()[0]).dot(polygon.normal()) > 0.0
 }
 
 /// Whether the polygon may fill more than [`NEAR`]: from its nearest point r away it fills area / r² at most.

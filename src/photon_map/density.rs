@@ -122,9 +122,7 @@ impl<'a> PhotonDensity<'a> {
     ) -> Self {
         let (field, lattice) = (&scene.field, scene.lattice());
         let kept = photons.par_iter().with_min_len(1024).filter(|p| keep(p)).count();
-        let axes = lattice.axes();
-        let spacing = DVec3::from_array(std::array::from_fn(|a| axes.col(a).length()));
-        let volume = axes.determinant().abs();
+        let (spacing, volume) = (lattice.spacing(), lattice.cell_volume());
         let passed = field.samples().par_iter().filter(|h| (0.0..=1.0).contains(*h)).count();
         let per_bin = (settings.photons as f64 / SHARE).clamp(FILL[0], FILL[1]);
         let voxels = (per_bin * passed as f64 / kept.max(1) as f64).max(1.0);

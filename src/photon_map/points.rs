@@ -4,7 +4,7 @@ use super::{EstimateSettings, Estimator, Irradiance, Normalisation};
 use crate::field::Field;
 use crate::nearest::{Neighbours, PointGrid};
 use crate::photon::SurfacePhoton;
-use crate::rng::{Sobol, Stage};
+use crate::rng::{Sobol, Stage, folded};
 use crate::scene::Scene;
 use crate::warp;
 use glam::{DVec3, Vec3};
@@ -132,7 +132,7 @@ impl<'a> PhotonPoints<'a> {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a hash of the position")]
     fn footprint(&self, position: DVec3, isovalue: f64, normal: Vec3, radius: f64) -> f64 {
         let lattice = self.field.lattice();
-        let hash = position.to_array().iter().fold(0u64, |h, x| (h ^ x.to_bits()).wrapping_mul(0x9e37_79b9_7f4a_7c15));
+        let hash = folded(0, position);
         let points = &self.footprints[(hash >> 60) as usize % FOOTPRINT_SETS];
         let far = lattice.far();
         let (mut sum, mut accepted, mut tried) = (0.0, 0, 0);

@@ -9,7 +9,7 @@ use crate::landing::{Landing, MOST_LANDINGS, landing};
 use crate::luminaire::{Aim, unoccluded};
 use crate::progress::Progress;
 use crate::render::{Camera, trace_picture};
-use crate::rng::{Key, Rng, Sobol, Stage};
+use crate::rng::{Key, Rng, Sobol, Stage, folded};
 use crate::scene::Scene;
 use crate::tracer::Tracer;
 use crate::warp::{Frame, cosine_hemisphere};
@@ -141,12 +141,9 @@ pub fn path_picture<T: Tracer>(
 ) -> Result<Picture> {
     // Paths are told apart by camera and ray: the same picture on any number of threads, and of two cameras that see
     // the same two with noise of their own.
-    let fold = |key: u64, x: DVec3| {
-        x.to_array().iter().fold(key, |k, x| (k ^ x.to_bits()).wrapping_mul(0x9e37_79b9_7f4a_7c15))
-    };
-    let camera_key = fold(0, camera.eye);
+    let camera_key = folded(0, camera.eye);
     let shade = |ray: &FlattenedRay, hit, direction: DVec3, _| {
-        let key = fold(camera_key, direction);
+        let key = folded(camera_key, direction);
         path_radiance(scene, tracer, ray, hit, &mut Rng::stream(1, Stage::Path, key))
     };
     trace_picture(scene, tracer, isovalue, camera, &shade, progress)

@@ -40,9 +40,8 @@ pub(super) fn hang(polygons: &mut [Polygon], emitting: usize, lattice: &Lattice)
 /// Whether `light` lies in the plane of `wall`, faces where that faces, and hides a part of it.
 fn lies_on(light: &Polygon, wall: &Polygon, lattice: &Lattice) -> bool {
     let normal = wall.normal();
-    let height = |x: DVec3| (x - wall.vertices()[0]).dot(normal);
     let near = || FLUSH * voxel_along(lattice, light).1;
-    if light.normal().dot(normal) <= 0.0 || light.vertices().iter().any(|x| height(*x).abs() > near()) {
+    if light.normal().dot(normal) <= 0.0 || light.vertices().iter().any(|x| wall.height(*x).abs() > near()) {
         return false;
     }
     // What is left of the luminaire within all of the wall's edges.
@@ -73,11 +72,10 @@ impl Scene {
     }
 
     fn hangs_before(&self, light: &Polygon, wall: &Polygon) -> bool {
-        let depth = |x: &DVec3| (*x - wall.vertices()[0]).dot(wall.normal());
         let reach = || SLIT * voxel_along(self.lattice(), light).1;
         light.opaque_back
             && light.normal().dot(wall.normal()) > 0.0
-            && light.vertices().iter().all(|x| depth(x) > 0.0 && depth(x) < reach() && wall.contains(*x))
+            && light.vertices().iter().all(|&x| wall.height(x) > 0.0 && wall.height(x) < reach() && wall.contains(x))
     }
 
     /// The luminaires that cover a part of polygon `wall`.
@@ -92,7 +90,7 @@ impl Scene {
     #[inline]
     pub fn covers(&self, x: DVec3) -> bool {
         (0..).zip(self.luminaires()).any(|(l, light)| {
-            let depth = (light.vertices()[0] - x).dot(light.normal());
+            let depth = -light.height(x);
             // Most places are far in front of every luminaire.
             depth >= 0.0
                 && depth < SLIT * voxel_along(self.lattice(), light).1

@@ -1,6 +1,6 @@
 //! Light smoothed over places scattered beside grid points.
 
-use super::{CONE, Halves, Smoothed, Surroundings, shortest};
+use super::{CONE, Halves, Smoothed, Surroundings};
 use crate::flattened::Side;
 use crate::node_set::NodeSet;
 use crate::progress::Tick;
@@ -82,7 +82,7 @@ impl<'a> Cloud<'a> {
         halves: &(dyn Fn(usize) -> Halves + Sync),
     ) -> Self {
         let (field, lattice) = (&scene.field, scattered.lattice);
-        let step = shortest(lattice);
+        let step = lattice.spacing().min_element();
         let place = |(n, p): (usize, &Vec3)| {
             if halves(n)[0].is_nan() {
                 return Place::default();

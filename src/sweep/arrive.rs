@@ -5,7 +5,7 @@ use super::directions::Layout;
 use super::ends::Ends;
 use super::flats::{Flats, Stop, below, fill_column, shapes, sinks};
 use super::gaps::Crossing;
-use super::gather::{Bounce, Pass, local_bounds};
+use super::gather::{Bounce, Pass};
 use super::half::{Half4, colour, decode};
 use super::incoming::Arrivals;
 use super::pack::{LANES, OUTSIDE, Pack, Plan};
@@ -45,7 +45,7 @@ fn strides(lattice: &Lattice, axis: usize, sinks: impl Iterator<Item = f64>, fam
 /// Bytes of what the lines of two families bring to walls of so many texels across, about at most: one is told to the
 /// walls while the next is walked.
 pub(crate) fn reports(scene: &Scene, across: usize, isovalues: usize) -> f64 {
-    let [lo, hi] = local_bounds(scene);
+    let [lo, hi] = scene.local_bounds();
     let far = scene.lattice().far();
     // Lines through a box, along the axis of most that report, at slopes of a half.
     let lines = |e: DVec3, c: usize| (e[(c + 1) % 3] + 0.5 * e[c]) * (e[(c + 2) % 3] + 0.5 * e[c]);
@@ -140,9 +140,8 @@ impl<'a> Walls<'a> {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few thousand lines")]
     pub(super) fn new(pass: &Pass, bounce: &Bounce<'a>, side: Side, plan: &'a Plan, ends: &'a Ends) -> Self {
         let (shear, flats) = (&plan.shear, bounce.flats);
-        let [lo, hi] = local_bounds(pass.scene);
-        let far = pass.scene.lattice().far();
-        let margin = (lo.min(far - hi)).min_element() < -1e-6;
+        let [lo, hi] = pass.scene.local_bounds();
+        let margin = pass.scene.has_margin();
         let axes = shear.layout.axes;
         // Lines that meet the box: bounds of p over its corners.
         let range = |a: usize| {
@@ -172,7 +171,7 @@ impl<'a> Walls<'a> {
             columns,
             near: every(near),
             past: every(past),
-            capped: super::flats::capped(pass.scene),
+            capped: pass.scene.is_capped(),
             primary: side == pass.sides[0],
             margin,
             caps: pass.scene.polygons().len() as u32,

@@ -18,7 +18,7 @@ impl Blockers {
         let polygons = scene.polygons().iter().enumerate().filter_map(|(i, p)| {
             let i = u32::try_from(i).expect("scenes hold fewer than 2¹⁶ polygons");
             let slack = 1e-6 * p.area().sqrt();
-            let heights = || source.vertices().iter().chain(receivers).map(|x| (*x - p.vertices()[0]).dot(p.normal()));
+            let heights = || source.vertices().iter().chain(receivers).map(|x| p.height(*x));
             let idle = heights().all(|h| h >= -slack) || (!p.opaque_back && heights().all(|h| h <= slack));
             (i != light && !idle).then(|| (i, LocalPolygon::new(p, scene.lattice())))
         });

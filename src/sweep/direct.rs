@@ -8,7 +8,7 @@ mod texels;
 use super::blockers::Blockers;
 use super::clearance::Clearance;
 use super::fans::Fans;
-use super::flats::{Flats, capped};
+use super::flats::Flats;
 use super::grid::Geometry;
 use super::open_share::OpenShare;
 use super::planes::{Planes, Spare};
@@ -29,7 +29,7 @@ const ROWS: usize = 8;
 /// How far segments to flats may step: from the lower side what is below the sweep hides nothing, however far below.
 /// `None` where flats are seen from inside solids, too.
 pub(super) fn clearance(scene: &Scene, geometry: &Geometry, sides: &[Side]) -> Option<Clearance> {
-    let inside = sides.contains(&Side::Higher) && !capped(scene);
+    let inside = sides.contains(&Side::Higher) && !scene.is_capped();
     (!inside).then(|| Clearance::new(geometry))
 }
 
@@ -110,7 +110,7 @@ impl Direct<'_> {
             let start = match start.is_nan() {
                 false => [start; 2],
                 // Caps let no light into solids.
-                true if !inside && capped(scene) => [f32::NEG_INFINITY; 2],
+                true if !inside && scene.is_capped() => [f32::NEG_INFINITY; 2],
                 true => [f32::NEG_INFINITY, f32::INFINITY],
             };
             fans.march((geometry, self.isa, sides), y, start);

@@ -118,7 +118,7 @@ impl<'a> Touching<'a> {
                 let x = lattice.to_index(*x)[face / 2];
                 (x - (face % 2 * (dims[face / 2] - 1)) as f64).abs() < ON
             };
-            let inwards = |p: &Polygon| (lattice.to_world(0.5 * lattice.far()) - p.vertices()[0]).dot(p.normal()) > 0.0;
+            let inwards = |p: &Polygon| p.height(lattice.to_world(0.5 * lattice.far())) > 0.0;
             let touch = |p: &Polygon| p.vertices().iter().all(on_face) && inwards(p);
             let all = scene.polygons().iter().enumerate();
             let walls: Vec<_> = all.filter(|(i, p)| flats.textures[*i].is_some() && touch(p)).collect();

@@ -2,7 +2,6 @@
 
 #![allow(clippy::needless_range_loop, reason = "a channel indexes several planes at once")]
 
-use super::gather::local_bounds;
 use super::half::{Half4, encode};
 use super::incoming::{Incoming, Sink, around};
 use super::settling::Sums;
@@ -11,7 +10,7 @@ use super::swept_sides;
 use crate::flat::{self, Flat, FlatLight, FlatTexture, Within};
 use crate::flattened::Side;
 use crate::isovalue_axis::IsovalueAxis;
-use crate::scene::{Boundary, Scene};
+use crate::scene::Scene;
 use rayon::prelude::*;
 use std::f32::consts::PI;
 
@@ -97,7 +96,7 @@ const NARROW: f64 = 1.0 / 16.0;
 /// How long a texel of a scene's walls may be, but for walls too large to hold as many: no shorter than a voxel.
 fn narrow(scene: &Scene) -> f64 {
     let lattice = scene.lattice();
-    let [lo, hi] = local_bounds(scene);
+    let [lo, hi] = scene.local_bounds();
     let inverse = lattice.axes().inverse();
     let width = |a: usize| (hi[a] - lo[a]) / inverse.row(a).length();
     (NARROW * (0..3).map(width).fold(f64::INFINITY, f64::min)).max(lattice.cell_volume().cbrt())
@@ -120,7 +119,7 @@ pub(super) fn sinks(dims: [usize; 2]) -> [usize; 2] {
 
 /// Texels of all flats of a scene, of both sides of the level sets where these may be kept apart.
 pub(crate) fn texels(scene: &Scene, across: usize, isovalues: usize) -> usize {
-    let sides = if capped(scene) { 1 } else { swept_sides(scene).len() };
+    let sides = if scene.is_capped() { 1 } else { swept_sides(scene).len() };
     sides * shapes(scene, across).flatten().map(|(_, [u, v])| u * v * isovalues).sum::<usize>()
 }
 
@@ -139,7 +138,7 @@ impl Flats {
         let shapes: Vec<_> = shapes(scene, across).collect();
         let solid = |(flat, dims): &(Flat, _)| solid(scene, flat, *dims, &axis, isovalues);
         let solid: Vec<_> = match sides {
-            [_, _] if !capped(scene) => shapes.iter().map(|shape| shape.as_ref().map(solid)).collect(),
+            [_, _] if !scene.is_capped() => shapes.iter().map(|shape| shape.as_ref().map(solid)).collect(),
             _ => Vec::new(),
         };
         let apart = solid.iter().flatten().flatten().any(|n| *n != FREE);
@@ -510,9 +509,4 @@ pub(super) fn fill_column(flats: &Flats, stop: Option<Stop>, out: &mut [f32]) {
         Some((texture, uv)) => texture.column(uv, out),
         None => out.fill(0.0),
     }
-}
-
-/// Whether caps close Ω's faces.
-pub(super) fn capped(scene: &Scene) -> bool {
-    scene.boundary == Boundary::Capped
 }

@@ -5,7 +5,7 @@ use super::arrive;
 use super::directions::{Layout, Shear};
 use super::ends::{Ends, Standing};
 use super::faces::{RowEnds, Sides, Touched, Touching, inwards, note, on_side};
-use super::flats::{Flats, capped};
+use super::flats::Flats;
 use super::gaps::Around;
 use super::grid::{Geometry, Source};
 use super::half::Half4;
@@ -22,7 +22,6 @@ use crate::flattened::Side;
 use crate::isa::Isa;
 use crate::scene::Scene;
 use crate::volume::Lattice;
-use glam::DVec3;
 use rayon::prelude::*;
 use std::sync::{Mutex, MutexGuard};
 
@@ -232,7 +231,7 @@ impl Pass<'_> {
             ends: &ends,
             flats,
             touched: receivers.touched,
-            way: Way { strict: side == Side::Higher, sign, capped: capped(self.scene) },
+            way: Way { strict: side == Side::Higher, sign, capped: self.scene.is_capped() },
             goes_on: bounce.goes_on,
             omega: (shear.omega * share).as_vec3().to_array(),
             walls,
@@ -480,14 +479,4 @@ pub(super) fn sum_cosines(omega: &[[f32; 3]], n: &[u32], sum: &mut [f32; COSINES
             sum[i] += (w[0] * normal[0][i] + w[1] * normal[1][i] + w[2] * normal[2][i]).abs();
         }
     }
-}
-
-/// World bounds in the local frame.
-pub(super) fn local_bounds(scene: &Scene) -> [DVec3; 2] {
-    let mut bounds = [DVec3::ZERO, scene.lattice().far()];
-    for &x in scene.polygons().iter().flat_map(|p| p.vertices()) {
-        let p = scene.lattice().to_index(x);
-        bounds = [bounds[0].min(p), bounds[1].max(p)];
-    }
-    bounds
 }

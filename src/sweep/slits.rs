@@ -56,7 +56,7 @@ fn hidden_by(scene: &Scene, number: u32) -> Vec<(usize, usize)> {
             let front = node + step;
             // Voxels from the plane, along the axis.
             let world = lattice.to_world(node);
-            let depth = (light.vertices()[0] - world).dot(light.normal()) / voxel;
+            let depth = -light.height(world) / voxel;
             let foot = lattice.to_world(node + depth * step);
             let within = front.cmpge(DVec3::ZERO).all() && front.cmple(lattice.far()).all();
             if (0.0..SLIT).contains(&depth) && light.contains(foot) && within {

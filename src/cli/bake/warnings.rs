@@ -4,7 +4,7 @@ use crate::bake::{BakeOptions, BakeSettings, Engine, common_size, left_out};
 use crate::error::Result;
 use crate::flattened::Side;
 use crate::illumination_grid::GridSize;
-use crate::scene::{Boundary, Scene};
+use crate::scene::Scene;
 use crate::sweep::{lit_mostly_within, lit_within_solids};
 use crate::volume::Volume;
 use glam::DVec3;
@@ -34,7 +34,7 @@ pub(super) fn warnings(
     if scene.luminaires().is_empty() && dark {
         lines.push("nothing emits light; everything will be black".into());
     }
-    let sealed = scene.boundary == Boundary::Capped && scene.surface.outside == Side::Higher;
+    let sealed = scene.is_capped() && scene.surface.outside == Side::Higher;
     if sealed && scene.fields() == 1 && !lit_within_solids(scene) {
         lines.push(
             "boundary = \"capped\" closes the higher side of surfaces off, which is to be their outside: it will be black; \
@@ -44,7 +44,7 @@ pub(super) fn warnings(
     }
     let mostly_within = |scene: &Scene| {
         let stored = scene.surface.both_sides || scene.surface.emission != DVec3::ZERO;
-        !stored && scene.boundary == Boundary::Open && lit_mostly_within(scene)
+        !stored && !scene.is_capped() && lit_mostly_within(scene)
     };
     if (0..scene.fields()).any(|n| mostly_within(&scene.lit(n))) {
         lines.push(
@@ -92,7 +92,7 @@ fn long_voxels(scene: &Scene) -> Option<String> {
 mod tests {
     use super::*;
     use crate::field::{Field, Sweep};
-    use crate::scene::Surface;
+    use crate::scene::{Boundary, Surface};
     use crate::volume::{Lattice, Samples};
 
     /// A grid that no lattice can be is no advice, nor a fault of a bake that did not ask for it.

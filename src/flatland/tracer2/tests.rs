@@ -3,6 +3,7 @@
 use super::*;
 use crate::field::Sweep;
 use crate::rng::{Rng, Stage};
+use glam::Vec3;
 
 /// Whole-number noise inside a border of zeros: closed curves, and isovalues that equal samples.
 fn noise(levels: u64) -> FlatScene {

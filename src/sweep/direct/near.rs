@@ -11,7 +11,6 @@ use crate::polygon::LocalPolygon;
 use crate::rng::{Sobol, Stage};
 use crate::scene::Scene;
 use crate::sweep::blockers::Blockers;
-use crate::sweep::flats::capped;
 use crate::sweep::grid::Geometry;
 use crate::sweep::pack::LANES;
 use crate::sweep::points::Points;
@@ -61,7 +60,7 @@ impl Direct<'_> {
                         looks.sums[place + s][1] += g as f32;
                         let y = lattice.to_index(y);
                         // Caps let no light into solids.
-                        let cap = capped(scene) && y.clamp(DVec3::ZERO, lattice.far()) != y;
+                        let cap = scene.is_capped() && y.clamp(DVec3::ZERO, lattice.far()) != y;
                         let closed = side == Side::Higher && cap;
                         if g > 0.0 && !closed && !blockers.block(number, None, y, x) {
                             looks.add(&scene.field, [y, x], Look { place: place + s, side, h, g: g as f32, cap });

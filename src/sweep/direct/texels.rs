@@ -9,7 +9,7 @@ use crate::luminaire::{point_term, unoccluded};
 use crate::polygon::Polygon;
 use crate::rng::{Rng, Stage};
 use crate::sweep::blockers::Blockers;
-use crate::sweep::flats::{self, Flats, capped};
+use crate::sweep::flats::{self, Flats};
 use crate::sweep::open_share::OpenShare;
 use crate::sweep::pack::LANES;
 use crate::sweep::segments::Segments;
@@ -37,7 +37,7 @@ impl Direct<'_> {
             .map(|side| flats.centres.iter().map(|&c| share.correction(side, c)).collect::<Vec<f64>>());
         let even = [1.0; 2].map(|x| vec![x; nc]);
         let [lower, higher] = [Side::Lower, Side::Higher].map(|s| self.sides.contains(&s));
-        let higher = higher && !capped(scene);
+        let higher = higher && !scene.is_capped();
         let (textures, others) = flats.textures.split_at_mut(flats.count);
         for (id, texture) in textures.iter_mut().enumerate() {
             let Some(texture) = texture else { continue };
@@ -124,7 +124,7 @@ impl Seer<'_> {
                     continue;
                 }
                 let (lx, ly) = (lattice.to_index(x), lattice.to_index(y));
-                let here = if lattice.holds(lx) && !self.is_cap() && !capped(scene) { below(h(lx)) } else { 0 };
+                let here = if lattice.holds(lx) && !self.is_cap() && !scene.is_capped() { below(h(lx)) } else { 0 };
                 all.add(g, here, here);
                 if blockers.block(*number, receiver, ly, lx) {
                     continue;
@@ -140,7 +140,7 @@ impl Seer<'_> {
             if geometry.has_gaps() {
                 for (lane, &(g, here)) in seen {
                     let y = lattice.to_index(points[lane]);
-                    let caps = [y.clamp(DVec3::ZERO, far) != y, true].map(|outside| outside && capped(scene));
+                    let caps = [y.clamp(DVec3::ZERO, far) != y, true].map(|outside| outside && scene.is_capped());
                     lit.add_beside(g, here, &segments.ranges(scene.field.samples(), lane, caps), below);
                 }
                 continue;
