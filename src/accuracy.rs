@@ -11,7 +11,7 @@ mod survey;
 
 pub use belongs::belongs;
 use clamped::clamped_variance;
-pub use floor::{interpolation_floor, total_floor};
+pub use floor::InterpolationFloor;
 pub use survey::{Part, Survey, SurveySettings, survey};
 
 use crate::error::{Error, Result};
@@ -229,7 +229,6 @@ pub fn compare(texture: &[DVec3], references: &[ReferenceMesh], exposure: f64) -
         out.noise_floor += references.iter().map(|r| noise(r, v, exposure)).sum::<f64>() / count;
     }
     let vertices = chosen.len() as f64;
-    let percent = |square: f64| 100.0 * square.max(0.0).sqrt();
     let square = sum / vertices;
     // A single vertex says nothing about how others scatter.
     let deviation = match chosen.len() {
@@ -249,4 +248,9 @@ pub fn compare(texture: &[DVec3], references: &[ReferenceMesh], exposure: f64) -
     out.mean *= 100.0 / vertices;
     out.bias *= 100.0 / vertices;
     Ok((out, per_vertex))
+}
+
+/// Percent RMS of a mean square, which may be an estimate below 0.
+pub(crate) fn percent(square: f64) -> f64 {
+    100.0 * square.max(0.0).sqrt()
 }

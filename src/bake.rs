@@ -172,29 +172,16 @@ fn stages(checkpoint: Option<&Checkpoint>, first: u32) -> [checkpoint::Stage<'_>
 /// `Invalid` if no level set of the sweep has a gradient anywhere, and for values of settings, surfaces and polygons
 /// out of range, `NotSupported` for a scene the engine cannot light, `Embree`, or `Interrupted`.
 pub fn bake(scene: &Scene, settings: &BakeSettings, device: &Device, progress: Progress) -> Result<Bake> {
-    bake_resumable(scene, settings, device, progress, None)
-}
-
-/// As [`bake`], keeping finished blocks of the long stages (radiance cache, radiance samples, passes of sweeps) in
-/// `checkpoint` and taking from there what a run of the same [`job`] finished: with the same bits, counts included.
-///
-/// # Errors
-/// As [`bake`].
-pub fn bake_resumable(
-    scene: &Scene,
-    settings: &BakeSettings,
-    device: &Device,
-    progress: Progress,
-    checkpoint: Option<&Checkpoint>,
-) -> Result<Bake> {
-    bake_fields(scene, settings, device, progress, checkpoint)?
+    bake_fields(scene, settings, device, progress, None)?
         .into_iter()
         .next()
         .ok_or_else(|| Error::Invalid("the scene holds no field".into()))
 }
 
-/// As [`bake_resumable`], for each field of a scene by number. Fields that light each other share photons, walls and
-/// counts; the reports differ in what belongs to a grid.
+/// As [`bake`], for each field of a scene by number. Fields that light each other share photons, walls and counts; the
+/// reports differ in what belongs to a grid. Finished blocks of the long stages (radiance cache, radiance samples,
+/// passes of sweeps) are kept in `checkpoint`, and what a run of the same [`job`] finished is taken from there: with
+/// the same bits, counts included.
 ///
 /// # Errors
 /// As [`bake`]; `NotSupported` for several fields that light each other by the sweep engine.
@@ -414,7 +401,6 @@ pub(crate) fn settings_job(settings: &BakeSettings) -> String {
     if let Ok(serde_json::Value::Object(settings)) = serde_json::to_value(settings) {
         settings.iter().for_each(|(key, value)| add(key, value.to_string()));
     }
-    add("normalisation", format!("{:?}", settings.normalisation));
     text
 }
 

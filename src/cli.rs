@@ -251,7 +251,7 @@ impl Info {
             });
             (Volume::of_vti(&self.file, file)?, bake)
         } else {
-            (export::open(&self.file, &self.raw)?, None)
+            (self.raw.open(&self.file)?, None)
         };
         let statistics = VolumeStatistics::of(&volume);
         if self.json {

@@ -171,15 +171,13 @@ fn indirect(baked: &BakedVolume, departure: Departure, p: DVec3) -> Option<DVec3
         Departure::Free | Departure::Polygon(_) | Departure::Cap(..) => return None,
     };
     let (own, p) = holder(baked, n, p);
-    let (_, grid) = own.sides.iter().find(|(s, _)| *s == side)?;
-    Some(grid.indirect_at(own.lattice(), p).unwrap_or_default())
+    Some(own.grid(side)?.indirect_at(own.lattice(), p).unwrap_or_default())
 }
 
 /// What leaves a level set at local position `p`; `None` if that is not stored, or no point around holds something.
 fn stored(baked: &BakedVolume, n: Option<u8>, side: Side, p: DVec3) -> Option<DVec3> {
     let (own, p) = holder(baked, n, p);
-    let (_, grid) = own.sides.iter().find(|(s, _)| *s == side)?;
-    grid.known_at(&own.scene, own.lattice(), p, side)
+    own.grid(side)?.known_at(&own.scene, own.lattice(), p, side)
 }
 
 /// Baked radiance where a picture's `ray` landed, with what luminaires emit; `None` on a side that is not stored.

@@ -347,13 +347,16 @@ impl FlatLight {
 
 /// Texels of the textures of all flats of a scene, at most: as [`Flat::resolution`] sizes them.
 pub fn texels(scene: &Scene, across: usize, isovalues: usize) -> usize {
-    let flats = (0..count(scene)).filter_map(|n| flat(scene, n));
-    flats.map(|f| f.resolution(across, isovalues).iter().product::<usize>()).sum()
+    texels_where(scene, [across, isovalues], |_| true)
 }
 
 /// As [`texels`], of flats that reflect something: the others need none.
 pub fn lit_texels(scene: &Scene, across: usize, isovalues: usize) -> usize {
-    let flats = (0..count(scene)).filter_map(|n| flat(scene, n)).filter(|f| !f.albedo.black());
+    texels_where(scene, [across, isovalues], |flat| !flat.albedo.black())
+}
+
+fn texels_where(scene: &Scene, [across, isovalues]: [usize; 2], holds: fn(&Flat) -> bool) -> usize {
+    let flats = (0..count(scene)).filter_map(|n| flat(scene, n)).filter(holds);
     flats.map(|f| f.resolution(across, isovalues).iter().product::<usize>()).sum()
 }
 

@@ -11,7 +11,7 @@ pub(crate) use fault::parse as parse_toml;
 pub use frames::load_series;
 pub use inputs::Inputs;
 pub(crate) use inputs::same;
-pub use several::{PolicyName, VolumeEntry, Volumes};
+pub use several::{VolumeEntry, Volumes};
 use surface::surface;
 pub use surface::{Albedo, BoundaryName, ColourStop, OutsideName, Rgb, SidesName, SurfaceOptions};
 
@@ -20,7 +20,7 @@ use crate::error::{Error, Result};
 use crate::field::{Field, Sweep};
 use crate::files;
 use crate::polygon::Polygon;
-use crate::scene::{Placement, Scene, check_edges, check_spacing, cornell_box, read_context, read_obj};
+use crate::scene::{Placement, Policy, Scene, check_edges, check_spacing, cornell_box, read_context, read_obj};
 use crate::volume::generate::Generator;
 use crate::volume::raw::RawLayout;
 use crate::volume::statistics::VolumeStatistics;
@@ -37,7 +37,7 @@ pub struct SceneFile {
     /// The volume, or several.
     pub volume: Volumes,
     /// How several volumes share light (default joint).
-    pub policy: Option<PolicyName>,
+    pub policy: Option<Policy>,
     /// The sweep [lo, hi] in source units; a suggestion from the data if absent.
     #[serde(default, deserialize_with = "numbers")]
     pub isovalues: Option<[f64; 2]>,
@@ -192,6 +192,14 @@ impl RawOptions {
         layout.origin = triple(&self.origin, "origin")?.unwrap_or(DVec3::ZERO);
         layout.header_bytes = self.skip.unwrap_or(0);
         Ok(layout)
+    }
+
+    /// Opens a volume as this says, or by its extension if nothing is set.
+    ///
+    /// # Errors
+    /// As [`RawOptions::layout`], [`RawLayout::read`] and [`Volume::open`].
+    pub fn open(&self, path: &Path) -> Result<Volume> {
+        if self.given() { self.layout(path)?.read(path) } else { Volume::open(path) }
     }
 
     /// Whether anything of it is set.

@@ -2,7 +2,7 @@
 //! that `compare` makes of it.
 
 use glam::DVec3;
-use isolume::accuracy::{ReferenceMesh, compare, interpolation_floor};
+use isolume::accuracy::{InterpolationFloor, ReferenceMesh, compare};
 use isolume::brdf::reflected;
 use isolume::direct::{Receiver, luminance};
 use isolume::embree::{Device, GraphTracer, SurfaceTracer};
@@ -484,9 +484,9 @@ fn the_interpolation_floor_falls_with_the_grid() {
     let tracer = GraphTracer::new(&device, &scene).unwrap();
     let mesh = SurfaceMesh::extract(&scene, c, 1).unwrap();
     let floor = |factor| {
-        interpolation_floor(&scene, &tracer, &mesh, c, GridSize::Factors([factor; 3]), 1024, Some(300))
-            .unwrap()
-            .percent_rms
+        let grid = GridSize::Factors([factor; 3]);
+        let floor = InterpolationFloor { scene: &scene, tracer: &tracer, mesh: &mesh, grid };
+        floor.direct(c, 1024, Some(300)).unwrap().percent_rms
     };
     let (coarse, fine) = (floor(1), floor(3));
     assert!(fine < 0.7 * coarse && coarse < 5.0 && fine > 0.0, "{coarse} {fine}");

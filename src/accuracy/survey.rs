@@ -1,7 +1,7 @@
 //! A survey of all isosurfaces of a bake at random points: no references need be made first, and no isovalue chosen.
 //! \[BB09 §3\]
 
-use super::display;
+use super::{display, percent};
 use crate::direct::Receiver;
 use crate::error::{Error, Result};
 use crate::field::Field;
@@ -172,10 +172,6 @@ pub fn survey<T: Tracer>(
         left_out: chosen.len() - all.len(),
         rays: rays.into_inner(),
     })
-}
-
-fn percent(square: f64) -> f64 {
-    100.0 * square.max(0.0).sqrt()
 }
 
 /// One point against paths.

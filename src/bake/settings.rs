@@ -6,7 +6,7 @@ use crate::error::{Error, Result};
 use crate::illumination_grid::GridSize;
 use crate::isovalue_axis::IsovalueAxis;
 use crate::photon::PhotonSettings;
-use crate::photon_map::{EstimateSettings, Estimator, Normalisation};
+use crate::photon_map::{EstimateSettings, Estimator};
 use crate::radiance_cache::CacheSettings;
 use crate::sampling::Strategy;
 use crate::scene::Scene;
@@ -341,9 +341,6 @@ pub struct BakeSettings {
     pub wall_isovalues: usize,
     /// Shadow rays per texel and luminaire; four times as many, of at least 32, beside texels that see one in part.
     pub wall_shadow_rays: u32,
-    /// How photon power becomes irradiance.
-    #[serde(skip)]
-    pub normalisation: Normalisation,
     /// Whether light is split ([`crate::split`]).
     pub split: bool,
     /// Seed.
@@ -428,7 +425,6 @@ impl BakeSettings {
             wall_isovalues: usual.wall_isovalues,
             wall_shadow_rays: usual.wall_shadow_rays,
             split: o.split.unwrap_or(false),
-            normalisation: Normalisation::Accepted,
             seed: o.seed.unwrap_or(1),
             bands: o.bands.unwrap_or(1),
         };
@@ -525,7 +521,6 @@ impl BakeSettings {
             estimator: self.estimator,
             photons: self.photons_per_estimate,
             tau: self.tau,
-            normalisation: self.normalisation,
             ..EstimateSettings::default()
         }
     }

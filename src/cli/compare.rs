@@ -152,7 +152,7 @@ impl Compare {
         }
         let scene = own.unwrap_or_else(|| baked.scene.lit(baked.scene.number()));
         let side = scene.surface.outside;
-        let Some((_, grid)) = baked.sides.iter().find(|(s, _)| *s == side) else {
+        let Some(grid) = baked.grid(side) else {
             return Err(Error::invalid(&self.bake, "does not hold the surface's outside"));
         };
         let settings = SurveySettings { points: self.points, paths: self.paths, seed: self.seed };

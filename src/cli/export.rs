@@ -6,7 +6,7 @@ use crate::export::{bake_file, slices};
 use crate::progress::{Progress, say};
 use crate::scene_file::{Inputs, RawOptions};
 use crate::volume::vti::{self, VtiFile, VtiWriter};
-use crate::volume::{Lattice, Samples, Space, Volume, npy, nrrd};
+use crate::volume::{Lattice, Samples, Space, npy, nrrd};
 use std::path::{Path, PathBuf};
 
 #[derive(clap::Args, Debug)]
@@ -101,7 +101,7 @@ impl Export {
         if is_vti && !self.raw.given() {
             return array_of(&self.input, self.array.as_deref());
         }
-        let volume = open(&self.input, &self.raw)?;
+        let volume = self.raw.open(&self.input)?;
         if let Some(name) = self.array.as_deref().filter(|n| *n != "value") {
             return Err(Error::invalid(
                 &self.input,
@@ -130,9 +130,4 @@ fn array_of(path: &Path, name: Option<&str>) -> Result<Array> {
     };
     let array = file.point_data.swap_remove(chosen);
     Ok(Array { lattice: file.lattice, space, name: array.name, components: array.components, samples: array.samples })
-}
-
-/// A volume by its extension, or by the layout that is given.
-pub(super) fn open(path: &Path, raw: &RawOptions) -> Result<Volume> {
-    if raw.given() { raw.layout(path)?.read(path) } else { Volume::open(path) }
 }

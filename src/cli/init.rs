@@ -1,6 +1,6 @@
 //! `isolume init`: a scene file for a volume, with every key, its default and what it does.
 
-use super::{expect_extension, export, one_frame};
+use super::{expect_extension, one_frame};
 use crate::digits::brief_span;
 use crate::error::{Error, Result};
 use crate::files;
@@ -37,7 +37,7 @@ impl Init {
         if output.exists() {
             return Err(Error::invalid(&output, "exists already; give another name with -o, or remove it first"));
         }
-        let volume = export::open(&self.file, &self.raw)?;
+        let volume = self.raw.open(&self.file)?;
         let statistics = VolumeStatistics::of(&volume);
         let named = relative(&self.file, &output)?;
         let text = scene_text(&named, &self.raw, &statistics, &volume.lattice);

@@ -486,17 +486,21 @@ impl BakedVolume {
         Ok(Some(scene.lit(self.scene.number())))
     }
 
+    /// The grid of a side; `None` if that is not stored.
+    pub fn grid(&self, side: Side) -> Option<&IlluminationGrid> {
+        self.sides.iter().find(|(s, _)| *s == side).map(|(_, grid)| grid)
+    }
+
     /// Radiance of `side` at local `p`: trilinear over the points of the cell that hold something, as a 3D texture
     /// would give it; of a bake that is split, with direct light of the very place. `None` if the side is not stored.
     pub fn radiance(&self, side: Side, p: DVec3) -> Option<DVec3> {
-        let (_, grid) = self.sides.iter().find(|(s, _)| *s == side)?;
-        Some(grid.radiance_at(&self.scene, self.lattice(), p, side))
+        Some(self.grid(side)?.radiance_at(&self.scene, self.lattice(), p, side))
     }
 
     /// [`BakedVolume::radiance`] at a point of the world, of the isosurface through it; `None` outside the volume, too,
     /// and where the bake holds nothing.
     pub fn radiance_at(&self, side: Side, world: DVec3) -> Option<DVec3> {
-        let (_, grid) = self.sides.iter().find(|(s, _)| *s == side)?;
+        let grid = self.grid(side)?;
         let p = Some(self.lattice().to_index(world)).filter(|p| self.lattice().holds(*p))?;
         grid.known_at(&self.scene, self.lattice(), p, side)
     }

@@ -14,7 +14,8 @@ use glam::{DMat3, DVec3};
 use std::sync::Arc;
 
 /// Whether fields light each other.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Policy {
     /// All fields stand in one 4D scene: they shadow and light each other.
     #[default]

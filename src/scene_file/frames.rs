@@ -61,6 +61,5 @@ pub(super) fn moment(
 
 /// Reads a volume file as the source and flags say.
 pub(super) fn read_volume(path: &Path, source: &VolumeSource, raw: &RawOptions) -> Result<Volume> {
-    let layout = raw.or(source.raw.as_ref());
-    if layout.given() { layout.layout(path)?.read(path) } else { Volume::open(path) }
+    raw.or(source.raw.as_ref()).open(path)
 }

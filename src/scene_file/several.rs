@@ -9,7 +9,7 @@ use crate::field::{Field, Sweep};
 use crate::flattened::MAX_POLYGONS;
 use crate::isosurface;
 use crate::polygon::Polygon;
-use crate::scene::{Boundary, Member, Policy, Scene, Surface};
+use crate::scene::{Boundary, Member, Scene, Surface};
 use crate::volume::{Lattice, Volume};
 use glam::{DMat3, DVec3};
 use serde::de::value::{MapAccessDeserializer, SeqAccessDeserializer};
@@ -54,16 +54,6 @@ impl<'de> Deserialize<'de> for Volumes {
         }
         deserializer.deserialize_any(TableOrArray)
     }
-}
-
-/// How several volumes share light.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum PolicyName {
-    /// They shadow and light each other.
-    Joint,
-    /// Each sees walls and luminaires only.
-    Independent,
 }
 
 /// One `[[volume]]`: where it comes from, its isovalues and its material. What is not set comes from the file's top
@@ -244,11 +234,8 @@ pub(super) fn load(
         .map_err(|e| e.at(format_args!("{}: box", source.place(&["box", "kind"]))))?;
     polygons.extend(context(&file.context, folder, Some(&source))?);
     polygons.extend(standing);
-    let policy = match file.policy {
-        Some(PolicyName::Independent) => Policy::Independent,
-        Some(PolicyName::Joint) | None => Policy::Joint,
-    };
-    let scene = Scene::with_members(members, policy, polygons).map_err(|e| e.in_file(input))?;
+    let scene =
+        Scene::with_members(members, file.policy.unwrap_or_default(), polygons).map_err(|e| e.in_file(input))?;
     Ok(Loaded { volume, companions: volumes.collect(), scene, bake: file.bake.clone(), source: Some(source) })
 }
 
@@ -276,6 +263,7 @@ mod tests {
     use super::super::load as load_scene;
     use super::*;
     use crate::flattened::Side;
+    use crate::scene::Policy;
 
     fn load_text(text: &str, options: &SceneOptions) -> Result<Loaded> {
         let dir = tempfile::tempdir().unwrap();

@@ -1,7 +1,7 @@
 //! The table of data sets: error and seconds with and without final gather, and where the error comes from.
 
 use super::{Effort, Study, Subject, Table, accuracy_of, exactly, provenance};
-use crate::accuracy::{ReferenceMesh, display, interpolation_floor, total_floor};
+use crate::accuracy::{InterpolationFloor, ReferenceMesh, display, percent};
 use crate::bake::{Bake, BakeOptions, BakeSettings, Engine, StrategyName};
 use crate::embree::{GraphTracer, SurfaceTracer};
 use crate::error::Result;
@@ -88,14 +88,14 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
         // At the vertices of the references: few of them carry much of an error, and of its floor.
         let vertices = references[0].sampled.iter().filter(|s| **s).count();
         let shadow = if study.quick { 64 } else { 1024 };
+        let floor = |grid| InterpolationFloor { scene, tracer: &tracer, mesh: &mesh, grid };
         let mut floors = Vec::new();
         for grid in [1, 2, 3].map(|n| GridSize::Factors([n; 3])) {
-            let floor = interpolation_floor(scene, &tracer, &mesh, unit, grid, shadow, Some(vertices))?;
-            floors.push(floor.percent_rms);
+            floors.push(floor(grid).direct(unit, shadow, Some(vertices))?.percent_rms);
         }
         let paths = if study.quick { 64 } else { 256 };
         let grid = base.grid.unwrap_or(GridSize::OWN);
-        let total = total_floor(scene, &tracer, &mesh, &references, grid, paths, vertices)?;
+        let total = floor(grid).total(&references, paths, vertices)?;
         let triangles = triangle_error(study, subject, &mesh, unit)?;
         for (mode, options) in &modes {
             if table.has(&key(mode)) {
@@ -195,7 +195,7 @@ fn displayed_difference(pairs: &[[Reference; 2]; 2], exposure: f64) -> f64 {
         sum += a.dot(b);
         count += 1.0;
     }
-    100.0 * (sum / f64::max(count, 1.0)).max(0.0).sqrt()
+    percent(sum / f64::max(count, 1.0))
 }
 
 #[cfg(test)]

@@ -185,7 +185,8 @@ impl MolecularDynamics {
     }
 
     /// Potential energy of the pairs and in the field.
-    pub fn potential_energy(&self) -> f64 {
+    #[cfg(test)]
+    pub(super) fn potential_energy(&self) -> f64 {
         self.forces.iter().map(|(e, _)| e).sum()
     }
 
@@ -195,7 +196,8 @@ impl MolecularDynamics {
     }
 
     /// Total momentum.
-    pub fn momentum(&self) -> DVec3 {
+    #[cfg(test)]
+    pub(super) fn momentum(&self) -> DVec3 {
         self.mass * self.velocities.iter().sum::<DVec3>()
     }
 
