@@ -21,7 +21,7 @@ use crate::error::{Error, Result};
 use crate::export::bake_file::BakeSummary;
 use crate::isa::Isa;
 use crate::progress::{Progress, say};
-use crate::scene_file::{self, Inputs, RawOptions};
+use crate::scene_file::{self, Inputs, ReadOptions};
 use crate::series::is_pattern;
 use crate::volume::Volume;
 use crate::volume::statistics::VolumeStatistics;
@@ -117,18 +117,31 @@ struct Info {
     #[arg(long)]
     json: bool,
     #[command(flatten)]
-    raw: RawOptions,
+    read: ReadOptions,
 }
 
 /// More are of no use to any machine, and take long to start.
 const MOST_THREADS: usize = 1024;
 
-/// `-.5` as `-0.5`, which clap knows for a number.
-fn spelt_out(argument: OsString) -> OsString {
-    match argument.to_str().and_then(|text| text.strip_prefix("-.").filter(|_| text.parse::<f64>().is_ok())) {
-        Some(rest) => format!("-0.{rest}").into(),
-        None => argument,
+/// The arguments as clap knows them: `-.5` as `-0.5`, and the two numbers of `--isovalues` apart, which other lists have
+/// commas between.
+fn spelt_out(arguments: impl Iterator<Item = OsString>) -> Vec<OsString> {
+    let is_number = |text: &str| text.parse::<f64>().is_ok();
+    let mut all: Vec<OsString> = Vec::new();
+    for argument in arguments {
+        let sweep = all.last().is_some_and(|before| before == "--isovalues");
+        let numbers = argument.to_str().and_then(|text| text.split_once(','));
+        match numbers.filter(|(lo, hi)| sweep && is_number(lo) && is_number(hi)) {
+            Some((lo, hi)) => all.extend([lo.into(), hi.into()]),
+            None => all.push(argument),
+        }
     }
+    for argument in &mut all {
+        if let Some(rest) = argument.to_str().filter(|text| is_number(text)).and_then(|text| text.strip_prefix("-.")) {
+            *argument = format!("-0.{rest}").into();
+        }
+    }
+    all
 }
 
 /// The command, whose options all take negative numbers: a value out of its range is better named than an unknown
@@ -144,7 +157,7 @@ fn with_negative_numbers(command: clap::Command) -> clap::Command {
 impl Cli {
     /// From the arguments of the process, which ends here if they are wrong or ask for help.
     pub fn from_arguments() -> Self {
-        let matches = with_negative_numbers(Self::command()).get_matches_from(std::env::args_os().map(spelt_out));
+        let matches = with_negative_numbers(Self::command()).get_matches_from(spelt_out(std::env::args_os()));
         Self::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())
     }
 
@@ -241,7 +254,7 @@ fn device() -> Result<Device> {
 impl Info {
     fn run(self) -> Result<()> {
         one_frame(&self.file)?;
-        let vti = !self.raw.given() && self.file.extension().is_some_and(|e| e.eq_ignore_ascii_case("vti"));
+        let vti = !self.read.raw.given() && self.file.extension().is_some_and(|e| e.eq_ignore_ascii_case("vti"));
         let (volume, bake) = if vti {
             let file = VtiFile::read(&self.file)?;
             // Whatever it says of itself, its samples can be examined.
@@ -249,9 +262,11 @@ impl Info {
                 say!("warning: {}", e.in_file(&self.file));
                 None
             });
-            (Volume::of_vti(&self.file, file)?, bake)
+            let mut volume = Volume::of_vti(&self.file, file, self.read.array.as_deref())?;
+            volume.lattice = self.read.place.of(volume.lattice, &self.file)?;
+            (volume, bake)
         } else {
-            (self.raw.open(&self.file)?, None)
+            (self.read.open(&self.file)?, None)
         };
         let statistics = VolumeStatistics::of(&volume);
         if self.json {
@@ -264,5 +279,25 @@ impl Info {
             print!("{}{}", statistics.to_text(), bake.map_or_else(String::new, |b| b.to_text()));
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::spelt_out;
+
+    #[test]
+    fn numbers_are_spelt_out() {
+        let spelt = |arguments: &[&str]| spelt_out(arguments.iter().map(Into::into)).join(" ".as_ref());
+        for (arguments, expected) in [
+            (&["--eye", "-.5,1,2"][..], "--eye -.5,1,2"),
+            (&["--isovalues", "-.5", "3"], "--isovalues -0.5 3"),
+            (&["--isovalues", "-500,.5"], "--isovalues -500 .5"),
+            (&["--isovalues", "-.5,5"], "--isovalues -0.5 5"),
+            (&["--isovalues", "a,5"], "--isovalues a,5"),
+            (&["--origin", "1,2"], "--origin 1,2"),
+        ] {
+            assert_eq!(spelt(arguments), expected, "{arguments:?}");
+        }
     }
 }

@@ -5,7 +5,7 @@ use crate::error::{Error, Result};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::fmt;
 use std::io::IsTerminal;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Instant;
 
 /// Prints a line to standard error. Where nobody reads it nothing else is lost; the library's own macro would end the
@@ -126,8 +126,39 @@ impl Clock {
 pub struct Stage<'a> {
     progress: Progress<'a>,
     bar: Option<ProgressBar>,
+    lines: Option<Lines>,
     name: String,
     begun: Instant,
+}
+
+/// Lines about long work, for logs.
+#[derive(Debug)]
+struct Lines {
+    total: u64,
+    done: AtomicU64,
+    /// Seconds from the beginning to the next line.
+    next: AtomicU64,
+}
+
+/// Seconds between two of them.
+const BETWEEN: u64 = 60;
+
+impl Lines {
+    /// What there is to say after some time, once at a time.
+    fn advance(&self, n: u64, begun: Instant) -> Option<String> {
+        let done = self.done.fetch_add(n, Ordering::Relaxed) + n;
+        let next = self.next.load(Ordering::Relaxed);
+        let seconds = begun.elapsed().as_secs_f64();
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "seconds")]
+        let then = seconds as u64 + BETWEEN;
+        let due = seconds >= next as f64
+            && self.next.compare_exchange(next, then, Ordering::Relaxed, Ordering::Relaxed).is_ok();
+        let share = done as f64 / self.total.max(1) as f64;
+        due.then(|| {
+            let left = seconds * (1.0 - share).max(0.0) / share;
+            format!("{:.0} % after {seconds:.0} s, about {left:.0} s left", 100.0 * share.min(1.0))
+        })
+    }
 }
 
 impl<'a> Progress<'a> {
@@ -164,7 +195,12 @@ impl<'a> Progress<'a> {
             bar.set_prefix(name.to_owned());
             bar
         });
-        Stage { progress: self, bar, name: name.to_owned(), begun: Instant::now() }
+        let lines = (self.is_shown() && bar.is_none()).then(|| Lines {
+            total,
+            done: AtomicU64::new(0),
+            next: AtomicU64::new(BETWEEN),
+        });
+        Stage { progress: self, bar, lines, name: name.to_owned(), begun: Instant::now() }
     }
 }
 
@@ -175,6 +211,11 @@ impl Stage<'_> {
         match (self.progress, &self.bar) {
             (Progress::Watched(observer), _) if n > 0 => observer.advances(&self.name, n),
             (_, Some(bar)) if n > 0 => bar.inc(n),
+            _ if n > 0 => {
+                if let Some(line) = self.lines.as_ref().and_then(|lines| lines.advance(n, self.begun)) {
+                    say!("{:>14}  {line}", self.name);
+                }
+            }
             _ => {}
         }
         !self.progress.stops()
@@ -216,5 +257,22 @@ pub fn processor_seconds() -> f64 {
     match (fields.next(), fields.next()) {
         (Some(user), Some(system)) => (user + system) * 0.01,
         _ => f64::NAN,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::time::Duration;
+
+    /// One a minute, whoever reports first, with what is left at the same pace.
+    #[test]
+    fn logs_get_a_line_a_minute() {
+        let lines = Lines { total: 200, done: AtomicU64::new(0), next: AtomicU64::new(BETWEEN) };
+        let ago = |seconds: u64| Instant::now().checked_sub(Duration::from_secs(seconds)).unwrap();
+        assert_eq!(lines.advance(40, ago(59)), None);
+        assert_eq!(lines.advance(10, ago(75)).as_deref(), Some("25 % after 75 s, about 225 s left"));
+        assert_eq!(lines.advance(10, ago(130)), None);
+        assert_eq!(lines.advance(140, ago(136)).as_deref(), Some("100 % after 136 s, about 0 s left"));
     }
 }

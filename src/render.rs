@@ -118,7 +118,7 @@ pub fn render(
     let sweep = scene.field.sweep();
     if !(isovalue >= sweep.lo() && isovalue <= sweep.hi()) {
         return Err(Error::Invalid(format!(
-            "isovalue {} lies outside the sweep {sweep}; choose one inside, or bake a wider sweep",
+            "isovalue {} lies outside the sweep {sweep}; choose one inside, or a wider sweep",
             Shortest(isovalue)
         )));
     }

@@ -4,6 +4,7 @@ mod fault;
 mod frames;
 mod inputs;
 mod keys;
+mod reading;
 mod several;
 mod surface;
 
@@ -11,6 +12,7 @@ pub(crate) use fault::parse as parse_toml;
 pub use frames::load_series;
 pub use inputs::Inputs;
 pub(crate) use inputs::same;
+pub use reading::{PlaceOptions, RawOptions, ReadOptions};
 pub use several::{VolumeEntry, Volumes};
 use surface::surface;
 pub use surface::{Albedo, BoundaryName, ColourStop, OutsideName, Rgb, SidesName, SurfaceOptions};
@@ -21,10 +23,8 @@ use crate::field::{Field, Sweep};
 use crate::files;
 use crate::polygon::Polygon;
 use crate::scene::{Placement, Policy, Scene, check_edges, check_spacing, cornell_box, read_context, read_obj};
-use crate::volume::generate::Generator;
-use crate::volume::raw::RawLayout;
 use crate::volume::statistics::VolumeStatistics;
-use crate::volume::{ElementType, Endian, Lattice, Volume};
+use crate::volume::{Lattice, Volume};
 use clap::ArgAction;
 use glam::DVec3;
 use serde::Deserialize;
@@ -115,6 +115,14 @@ pub struct VolumeSource {
     pub times: Option<Vec<f64>>,
     /// How to read a headerless file.
     pub raw: Option<RawOptions>,
+    /// The array of a VTK file that holds several.
+    pub array: Option<String>,
+    /// World distance between samples, instead of the file's.
+    #[serde(default, deserialize_with = "numbers")]
+    pub spacing: Option<[f64; 3]>,
+    /// World position of the first sample, instead of the file's.
+    #[serde(default, deserialize_with = "numbers")]
+    pub origin: Option<[f64; 3]>,
     /// Name of a generator instead of a file.
     pub generator: Option<String>,
     /// Samples along each edge of a generated volume.
@@ -131,92 +139,8 @@ impl VolumeSource {
             (Some(_), _, Some(_)) => fail("[volume] needs either file or generator"),
             (.., None) if self.size.is_some() => fail("size is for a generator: a file has the samples that it has"),
             (.., Some(_)) if self.raw.is_some() => fail("raw is for a file, a generated volume has no layout"),
+            (.., Some(_)) if self.array.is_some() => fail("array is for a file, a generated volume has one"),
             _ => Ok(()),
-        }
-    }
-}
-
-/// The layout of a headerless file.
-#[derive(Clone, Debug, Default, PartialEq, Deserialize, clap::Args)]
-#[serde(deny_unknown_fields, rename_all = "kebab-case")]
-pub struct RawOptions {
-    /// Samples of a headerless file along x, y, z (x fastest)
-    #[arg(long = "raw-dims", value_name = "NX,NY,NZ", value_delimiter = ',')]
-    pub dims: Option<Vec<usize>>,
-    /// Sample type of a headerless file: u8, i8, u16 … f32, f64
-    #[arg(long = "raw-type", value_name = "TYPE")]
-    #[serde(rename = "type")]
-    pub element: Option<String>,
-    /// Byte order of a headerless file: little (default) or big
-    #[arg(long = "raw-endian", value_name = "ORDER")]
-    pub endian: Option<String>,
-    /// World distance between samples of a headerless file, negative where an axis is flipped (default: 1,1,1)
-    #[arg(long = "raw-spacing", value_name = "DX,DY,DZ", value_delimiter = ',', allow_hyphen_values = true)]
-    pub spacing: Option<Vec<f64>>,
-    /// World position of the first sample of a headerless file (default: 0,0,0)
-    #[arg(long = "raw-origin", value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true)]
-    pub origin: Option<Vec<f64>>,
-    /// Bytes to skip at the start of a headerless file (default: 0)
-    #[arg(long = "raw-skip", value_name = "BYTES")]
-    pub skip: Option<u64>,
-}
-
-impl RawOptions {
-    /// The layout.
-    ///
-    /// # Errors
-    /// `Invalid` with the key that is missing or wrong.
-    pub fn layout(&self, path: &Path) -> Result<RawLayout> {
-        let fail = |what: &str| Error::invalid(path, format!("raw layout: {what}"));
-        let triple = |v: &Option<Vec<f64>>, name: &str| match v.as_deref() {
-            None => Ok(None),
-            Some(&[x, y, z]) => Ok(Some(DVec3::new(x, y, z))),
-            Some(v) => Err(fail(&format!("{name} needs three numbers, found {}", v.len()))),
-        };
-        let dims = match self.dims.as_deref() {
-            Some(&[x, y, z]) => [x, y, z],
-            Some(v) => return Err(fail(&format!("dims needs three counts, found {}", v.len()))),
-            None => return Err(fail("dims is missing; give the samples along x, y, z")),
-        };
-        let name = self.element.as_deref().unwrap_or("u8");
-        let element = ElementType::from_name(name).ok_or_else(|| {
-            fail(&format!("type '{name}' is unknown; use u8, i8, u16, i16, u32, i32, u64, i64, f32 or f64"))
-        })?;
-        let mut layout = RawLayout::new(dims, element);
-        layout.endian = match self.endian.as_deref() {
-            None | Some("little") => Endian::Little,
-            Some("big") => Endian::Big,
-            Some(other) => return Err(fail(&format!("endian '{other}' is neither little nor big"))),
-        };
-        layout.spacing = triple(&self.spacing, "spacing")?.unwrap_or(DVec3::ONE);
-        layout.origin = triple(&self.origin, "origin")?.unwrap_or(DVec3::ZERO);
-        layout.header_bytes = self.skip.unwrap_or(0);
-        Ok(layout)
-    }
-
-    /// Opens a volume as this says, or by its extension if nothing is set.
-    ///
-    /// # Errors
-    /// As [`RawOptions::layout`], [`RawLayout::read`] and [`Volume::open`].
-    pub fn open(&self, path: &Path) -> Result<Volume> {
-        if self.given() { self.layout(path)?.read(path) } else { Volume::open(path) }
-    }
-
-    /// Whether anything of it is set.
-    pub fn given(&self) -> bool {
-        *self != Self::default()
-    }
-
-    /// What is not given here comes from `other`.
-    fn or(&self, other: Option<&Self>) -> Self {
-        let (this, other) = (self.clone(), other.cloned().unwrap_or_default());
-        Self {
-            dims: this.dims.or(other.dims),
-            element: this.element.or(other.element),
-            endian: this.endian.or(other.endian),
-            spacing: this.spacing.or(other.spacing),
-            origin: this.origin.or(other.origin),
-            skip: this.skip.or(other.skip),
         }
     }
 }
@@ -240,6 +164,9 @@ pub struct SceneOptions {
     // Given twice it would be four numbers, of which nobody asks for any.
     #[arg(long, num_args = 2, value_names = ["LO", "HI"], allow_negative_numbers = true, action = ArgAction::Set)]
     pub isovalues: Option<Vec<f64>>,
+    /// An isovalue that a suggested sweep is widened to hold.
+    #[arg(skip)]
+    pub held: Option<f64>,
     /// The moment of a series of volumes; between two of its frames, their blend
     #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
     pub time: Option<f64>,
@@ -251,12 +178,12 @@ pub struct SceneOptions {
     pub surroundings: BoxOptions,
     #[command(flatten)]
     #[allow(missing_docs, reason = "a doc comment would become the group's help")]
-    pub raw: RawOptions,
+    pub read: ReadOptions,
 }
 
 impl SceneOptions {
     /// Flags that speak of one volume, and whether they are given.
-    fn of_volume(&self) -> [(&'static str, bool); 8] {
+    fn of_volume(&self) -> [(&'static str, bool); 11] {
         let s = &self.surface;
         [
             ("--time", self.time.is_some()),
@@ -266,8 +193,16 @@ impl SceneOptions {
             ("--outside", s.outside.is_some()),
             ("--sides", s.sides.is_some()),
             ("--boundary", s.boundary.is_some()),
-            ("--raw-…", self.raw.given()),
+            ("--array", self.read.array.is_some()),
+            ("--spacing", self.read.place.spacing.is_some()),
+            ("--origin", self.read.place.origin.is_some()),
+            ("--raw-…", self.read.raw.given()),
         ]
+    }
+
+    /// A suggested sweep, widened to hold what it must.
+    fn widened(&self, [lo, hi]: [f64; 2]) -> [f64; 2] {
+        self.held.filter(|c| c.is_finite()).map_or([lo, hi], |c| [lo.min(c), hi.max(c)])
     }
 
     /// The first flag that is given, if any.
@@ -377,10 +312,10 @@ pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
     }
     let key = single.key();
     let series = single.series(&folder).map_err(blame(key, false))?;
-    let read = |path: &Path| frames::read_volume(path, single, &options.raw);
+    let read = |path: &Path| single.read(path, &options.read);
     let volume = match (&series, options.time) {
         (Some(series), time) => frames::moment(series, time, input, read).map_err(blame(key, true))?,
-        (None, None) => load_volume(single, &folder, &options.raw).map_err(blame(key, false))?,
+        (None, None) => single.load(&folder, &options.read).map_err(blame(key, false))?,
         (None, Some(time)) => {
             return Err(Error::invalid(input, format!("is a single volume: --time {time} chooses of a series")));
         }
@@ -393,8 +328,9 @@ pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
         (_, Some(range), _) => range,
         (.., Some(series)) => series
             .check(read)?
+            .map(|sweep| options.widened(sweep))
             .ok_or_else(|| Error::invalid(input, "no frame suggests a sweep; choose one with --isovalues"))?,
-        _ => suggested(&volume)?,
+        _ => options.widened(suggested(&volume)?),
     };
     let given = options.isovalues.is_some() || file.isovalues.is_none();
     let sweep = Sweep::new(isovalues[0], isovalues[1]).map_err(blame(&["isovalues"], given))?;
@@ -450,18 +386,6 @@ fn parse(input: &Path) -> Result<(Option<Source>, SceneFile, PathBuf)> {
     }
     let volume = VolumeSource { file: Some(input.to_path_buf()), ..VolumeSource::default() };
     Ok((None, SceneFile { volume: Volumes::One(volume), ..SceneFile::default() }, PathBuf::new()))
-}
-
-fn load_volume(source: &VolumeSource, folder: &Path, raw: &RawOptions) -> Result<Volume> {
-    source.check()?;
-    if source.generator.is_some() && raw.given() {
-        return Err(Error::Invalid("--raw-…: a generated volume has no file with a layout".into()));
-    }
-    match (&source.file, &source.generator) {
-        (Some(file), None) => frames::read_volume(&folder.join(file), source, raw),
-        (None, Some(name)) => Generator::from_name(name)?.sample([source.size.unwrap_or(101); 3]),
-        _ => Err(Error::Invalid("[volume] needs either file or generator".into())),
-    }
 }
 
 /// The box around a volume unless another is named.

@@ -154,7 +154,7 @@ fn same_lattice(a: &Volume, b: &Volume) -> Result<()> {
     }
     let of = |v: &Volume| {
         let ([x, y, z], spacing, origin) = (v.lattice.dims(), v.lattice.spacing(), v.lattice.origin());
-        format!("{x}×{y}×{z} samples, spacing {spacing}, origin {origin}")
+        format!("{x}×{y}×{z} samples, spacing {spacing}, origin {origin}, {}", v.space.name())
     };
     Err(Error::Invalid(format!(
         "{}: its lattice ({}) is not that of {} ({}); frames of a series must share one",

@@ -1,6 +1,6 @@
 //! One isosurface as users take it away: world units, unit normals, outside faces out.
 
-use crate::digits::Shortest;
+use crate::digits::{Shortest, brief_span};
 use crate::error::{Error, Result};
 use crate::export::Mesh;
 use crate::export::bake_file::BakedVolume;
@@ -54,7 +54,12 @@ impl SurfaceMesh {
     /// `Invalid` if it is empty.
     pub fn new(scene: &Scene, mut mesh: Isosurface) -> Result<Self> {
         if mesh.triangles.is_empty() {
-            return Err(Error::Invalid("there is no surface at this isovalue; choose another".into()));
+            let finite = scene.field.samples().iter().filter(|h| h.is_finite()).map(|h| f64::from(*h));
+            let [lo, hi] = finite.fold([f64::INFINITY, f64::NEG_INFINITY], |[lo, hi], h| [h.min(lo), h.max(hi)]);
+            return Err(Error::Invalid(format!(
+                "there is no surface at this isovalue; choose another (the data span {})",
+                brief_span([lo, hi].map(|h| scene.field.sweep().from_unit(h)))
+            )));
         }
         let outside = scene.surface.outside;
         mesh.face_outside(scene.lattice().axes(), outside == Side::Higher);

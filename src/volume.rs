@@ -24,8 +24,8 @@ use rayon::prelude::*;
 use std::path::Path;
 
 /// The extensions that [`Volume::open`] reads.
-pub const READ: &str = ".nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd, .mrc, .map, .ccp4, .rec (also .gz), .cube, .cube.gz, .vti, .vtk, \
-                        .npy, .tif, .tiff and .tif.zip";
+pub const READ: &str = ".nii, .mrc, .map, .ccp4, .rec and .cube (these also as .gz), .nrrd, .nhdr, .mha, .mhd, .vti, .vtk, .npy, \
+                        .tif, .tiff and .tif.zip";
 
 /// A regular lattice of `dims` samples, vertex-centred: sample (i, j, k) stands at `origin + axes · (i, j, k)`.
 ///
@@ -464,10 +464,23 @@ impl Volume {
     /// # Errors
     /// `Io` for a missing file, `NotSupported` with the list of extensions, or what the format's reader returns.
     pub fn open(path: impl AsRef<Path>) -> Result<Self> {
-        let path = path.as_ref();
+        Self::open_array(path.as_ref(), None)
+    }
+
+    /// [`Volume::open`], of a VTK file that holds several arrays the one of that name, if one is given.
+    ///
+    /// # Errors
+    /// As [`Volume::open`]; `Invalid` if there is no such array, or the file is of another format.
+    pub fn open_array(path: &Path, array: Option<&str>) -> Result<Self> {
         let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
         // A missing file is the better complaint, whatever its extension.
         std::fs::metadata(path).map_err(|e| Error::io(path, e))?;
+        if path.is_dir() {
+            return Err(Error::invalid(
+                path,
+                "is a folder; name a file in it (slices as files of their own: stack them)",
+            ));
+        }
         // What stands before `.gz` or `.zip` is the format's.
         let mut words = name.rsplit('.');
         let last = words.next().unwrap_or("");
@@ -475,36 +488,48 @@ impl Volume {
             "gz" | "zip" => (words.next().unwrap_or(""), last),
             _ => (last, ""),
         };
+        if let (Some(array), false) = (array, matches!((extension, packed), ("vti" | "vtk", ""))) {
+            return Err(Error::invalid(path, format!("has no named arrays to choose `{array}` of, as VTK files have")));
+        }
         match (extension, packed) {
             ("nii", "" | "gz") => nifti::read(path),
             ("nrrd" | "nhdr", "") => nrrd::read(path),
             ("mha" | "mhd", "") => metaimage::read(path),
             ("mrc" | "map" | "ccp4" | "rec", "" | "gz") => mrc::read(path),
             ("cube" | "cub", "" | "gz") => cube::read(path),
-            ("vti", "") => Self::of_vti(path, vti::VtiFile::read(path)?),
-            ("vtk", "") => legacy_vtk::read(path),
+            ("vti", "") => Self::of_vti(path, vti::VtiFile::read(path)?, array),
+            ("vtk", "") => legacy_vtk::read(path, array),
             ("npy", "") => npy::read(path),
             ("tif" | "tiff", "" | "zip") => tiff::read(path),
-            ("raw", "") => {
-                Err(Error::invalid(path, "has no header: give its dimensions, sample type, byte order and spacing too"))
-            }
+            ("raw", "") => Err(Error::invalid(
+                path,
+                "has no header: give its layout with --raw-dims, --raw-type …, or as [volume.raw]",
+            )),
             ("toml" | "vtm", "") => {
                 Err(Error::not_supported(path, "names volumes, of which this takes one: give that volume's file"))
             }
+            ("dcm" | "dicom" | "ima", "") => {
+                Err(Error::not_supported(path, "is DICOM: a converter to NIfTI or NRRD puts the slices together"))
+            }
+            ("vtr" | "vts" | "vtu" | "pvti" | "pvtr", "") => Err(Error::not_supported(
+                path,
+                "is no image of VTK's (.vti): resample it to one, as ParaView's `Resample To Image` does",
+            )),
+            ("npz", "") => Err(Error::not_supported(path, "holds several arrays: save one as a .npy")),
             _ => Err(Error::not_supported(
                 path,
-                format!("unknown extension; {READ} are read, and .raw with its layout given"),
+                format!("unknown extension; {READ} are read, and any file with its layout given (--raw-dims …)"),
             )),
         }
     }
 
-    /// The volume in a `.vti` that was read from `path`, as [`Volume::open`] takes it.
+    /// The volume in a `.vti` that was read from `path`, as [`Volume::open_array`] takes it.
     ///
     /// # Errors
     /// `Invalid` with the list of arrays if none are its scalars.
-    pub fn of_vti(path: &Path, file: vti::VtiFile) -> Result<Self> {
+    pub fn of_vti(path: &Path, file: vti::VtiFile, array: Option<&str>) -> Result<Self> {
         let space = file.space();
-        let (lattice, samples) = file.into_scalars().map_err(|e| e.in_file(path))?;
+        let (lattice, samples) = file.into_scalars(array).map_err(|e| e.in_file(path))?;
         Ok(Self { space, ..Self::new(path.display().to_string(), lattice, samples)? })
     }
 

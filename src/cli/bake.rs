@@ -17,7 +17,7 @@ use crate::scene_file::{Inputs, SceneOptions, load, load_series};
 use crate::series::{Series, write_collection};
 use plan::Plan;
 use serde::Serialize;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -204,7 +204,7 @@ impl Bake {
             }
             Begun::At(checkpoint) => {
                 let reports = self.work(&plan, &checkpoint, (begun, load), progress)?;
-                let json = in_one(plan.scene(), &reports);
+                let json = self.in_one(plan.scene(), &reports);
                 self.hand_out(&json)?;
                 if progress.is_shown() {
                     self.summarise(plan.scene(), &reports);
@@ -240,6 +240,24 @@ impl Bake {
         scene.members().iter().map(|m| bake_file::field_file(&self.output, &m.name)).collect()
     }
 
+    /// The reports as one, with what was baked: of several volumes, each by its name.
+    fn in_one<R: Serialize>(&self, scene: &Scene, reports: &[R]) -> serde_json::Value {
+        let members = scene.members();
+        let files = if members.len() > 1 { self.field_files(scene) } else { vec![self.output.clone()] };
+        let mut all = members.iter().zip(files).zip(reports).map(|((member, file), report)| {
+            let mut json = serde_json::to_value(report).expect("the report is plain data");
+            let sweep = member.field.sweep();
+            json["input"] = self.input.to_string_lossy().into();
+            json["output"] = file.to_string_lossy().into();
+            json["isovalues"] = [sweep.lo(), sweep.hi()].into();
+            (member.name.to_owned(), json)
+        });
+        match reports {
+            [_] => all.next().map(|(_, json)| json).unwrap_or_default(),
+            _ => all.collect::<serde_json::Map<_, _>>().into(),
+        }
+    }
+
     /// Where the work begins: with --resume at what is done.
     fn begin(&self, plan: &Plan, first: bool, progress: Progress) -> Result<Begun> {
         let job = job(plan.scene(), &plan.settings, &plan.device.version());
@@ -257,7 +275,7 @@ impl Bake {
                     checkpoint.remove();
                 }
                 let reports: Vec<_> = [&bake].into_iter().chain(&bake.companions).map(|b| &b.report).collect();
-                return Ok(Begun::Whole(in_one(plan.scene(), &reports)));
+                return Ok(Begun::Whole(self.in_one(plan.scene(), &reports)));
             }
             found => found.is_some() && self.scene.time.is_some(),
         };
@@ -384,15 +402,6 @@ enum Begun {
     Whole(serde_json::Value),
     /// What was kept of it, or nothing.
     At(Checkpoint),
-}
-
-/// The reports as one: of several volumes, each by its name.
-fn in_one<R: Serialize>(scene: &Scene, reports: &[R]) -> serde_json::Value {
-    let json = match reports {
-        [report] => serde_json::to_value(report),
-        all => serde_json::to_value(scene.members().iter().map(|m| &m.name).zip(all).collect::<BTreeMap<_, _>>()),
-    };
-    json.expect("the report is plain data")
 }
 
 /// The share of indirect light that may be missing without a word: five times what sweeps settle for.

@@ -4,7 +4,7 @@ use super::{expect_extension, one_frame, outputs};
 use crate::error::{Error, Result};
 use crate::export::{bake_file, slices};
 use crate::progress::{Progress, say};
-use crate::scene_file::{Inputs, RawOptions};
+use crate::scene_file::{Inputs, PlaceOptions, RawOptions, ReadOptions};
 use crate::volume::vti::{self, VtiFile, VtiWriter};
 use crate::volume::{Lattice, Samples, Space, npy, nrrd};
 use std::path::{Path, PathBuf};
@@ -32,6 +32,8 @@ pub(super) struct Export {
     /// What the world's axes mean, for a .nrrd or .vti: lps, ras or las (default: as the volume's own file said)
     #[arg(long, value_name = "SPACE")]
     space: Option<String>,
+    #[command(flatten)]
+    place: PlaceOptions,
     #[command(flatten)]
     raw: RawOptions,
 }
@@ -99,15 +101,19 @@ impl Export {
     fn load(&self) -> Result<Array> {
         let is_vti = self.input.extension().is_some_and(|e| e.eq_ignore_ascii_case("vti"));
         if is_vti && !self.raw.given() {
-            return array_of(&self.input, self.array.as_deref());
+            let array = array_of(&self.input, self.array.as_deref())?;
+            return Ok(Array { lattice: self.place.of(array.lattice, &self.input)?, ..array });
         }
-        let volume = self.raw.open(&self.input)?;
-        if let Some(name) = self.array.as_deref().filter(|n| *n != "value") {
+        let is_vtk = self.input.extension().is_some_and(|e| e.eq_ignore_ascii_case("vtk"));
+        if let Some(name) = self.array.as_deref().filter(|n| !is_vtk && *n != "value") {
             return Err(Error::invalid(
                 &self.input,
                 format!("is a volume with one array, `value`, and has no `{name}`"),
             ));
         }
+        let array = self.array.clone().filter(|_| is_vtk);
+        let read = ReadOptions { array, place: self.place.clone(), raw: self.raw.clone() };
+        let volume = read.open(&self.input)?;
         let (lattice, space) = (volume.lattice.clone(), volume.space);
         Ok(Array { lattice, space, name: "value".into(), components: 1, samples: volume.into_samples() })
     }
@@ -125,7 +131,7 @@ fn array_of(path: &Path, name: Option<&str>) -> Result<Array> {
             let names = names.join(", ");
             return Err(Error::invalid(path, format!("has no point data `{name}`; it has {names}")));
         }
-        let (lattice, samples) = file.into_scalars().map_err(|e| e.in_file(path))?;
+        let (lattice, samples) = file.into_scalars(None).map_err(|e| e.in_file(path))?;
         return Ok(Array { lattice, space, name: "value".into(), components: 1, samples });
     };
     let array = file.point_data.swap_remove(chosen);

@@ -86,7 +86,7 @@ impl Extract {
             }
         };
         unless_interrupted()?;
-        let mesh = SurfaceMesh::extract(&scene, isovalue, self.refine)?;
+        let mesh = SurfaceMesh::extract(&scene, isovalue, self.refine).map_err(|e| e.in_file(&self.input))?;
         let found = baked.as_ref().map(|b| light(b, rays, &mesh.positions, progress)).transpose();
         let found = found.map_err(|e| e.in_file(&self.input))?;
         let radiance = found.as_ref().map(|f| &f.radiance);

@@ -6,7 +6,7 @@ use crate::error::{Error, Result};
 use crate::files;
 use crate::illumination_grid::GridSize;
 use crate::progress::{Progress, say};
-use crate::scene_file::RawOptions;
+use crate::scene_file::ReadOptions;
 use crate::volume::Lattice;
 use crate::volume::statistics::VolumeStatistics;
 use std::path::{Path, PathBuf};
@@ -26,7 +26,7 @@ pub(super) struct Init {
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]
-    raw: RawOptions,
+    read: ReadOptions,
 }
 
 impl Init {
@@ -37,10 +37,10 @@ impl Init {
         if output.exists() {
             return Err(Error::invalid(&output, "exists already; give another name with -o, or remove it first"));
         }
-        let volume = self.raw.open(&self.file)?;
+        let volume = self.read.open(&self.file)?;
         let statistics = VolumeStatistics::of(&volume);
         let named = relative(&self.file, &output)?;
-        let text = scene_text(&named, &self.raw, &statistics, &volume.lattice);
+        let text = scene_text(&named, &self.read, &statistics, &volume.lattice);
         files::write_text(&output, &text)?;
         if progress.is_shown() {
             say!("{}: edit it, then: isolume bake {} -o lit.vti", output.display(), for_shell(&output));
@@ -65,6 +65,9 @@ fn beside(volume: &Path) -> PathBuf {
 
 /// The volume's path as the scene file must name it, since paths in scene files are relative to them.
 fn relative(volume: &Path, output: &Path) -> Result<PathBuf> {
+    if volume.to_str().is_none() {
+        return Err(Error::invalid(volume, "its name is no Unicode, which scene files are written in; rename it"));
+    }
     let folder = |p: &Path| p.parent().unwrap_or(Path::new("")).to_path_buf();
     if folder(volume) == folder(output) {
         return Ok(volume.file_name().map_or_else(|| volume.to_path_buf(), PathBuf::from));
@@ -75,7 +78,7 @@ fn relative(volume: &Path, output: &Path) -> Result<PathBuf> {
     std::path::absolute(volume).map_err(|e| Error::io(volume, e))
 }
 
-fn scene_text(volume: &Path, raw: &RawOptions, statistics: &VolumeStatistics, lattice: &Lattice) -> String {
+fn scene_text(volume: &Path, read: &ReadOptions, statistics: &VolumeStatistics, lattice: &Lattice) -> String {
     // Debug strings of text without control characters are TOML strings.
     let quoted = |s: &str| toml::Value::String(s.to_owned()).to_string();
     let [nx, ny, nz] = statistics.dims;
@@ -90,8 +93,17 @@ fn scene_text(volume: &Path, raw: &RawOptions, statistics: &VolumeStatistics, la
     // Light on a grid of long voxels is blurred.
     let grid = if GridSize::Cubic.of(lattice) == GridSize::OWN { "# grid = \"1x\"" } else { "grid = \"cubic\"" };
     let mut layout = String::new();
+    let mut key = |name: &str, value: Option<String>| {
+        if let Some(value) = value {
+            layout += &format!("{name} = {value}\n");
+        }
+    };
+    let ReadOptions { array, place, raw } = read;
+    key("array", array.as_deref().map(quoted));
+    key("spacing", place.spacing.as_ref().map(|v| format!("{v:?}")));
+    key("origin", place.origin.as_ref().map(|v| format!("{v:?}")));
     if raw.given() {
-        layout = "\n# The layout of the headerless file.\n[volume.raw]\n".to_owned();
+        layout += "\n# The layout of the headerless file.\n[volume.raw]\n";
         let mut key = |name: &str, value: Option<String>| {
             if let Some(value) = value {
                 layout += &format!("{name} = {value}\n");

@@ -197,7 +197,10 @@ impl Render {
             None if !self.reference && !self.local => Some(BakedVolume::read(&self.file)?),
             found => found,
         };
-        let Some(baked) = baked else { return Ok(Source::Unbaked(load(&self.file, &self.scene)?.scene)) };
+        let Some(baked) = baked else {
+            let options = SceneOptions { held: Some(self.isovalue), ..self.scene.clone() };
+            return Ok(Source::Unbaked(load(&self.file, &options)?.scene));
+        };
         gather.map_or(Ok(()), |g| g.check(&baked)).map_err(|e| e.in_file(&self.file))?;
         Ok(Source::Bake(baked))
     }

@@ -22,7 +22,9 @@ fn on_signal() -> impl FnMut() {
 /// the system tells of it (Linux does).
 #[cfg(unix)]
 pub(super) fn heed() {
-    use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+    use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
+    // A file that may not grow further is an error of writing, after which what is finished is kept.
+    let _ = signal_hook::flag::register(SIGXFSZ, std::sync::Arc::default());
     let hangup = (!ignored(SIGHUP)).then_some(SIGHUP);
     let signals = [SIGINT, SIGTERM].into_iter().chain(hangup);
     let Ok(mut signals) = signal_hook::iterator::Signals::new(signals) else { return };

@@ -376,6 +376,9 @@ impl BakedVolume {
         }
         if !path.extension().is_some_and(|e| e.eq_ignore_ascii_case("vti")) {
             std::fs::metadata(path).map_err(|e| Error::io(path, e))?;
+            if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("pvd")) {
+                return Err(Error::invalid(path, "is a series of bakes; name one of its .vti"));
+            }
             return Err(Error::invalid(path, "is no bake (.vti, .vtm); make one with `isolume bake`"));
         }
         Self::one(path)

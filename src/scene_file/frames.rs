@@ -1,6 +1,6 @@
 //! `[volume]` in time: `file` as a pattern, or `files`.
 
-use super::{RawOptions, SceneOptions, VolumeSource, Volumes, blame, parse};
+use super::{SceneOptions, VolumeSource, Volumes, blame, parse};
 use crate::error::{Error, Result};
 use crate::series::Series;
 use crate::volume::Volume;
@@ -15,7 +15,7 @@ pub fn load_series(input: &Path, options: &SceneOptions) -> Result<Option<Series
     let Volumes::One(single) = &file.volume else { return Ok(None) };
     let series = single.series(&folder).map_err(|e| blame(source.as_ref(), single.key(), e))?;
     if let Some(series) = &series {
-        series.check(|path| read_volume(path, single, &options.raw))?;
+        series.check(|path| single.read(path, &options.read))?;
     }
     Ok(series)
 }
@@ -57,9 +57,4 @@ pub(super) fn moment(
         return Err(Error::invalid(input, format!("is a series of {n} volumes; choose a moment with --time")));
     };
     series.at(time, read)
-}
-
-/// Reads a volume file as the source and flags say.
-pub(super) fn read_volume(path: &Path, source: &VolumeSource, raw: &RawOptions) -> Result<Volume> {
-    raw.or(source.raw.as_ref()).open(path)
 }

@@ -1,8 +1,8 @@
 //! `[[volume]]`: several volumes in one scene.
 
 use super::{
-    Albedo, BoundaryName, Loaded, OutsideName, RawOptions, Rgb, SceneFile, SceneOptions, SidesName, Source,
-    SurfaceOptions, VolumeSource, context, load_volume, numbers, suggested, surface, surroundings,
+    Albedo, BoundaryName, Loaded, OutsideName, RawOptions, ReadOptions, Rgb, SceneFile, SceneOptions, SidesName,
+    Source, SurfaceOptions, VolumeSource, context, numbers, suggested, surface, surroundings,
 };
 use crate::error::{Error, Result};
 use crate::field::{Field, Sweep};
@@ -68,10 +68,15 @@ pub struct VolumeEntry {
     pub file: Option<PathBuf>,
     /// How to read a headerless file.
     pub raw: Option<RawOptions>,
+    /// The array of a VTK file that holds several.
+    pub array: Option<String>,
     /// Name of a generator instead of a file.
     pub generator: Option<String>,
     /// Samples along each edge of a generated volume.
     pub size: Option<usize>,
+    /// World distance between samples, instead of the file's.
+    #[serde(default, deserialize_with = "numbers")]
+    pub spacing: Option<[f64; 3]>,
     /// World position of the first sample, instead of the file's.
     #[serde(default, deserialize_with = "numbers")]
     pub origin: Option<[f64; 3]>,
@@ -100,19 +105,20 @@ impl VolumeEntry {
         let source = VolumeSource {
             file: self.file.clone(),
             raw: self.raw.clone(),
+            array: self.array.clone(),
+            spacing: self.spacing,
+            origin: self.origin,
             generator: self.generator.clone(),
             size: self.size,
             ..VolumeSource::default()
         };
-        let mut volume = load_volume(&source, folder, &RawOptions::default())?;
-        if self.origin.is_some() || self.scale.is_some() {
-            let scale = self.scale.unwrap_or(1.0);
+        let mut volume = source.load(folder, &ReadOptions::default())?;
+        if let Some(scale) = self.scale {
             if !(scale > 0.0 && scale.is_finite()) {
                 return Err(Error::Invalid(format!("scale {scale}: must be a factor above 0")));
             }
             let lattice = &volume.lattice;
-            let origin = self.origin.map_or(lattice.origin(), DVec3::from_array);
-            volume.lattice = Lattice::new(lattice.dims(), origin, lattice.axes() * scale)?;
+            volume.lattice = Lattice::new(lattice.dims(), lattice.origin(), lattice.axes() * scale)?;
         }
         Ok(volume)
     }

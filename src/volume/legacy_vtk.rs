@@ -7,7 +7,7 @@ use glam::DVec3;
 use std::path::Path;
 
 /// Reads the first one-component scalars of the point data (unsigned char ones may be called `COLOR_SCALARS`), or else
-/// the first one-component array of its `FIELD` data.
+/// the first one-component array of its `FIELD` data; of either the one called `array`, if a name is given.
 ///
 /// `ASPECT_RATIO`, the keyword of version 1, means the same as `SPACING`; a missing spacing is 1. `long` has 64 bits.
 /// Cell data in front of the point data, where VTK's writer puts them, are passed over. Keywords and types may have any
@@ -16,9 +16,9 @@ use std::path::Path;
 /// # Errors
 /// `Io`; `Invalid` for a broken header, or arrays cut short; `NotSupported` for other data sets and for cell data
 /// alone.
-pub fn read(path: &Path) -> Result<Volume> {
+pub fn read(path: &Path, array: Option<&str>) -> Result<Volume> {
     let bytes = files::read(path)?;
-    let (lattice, samples) = parse(&bytes).map_err(|e| e.in_file(path))?;
+    let (lattice, samples) = parse(&bytes, array).map_err(|e| e.in_file(path))?;
     Volume::new(path.display().to_string(), lattice, samples)
 }
 
@@ -188,11 +188,11 @@ impl Section {
     }
 }
 
-fn parse(bytes: &[u8]) -> Result<(Lattice, Samples)> {
+fn parse(bytes: &[u8], array: Option<&str>) -> Result<(Lattice, Samples)> {
     let mut cursor = Cursor { bytes, at: 0, binary: false };
     begin(&mut cursor)?;
     let (lattice, part) = geometry(&mut cursor)?;
-    let samples = attributes(&mut cursor, &lattice, part)?;
+    let samples = attributes(&mut cursor, &lattice, part, array)?;
     Ok((lattice, samples))
 }
 
@@ -245,8 +245,16 @@ fn geometry(cursor: &mut Cursor) -> Result<(Lattice, Part)> {
     Ok((lattice, (section, tuples)))
 }
 
-/// The first scalars of the points, or else the first fitting array of their `FIELD`.
-fn attributes(cursor: &mut Cursor, lattice: &Lattice, (mut section, mut tuples): Part) -> Result<Samples> {
+/// The first scalars of the points, or else the first fitting array of their `FIELD`; those called `name`, if it is
+/// given.
+fn attributes(
+    cursor: &mut Cursor,
+    lattice: &Lattice,
+    (mut section, mut tuples): Part,
+    name: Option<&str>,
+) -> Result<Samples> {
+    // The writer of names with blanks.
+    let named = |word: &str| name.is_none_or(|name| name == word.replace("%20", " "));
     let mut field: Option<Array> = None;
     while let Some(words) = cursor.words() {
         let count = |n: usize| {
@@ -266,7 +274,7 @@ fn attributes(cursor: &mut Cursor, lattice: &Lattice, (mut section, mut tuples):
                     cursor.at = before;
                 }
                 let array = cursor.array(word(1)?, word(2)?, count(n)?)?;
-                if wanted(n) {
+                if wanted(n) && named(word(1)?) {
                     return cursor.samples(&array);
                 }
             }
@@ -279,7 +287,7 @@ fn attributes(cursor: &mut Cursor, lattice: &Lattice, (mut section, mut tuples):
             "COLOR_SCALARS" => {
                 let n = components(&words, 2)?;
                 let array = cursor.array(word(1)?, if cursor.binary { "unsigned_char" } else { "float" }, count(n)?)?;
-                if wanted(n) {
+                if wanted(n) && named(word(1)?) {
                     let samples = match cursor.samples(&array)? {
                         Samples::F32(v) => Samples::U8(v.into_iter().map(|v| (v * 255.0).round() as u8).collect()),
                         samples => samples,
@@ -298,8 +306,8 @@ fn attributes(cursor: &mut Cursor, lattice: &Lattice, (mut section, mut tuples):
             }
             "FIELD" => {
                 for _ in 0..components(&words, 2)? {
-                    let Some((array, n)) = field_array(cursor)? else { continue };
-                    if wanted(n) && array.count == tuples && field.is_none() {
+                    let Some((own, array, n)) = field_array(cursor)? else { continue };
+                    if wanted(n) && named(&own) && array.count == tuples && field.is_none() {
                         field = Some(array);
                     }
                 }
@@ -315,7 +323,10 @@ fn attributes(cursor: &mut Cursor, lattice: &Lattice, (mut section, mut tuples):
     }
     match field {
         Some(array) => cursor.samples(&array),
-        None => Err(cells()),
+        None => match name {
+            Some(name) => invalid(format!("has no point data `{name}` of one component")),
+            None => Err(cells()),
+        },
     }
 }
 
@@ -325,8 +336,8 @@ fn cells() -> Error {
     )
 }
 
-/// One array of a `FIELD`, and its components; `None` of what holds no numbers.
-fn field_array<'a>(cursor: &mut Cursor<'a>) -> Result<Option<(Array<'a>, usize)>> {
+/// One array of a `FIELD`, its name and components; `None` of what holds no numbers.
+fn field_array<'a>(cursor: &mut Cursor<'a>) -> Result<Option<(String, Array<'a>, usize)>> {
     let mut words = cursor.words().unwrap_or_default();
     // Behind each array there may be notes about it.
     if words.first().is_some_and(|w| w.eq_ignore_ascii_case("METADATA")) {
@@ -344,7 +355,8 @@ fn field_array<'a>(cursor: &mut Cursor<'a>) -> Result<Option<(Array<'a>, usize)>
     if kind.eq_ignore_ascii_case("string") {
         return cursor.pass_over_strings(&words[0], count).map(|()| None);
     }
-    Ok(Some((cursor.array(&words[0], kind, count)?, n)))
+    let array = cursor.array(&words[0], kind, count)?;
+    Ok(Some((words.swap_remove(0), array, n)))
 }
 
 fn skip_field(cursor: &mut Cursor, words: &[String]) -> Result<()> {
@@ -363,7 +375,7 @@ mod tests {
     const NUMBERS: &str = "0 1 2 3 4 5\n6 7 8 9 10 11\n";
 
     fn ok(bytes: &[u8], element: ElementType) {
-        let (lattice, samples) = parse(bytes).unwrap();
+        let (lattice, samples) = parse(bytes, None).unwrap();
         assert_eq!(lattice.to_world(DVec3::ONE), DVec3::new(1.5, 3.0, 5.0));
         assert_eq!(samples.element_type(), element);
         assert!((0..12).all(|i| samples.get(i) == i as f64));
@@ -418,11 +430,14 @@ mod tests {
         ok(&bytes, ElementType::I16);
         let start = head.len() + field.len();
         for cut in [start, start + 1, start + 4, start + 200, start + 400] {
-            assert!(matches!(parse(&bytes[..cut]), Err(Error::Invalid(e)) if e.contains("strings promised")), "{cut}");
+            assert!(
+                matches!(parse(&bytes[..cut], None), Err(Error::Invalid(e)) if e.contains("strings promised")),
+                "{cut}"
+            );
         }
         // 2⁶² bytes.
         let endless = [&bytes[..start], &[0x3f; 8]].concat();
-        assert!(parse(&endless).is_err());
+        assert!(parse(&endless, None).is_err());
     }
 
     #[test]
@@ -503,7 +518,7 @@ mod tests {
     #[test]
     fn broken_files_are_refused() {
         let refused = |text: String, words: &str| {
-            let message = parse(text.as_bytes()).unwrap_err().to_string();
+            let message = parse(text.as_bytes(), None).unwrap_err().to_string();
             assert!(message.contains(words), "{words}: {message}");
         };
         let good = format!("{HEAD}SCALARS s int\nLOOKUP_TABLE default\n{NUMBERS}");

@@ -27,6 +27,8 @@ pub struct VolumeStatistics {
     pub axes: [[f64; 3]; 3],
     /// World length of the steps.
     pub spacing: [f64; 3],
+    /// What the world's axes mean ([`crate::volume::Space`]); left-posterior-superior where the file says nothing.
+    pub space: &'static str,
     /// Name of the sample type: `u8`, `f32` …
     pub element_type: &'static str,
     /// Number of samples.
@@ -45,12 +47,23 @@ pub struct VolumeStatistics {
     pub commonest: Option<f64>,
     /// Its share of the finite samples, 0 … 1.
     pub commonest_share: Option<f64>,
+    /// Distinct values.
+    pub distinct: usize,
+    /// The commonest value, if it is so far from all others as only a mark for missing samples is: 90 times as far as
+    /// they are apart. Then no sweep is suggested.
+    pub fill: Option<f64>,
     /// Samples whose central-difference gradient (one-sided on the boundary) is exactly zero.
     pub flat: usize,
     /// Suggested sweep [lo, hi]: see [`VolumeStatistics::of`]. `None` for a constant volume, for a range that f64 does
-    /// not hold, and if no neighbours are finite.
+    /// not hold, if no neighbours are finite, and beside a [`VolumeStatistics::fill`].
     pub sweep: Option<[f64; 2]>,
 }
+
+/// See [`VolumeStatistics::fill`].
+const APART: f64 = 90.0;
+
+/// Volumes of at most so many values may be of labels.
+const LABELS: usize = 32;
 
 /// The samples in order, as far as percentiles need it.
 struct Distribution {
@@ -80,6 +93,7 @@ impl VolumeStatistics {
             origin: lattice.origin().to_array(),
             axes: [axes.x_axis, axes.y_axis, axes.z_axis].map(|a| a.to_array()),
             spacing: lattice.spacing().to_array(),
+            space: volume.space.name(),
             element_type: volume.samples().element_type().name(),
             samples: lattice.len(),
             non_finite: volume.non_finite(),
@@ -89,6 +103,8 @@ impl VolumeStatistics {
             histogram: None,
             commonest: None,
             commonest_share: None,
+            distinct: distribution.values.len(),
+            fill: None,
             flat: 0,
             sweep: None,
         };
@@ -100,12 +116,13 @@ impl VolumeStatistics {
         statistics.percentiles = Some(PERCENTILES.map(|p| distribution.percentile(p)));
         statistics.histogram = Some(distribution.histogram());
         (statistics.commonest, statistics.commonest_share) = (Some(commonest), Some(share));
+        statistics.fill = distribution.is_apart(commonest).then_some(commonest);
         let survey = sweep::Survey::of(volume, [min, max]);
         statistics.flat = survey.flat;
         let integer = !matches!(volume.samples(), Samples::F32(_) | Samples::F64(_));
         // Measured fields may never take the same value twice; then the fullest bin tells the background.
         let background = if share >= 0.01 { commonest } else { distribution.fullest() };
-        statistics.sweep = survey.suggest(background, integer);
+        statistics.sweep = survey.suggest(background, integer).filter(|_| statistics.fill.is_none());
         statistics
     }
 
@@ -114,6 +131,12 @@ impl VolumeStatistics {
         let why = match self.range {
             _ if self.sweep.is_some() => return None,
             None => "none of its samples is finite: it holds no isosurface".into(),
+            Some(_) if let (Some(fill), Some(share)) = (self.fill, self.commonest_share) => format!(
+                "{:.1} % of its samples are {}, far from all others, as if these were missing: make them NaN (other files \
+                 than those of integers hold it), or choose a sweep (--isovalues, or `isovalues` in a scene file)",
+                100.0 * share,
+                brief(fill)
+            ),
             Some([min, max]) if min < max => format!(
                 "its samples, {}, suggest none (they are too far apart, or no neighbours are finite); choose one \
                  (--isovalues, or `isovalues` in a scene file)",
@@ -141,6 +164,7 @@ impl VolumeStatistics {
         let [nx, ny, nz] = self.dims;
         line("volume", self.name.clone());
         line("samples", format!("{nx} × {ny} × {nz} = {}, type {}", self.samples, self.element_type));
+        line("world", self.space.to_owned());
         line("spacing", list(&self.spacing));
         line("origin", list(&self.origin));
         let aligned = (0..3).all(|a| (0..3).all(|c| a == c || self.axes[a][c] == 0.0) && self.axes[a][a] > 0.0);
@@ -164,6 +188,9 @@ impl VolumeStatistics {
             line("percentiles", format!("{values}  (at {} %)", PERCENTILES.map(|p| p.to_string()).join(", ")));
             line("commonest value", format!("{}, {:.3} % of samples", brief_within(c, range), 100.0 * share));
             line("zero gradient", format!("{} ({})", self.flat, percent(self.flat)));
+            if (3..=LABELS).contains(&self.distinct) {
+                line("distinct values", format!("{}; if they are labels, see the recipes", self.distinct));
+            }
         }
         let none = || self.without_sweep().map_or_else(String::new, |why| format!("none: {why}"));
         line("suggested sweep", self.sweep.map_or_else(none, brief_span));
@@ -264,6 +291,19 @@ impl Distribution {
     fn percentile(&self, p: f64) -> f64 {
         let rank = (p / 100.0 * self.total() as f64).ceil().max(1.0) as u64;
         self.values[self.cumulative.partition_point(|&n| n < rank).min(self.values.len() - 1)]
+    }
+
+    /// Whether a value is the least or greatest, and [`APART`] times as far from the others as they are apart.
+    fn is_apart(&self, value: f64) -> bool {
+        let (others, gap) = match &self.values[..] {
+            [first, others @ ..] if *first == value && others.len() > 1 => (others, 0.5 * others[0] - 0.5 * value),
+            [others @ .., last] if *last == value && others.len() > 1 => {
+                (others, 0.5 * value - 0.5 * others[others.len() - 1])
+            }
+            _ => return false,
+        };
+        // Halves, since differences may overflow.
+        gap > APART * (0.5 * others[others.len() - 1] - 0.5 * others[0])
     }
 
     fn commonest(&self) -> (f64, f64) {

@@ -58,13 +58,14 @@ impl VtiFile {
         Self::parse(&files::read(path)?).map_err(|e| e.in_file(path))
     }
 
-    /// The scalars to render: the active ones, else an array named `value`, else the only one of 1 component.
+    /// The scalars to render: those called `array`, if a name is given; else the active ones, else an array named
+    /// `value`, else the only one of 1 component.
     ///
     /// # Errors
     /// `Invalid` with the list of arrays.
-    pub fn into_scalars(self) -> Result<(Lattice, Samples)> {
+    pub fn into_scalars(self, array: Option<&str>) -> Result<(Lattice, Samples)> {
         let Self { lattice, point_data, active_scalars, .. } = self;
-        Ok((lattice, scalars(point_data, active_scalars.as_deref())?))
+        Ok((lattice, scalars(point_data, array, active_scalars.as_deref())?))
     }
 
     /// What the file says that the world's axes mean; the default if it says nothing that is understood.
@@ -107,25 +108,31 @@ pub fn read_plane(path: &Path) -> Result<Option<Plane>> {
     let read = || -> Result<Option<Plane>> {
         let (place, arrays) = Arrays::parse(&files::read(path)?, flat)?;
         let Some((dims, spacing)) = place else { return Ok(None) };
-        Ok(Some(Plane { dims, spacing, samples: scalars(arrays.point_data, arrays.active_scalars.as_deref())? }))
+        Ok(Some(Plane { dims, spacing, samples: scalars(arrays.point_data, None, arrays.active_scalars.as_deref())? }))
     };
     read().map_err(|e| e.in_file(path))
 }
 
 /// The scalars to render, see [`VtiFile::into_scalars`].
-fn scalars(point_data: Vec<VtiArray>, active: Option<&str>) -> Result<Samples> {
+fn scalars(point_data: Vec<VtiArray>, array: Option<&str>, active: Option<&str>) -> Result<Samples> {
     let scalar = |a: &&VtiArray| a.components == 1;
     let named = |name: &str| point_data.iter().filter(scalar).position(|a| a.name == name);
     let count = point_data.iter().filter(scalar).count();
-    let chosen = active.and_then(named).or_else(|| named("value")).or_else(|| (count == 1).then_some(0));
+    let chosen = match array {
+        Some(array) => named(array),
+        None => active.and_then(named).or_else(|| named("value")).or_else(|| (count == 1).then_some(0)),
+    };
     let Some(chosen) = chosen else {
         let list: Vec<String> =
             point_data.iter().map(|a| format!("`{}` ({} components)", a.name, a.components)).collect();
-        return Err(Error::Invalid(format!(
-            "cannot tell which point data to use: {}. Mark a 1-component array as Scalars, or name it `value` \
-             (cell data are not read: convert them to point data)",
-            if list.is_empty() { "there are none".to_string() } else { list.join(", ") }
-        )));
+        let list = if list.is_empty() { "there are none".to_string() } else { list.join(", ") };
+        return Err(Error::Invalid(match array {
+            Some(array) => format!("has no point data `{array}` of 1 component; there are: {list}"),
+            None => format!(
+                "cannot tell which point data to use: {list}. Name a 1-component array with --array, or as array in \
+                 [volume] (cell data are not read: convert them to point data)"
+            ),
+        }));
     };
     Ok(point_data.into_iter().filter(|a| a.components == 1).nth(chosen).expect("found above").samples)
 }

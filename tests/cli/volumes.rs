@@ -2,10 +2,10 @@
 //! several in a scene.
 
 use super::{Folder, QUICK, ok, refused, text};
-use glam::DVec3;
+use glam::{DMat3, DVec3};
 use isolume::export::ply;
 use isolume::volume::vti::{VtiFile, VtiWriter};
-use isolume::volume::{Lattice, Samples, Volume, npy};
+use isolume::volume::{Lattice, Samples, Space, Volume, npy};
 use std::fs;
 
 #[test]
@@ -306,4 +306,137 @@ fn the_scalars_of_a_volume_are_exported() {
         ok(dir, &[&["export", "v.vti", "-o", "v.npy", "-q"], array].concat());
         assert_eq!(Volume::open(dir.join("v.npy")).unwrap().samples(), expected, "{array:?}");
     }
+}
+
+/// By flags and by a scene file's keys: an array of its name, steps that keep their directions, an origin; of formats
+/// that say where they stand, too.
+#[test]
+fn what_a_file_does_not_say_is_said_beside_it() {
+    let dir = Folder::new();
+    let dir = dir.path();
+    let skew = DMat3::from_cols(DVec3::new(0.0, 2.0, 0.0), DVec3::new(-3.0, 0.0, 0.0), DVec3::new(0.0, 1.0, 1.0));
+    let lattice = Lattice::new([2; 3], DVec3::ONE, skew).unwrap();
+    let [p, q] = [[1u8, 2, 3, 4, 5, 6, 7, 8], [9, 1, 1, 1, 1, 1, 1, 1]].map(|v| Samples::U8(v.to_vec()));
+    VtiWriter::new(&lattice).point_data("p", 1, &p).point_data("q", 1, &q).write(&dir.join("two.vti")).unwrap();
+    npy::write(&dir.join("plain.npy"), &lattice, 1, (&p).into()).unwrap();
+    let legacy = "# vtk DataFile Version 3.0\nt\nASCII\nDATASET STRUCTURED_POINTS\nDIMENSIONS 2 2 2\nPOINT_DATA 8\n\
+                  SCALARS p int\nLOOKUP_TABLE default\n1 2 3 4 5 6 7 8\nSCALARS q%20r int\nLOOKUP_TABLE default\n\
+                  9 1 1 1 1 1 1 1\nFIELD FieldData 1\ns 1 8 int\n7 7 7 7 7 7 7 6\n";
+    fs::write(dir.join("two.vtk"), legacy).unwrap();
+
+    let info = |args: &[&str]| -> serde_json::Value {
+        serde_json::from_slice(&ok(dir, &[&["info", "--json"], args].concat()).stdout).unwrap()
+    };
+    let range = |args: &[&str]| info(args)["range"].clone();
+    refused(dir, &["info", "two.vti"], &["cannot tell which", "`p` (1 components), `q`", "--array"]);
+    refused(dir, &["info", "two.vti", "--array", "r"], &["no point data `r`", "`p`"]);
+    refused(dir, &["info", "two.vtk", "--array", "r"], &["no point data `r`"]);
+    refused(dir, &["info", "plain.npy", "--array", "p"], &["no named arrays"]);
+    assert_eq!(range(&["two.vti", "--array", "p"]), serde_json::json!([1.0, 8.0]));
+    assert_eq!(range(&["two.vti", "--array", "q"]), serde_json::json!([1.0, 9.0]));
+    assert_eq!(range(&["two.vtk"]), serde_json::json!([1.0, 8.0]));
+    assert_eq!(range(&["two.vtk", "--array", "q r"]), serde_json::json!([1.0, 9.0]));
+    assert_eq!(range(&["two.vtk", "--array", "s"]), serde_json::json!([6.0, 7.0]));
+
+    let placed = info(&["two.vti", "--array", "p", "--spacing", "4,-1,2", "--origin", "-1,0,5"]);
+    let root = 2f64.sqrt();
+    assert_eq!(placed["origin"], serde_json::json!([-1.0, 0.0, 5.0]));
+    assert_eq!(placed["axes"][0], serde_json::json!([0.0, 4.0, 0.0]));
+    assert_eq!(placed["axes"][1], serde_json::json!([1.0, 0.0, 0.0]));
+    assert!((placed["axes"][2][2].as_f64().unwrap() - root).abs() < 1e-12, "{placed}");
+    refused(dir, &["info", "plain.npy", "--spacing", "1,2"], &["spacing needs three numbers, found 2"]);
+    refused(dir, &["info", "plain.npy", "--spacing", "1,0,2"], &["plain.npy"]);
+    refused(dir, &["info", "plain.npy", "--raw-spacing", "1,1,2"], &["--spacing"]);
+
+    let scene = |keys: &str| fs::write(dir.join("s.toml"), keys).unwrap();
+    scene(
+        "isovalues = [2.0, 7.0]\n[volume]\nfile = \"two.vti\"\narray = \"p\"\nspacing = [1, 1, 3]\norigin = [0, 0, 7]\n",
+    );
+    let bake = |more: &[&str]| {
+        ok(dir, &[&["bake", "s.toml", "-o", "lit.vti", "-q"], &QUICK[..], more].concat());
+        VtiFile::read(&dir.join("lit.vti")).unwrap().lattice
+    };
+    let lattice = bake(&[]);
+    assert_eq!((lattice.origin(), lattice.spacing().x), (DVec3::new(0.0, 0.0, 7.0), 1.0));
+    assert!((lattice.spacing().z - 3.0).abs() < 1e-12);
+    // Flags win.
+    assert_eq!(bake(&["--origin", "1,2,3"]).origin(), DVec3::new(1.0, 2.0, 3.0));
+    scene("isovalues = [0.3, 0.7]\n[volume]\ngenerator = \"sphere\"\nsize = 9\narray = \"p\"\n");
+    refused(dir, &["bake", "s.toml", "-o", "lit.vti"], &["array is for a file"]);
+    scene("isovalues = [0.3, 0.7]\n[volume]\ngenerator = \"sphere\"\nsize = 9\nspacing = [1, 1, 2]\n");
+    assert_eq!(bake(&[]).spacing(), DVec3::new(1.0, 1.0, 2.0));
+}
+
+/// Where no sweep is given, the one that is suggested holds the isovalue that is asked for.
+#[test]
+fn isovalues_outside_a_suggested_sweep_are_in_it() {
+    let dir = Folder::new();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "17", "-o", "b.vti"]);
+    let sweep = serde_json::from_slice::<serde_json::Value>(&ok(dir, &["info", "b.vti", "--json"]).stdout).unwrap();
+    let [lo, max] = [&sweep["sweep"][0], &sweep["range"][1]].map(|x| x.as_f64().unwrap());
+    let above = format!("{}", 0.9 * max + 0.1 * sweep["sweep"][1].as_f64().unwrap());
+    assert!(lo < max);
+    let few = ["--samples", "4", "--vertices", "10", "-q"];
+    ok(dir, &[&["reference", "b.vti", "--isovalue", &above, "-o", "r.ply"], &few[..]].concat());
+    ok(
+        dir,
+        &["render", "b.vti", "--local", "--isovalue", &above, "--width", "32", "--height", "32", "-o", "l.png", "-q"],
+    );
+    let given = ["reference", "b.vti", "--isovalue", &above, "--isovalues", "10,20", "-o", "r.ply"];
+    refused(dir, &[&given[..], &few].concat(), &["outside the sweep 10 … 20"]);
+}
+
+/// A world of another handedness, walls of another unit, sweeps and colours beside the data, grids that leave points out.
+#[test]
+fn what_does_not_fit_together_is_warned_of() {
+    let dir = Folder::new();
+    let dir = dir.path();
+    let lattice = Lattice::aligned([9; 3], DVec3::splat(100.0), DVec3::splat(20.0)).unwrap();
+    let h =
+        |o: usize| (20.0 * (1.0 - lattice.ijk(o).map(|i| (i as f64 - 4.0).powi(2)).iter().sum::<f64>() / 48.0)) as f32;
+    let samples = Samples::F32((0..lattice.len()).map(h).collect());
+    let mut volume = Volume::new("v", lattice.clone(), samples).unwrap();
+    volume.write(dir.join("v.vti")).unwrap();
+    volume.space = Space::RightAnteriorSuperior;
+    volume.write(dir.join("ras.vti")).unwrap();
+    let square = |z: f64, emission: &str| {
+        format!("v 0 0 {z}\nv 1 0 {z}\nv 1 1 {z}\nv 0 1 {z}\nusemtl {emission}\nf -4 -3 -2 -1\n")
+    };
+    fs::write(dir.join("m.mtl"), "newmtl wall\nKd 0.5 0.5 0.5\nnewmtl lamp\nKe 1 1 1\n").unwrap();
+    fs::write(dir.join("unit.obj"), format!("mtllib m.mtl\n{}{}", square(0.0, "wall"), square(1.0, "lamp"))).unwrap();
+    let bake = |args: &[&str]| {
+        let given = ["bake", "v.vti", "-o", "o.vti", "--isovalues", "5,15", "--engine", "sweep"];
+        text(&ok(dir, &[&given[..], &QUICK, args].concat()).stderr)
+    };
+    let nothing = bake(&[]);
+    assert!(!nothing.contains("warning"), "{nothing}");
+    for (args, words) in [
+        (&["--box", "unit.obj"][..], "beside the volume, not around it: they span 0 … 1 × 0 … 1 × 0 … 1"),
+        (&["--isovalues", "-100", "10"], "of the sweep -100 … 10 is beyond them"),
+        (&["--grid", "5,5,5"], "5×5×5 points does not hold the volume's 9×9×9"),
+    ] {
+        let said = bake(args);
+        assert!(said.contains(words), "{args:?}: {said}");
+    }
+    // As fine, finer by whole numbers, or with a lamp of its own far away: nothing to say.
+    fs::write(dir.join("lamp.obj"), format!("mtllib m.mtl\n{}", square(5000.0, "lamp"))).unwrap();
+    for args in [&["--grid", "2x"][..], &["--grid", "17,9,9"], &["--box", "lamp.obj", "--sides", "both"]] {
+        let said = bake(args);
+        assert!(!said.contains("warning"), "{args:?}: {said}");
+    }
+    fs::write(dir.join("wall.obj"), format!("mtllib m.mtl\n{}", square(5000.0, "wall"))).unwrap();
+    fs::write(
+        dir.join("far.toml"),
+        "isovalues = [5, 15]\n[volume]\nfile = \"v.vti\"\n[[context]]\nfile = \"wall.obj\"\n[surface]\nalbedo = \
+         [{ isovalue = 30, colour = 0.2 }, { isovalue = 40, colour = 0.3 }]\n",
+    )
+    .unwrap();
+    let far = text(&ok(dir, &[&["bake", "far.toml", "-o", "o.vti"], &QUICK[..]].concat()).stderr);
+    assert!(far.contains("times the volume's size away") && far.contains("on one side of the sweep"), "{far}");
+    let entry =
+        |name: &str, file: &str| format!("[[volume]]\nname = \"{name}\"\nfile = \"{file}\"\nisovalues = [5, 15]\n");
+    fs::write(dir.join("both.toml"), entry("a", "v.vti") + &entry("b", "ras.vti")).unwrap();
+    let both = text(&ok(dir, &[&["bake", "both.toml", "-o", "o.vtm"], &QUICK[..]].concat()).stderr);
+    assert!(both.contains("left-posterior-superior") && both.contains("right-anterior-superior"), "{both}");
 }

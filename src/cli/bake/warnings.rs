@@ -1,10 +1,13 @@
 //! What a bake warns of before it begins.
 
 use crate::bake::{BakeOptions, BakeSettings, Engine, common_size, left_out};
+use crate::digits::brief_span;
 use crate::error::Result;
+use crate::field::Sweep;
 use crate::flattened::Side;
 use crate::illumination_grid::GridSize;
-use crate::scene::Scene;
+use crate::polygon::Polygon;
+use crate::scene::{Scene, Surface};
 use crate::sweep::{lit_mostly_within, lit_within_solids};
 use crate::volume::Volume;
 use glam::DVec3;
@@ -72,7 +75,99 @@ pub(super) fn warnings(
     if options.grid.is_none() {
         lines.extend(long_voxels(scene));
     }
+    lines.extend(spaces(volumes));
+    lines.extend(scene.members().iter().zip(volumes).filter_map(|(m, volume)| beyond(m.field.sweep(), volume)));
+    lines.extend(scene.members().iter().filter_map(|m| single_colour(&m.surface)));
+    lines.extend(resampled(scene, settings.grid));
+    lines.extend(elsewhere(scene));
     Ok(lines)
+}
+
+/// Of volumes whose worlds differ.
+fn spaces(volumes: &[&Volume]) -> Option<String> {
+    let (first, others) = volumes.split_first()?;
+    let other = others.iter().find(|v| v.space != first.space)?;
+    Some(format!(
+        "{} has its world {}, {} {} (which is meant where a file says nothing): they stand where their numbers are; if \
+         both show the same, turn the axes of one",
+        first.name,
+        first.space.name(),
+        other.name,
+        other.space.name()
+    ))
+}
+
+/// Of a sweep that is mostly beyond the data.
+fn beyond(sweep: Sweep, volume: &Volume) -> Option<String> {
+    let (min, max) = volume.range()?;
+    let share = (sweep.hi().min(max) - sweep.lo().max(min)) / (sweep.hi() - sweep.lo());
+    (share < 0.5).then(|| {
+        format!(
+            "{}: the data span {}; {:.0} % of the sweep {sweep} is beyond them, where no isosurfaces are",
+            volume.name,
+            brief_span([min, max]),
+            100.0 * (1.0 - share)
+        )
+    })
+}
+
+/// Of colours by isovalue, none of which is one of the sweep.
+fn single_colour(surface: &Surface) -> Option<String> {
+    let stops = surface.albedo.stops();
+    let outside = stops.iter().all(|s| s.0 <= 0.0) || stops.iter().all(|s| s.0 >= 1.0);
+    (stops.len() > 1 && outside)
+        .then(|| "albedo: all its isovalues are on one side of the sweep; every surface has the same colour".into())
+}
+
+/// Of a grid that does not hold the volume's points.
+fn resampled(scene: &Scene, grid: GridSize) -> Option<String> {
+    let (volume, grid) = (scene.lattice(), grid.lattice(scene.lattice()).ok()?);
+    let whole = grid.cells().iter().zip(volume.cells()).all(|(fine, coarse)| fine % coarse == 0);
+    let [[x, y, z], [nx, ny, nz]] = [grid.dims(), volume.dims()];
+    (!whole).then(|| {
+        format!(
+            "a grid of {x}×{y}×{z} points does not hold the volume's {nx}×{ny}×{nz}: the bake's `value` is the volume \
+             resampled to it, whose isosurfaces are others; --grid 1x, 2x … keeps them"
+        )
+    })
+}
+
+/// Of surroundings that do not surround any volume, and of walls far away: another unit, or another place.
+fn elsewhere(scene: &Scene) -> Option<String> {
+    /// How many times the volume's own size.
+    const FAR: f64 = 10.0;
+    /// Less of the volumes than this within is no room.
+    const HELD: f64 = 0.1;
+    let bounds = |points: &mut dyn Iterator<Item = DVec3>| {
+        points.fold([DVec3::INFINITY, DVec3::NEG_INFINITY], |[lo, hi], x| [lo.min(x), hi.max(x)])
+    };
+    let members = scene.members();
+    let corners = members.iter().flat_map(|m| m.field.lattice().corners().map(|p| m.field.lattice().to_world(p)));
+    let [volume_lo, volume_hi] = bounds(&mut corners.into_iter());
+    let size = volume_hi - volume_lo;
+    // The volumes are [0, 1]³.
+    let of = |p: &Polygon| bounds(&mut p.vertices().iter().map(|x| (*x - volume_lo) / size));
+    let away = |p: &&Polygon| {
+        let [lo, hi] = of(p);
+        p.emission == DVec3::ZERO && (lo - 1.0).max(-hi).max_element() > FAR
+    };
+    if let Some(p) = scene.polygons().iter().find(away) {
+        return Some(format!("'{}' is more than {FAR} times the volume's size away; is it in the same unit?", p.name));
+    }
+    let all = scene.polygons().iter().map(of);
+    let [lo, hi] = all.fold([DVec3::INFINITY, DVec3::NEG_INFINITY], |[a, b], [lo, hi]| [a.min(lo), b.max(hi)]);
+    let (extent, within) = (hi - lo, (hi.min(DVec3::ONE) - lo.max(DVec3::ZERO)).max(DVec3::ZERO));
+    // Lamps that hang side by side may hang anywhere.
+    let room = extent.min_element() > 1e-3 * extent.max_element();
+    (room && within.element_product() < HELD).then(|| {
+        let spans = |lo: DVec3, hi: DVec3| [0, 1, 2].map(|a| brief_span([lo[a], hi[a]])).join(" × ");
+        format!(
+            "walls and luminaires stand beside the volume, not around it: they span {}, the volume {}; are both in the \
+             same unit and place?",
+            spans(volume_lo + lo * size, volume_lo + hi * size),
+            spans(volume_lo, volume_hi)
+        )
+    })
 }
 
 /// Of volumes whose voxels are long what grid would suit them, if one suits all of them and is not too large.
@@ -91,8 +186,8 @@ fn long_voxels(scene: &Scene) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::{Field, Sweep};
-    use crate::scene::{Boundary, Surface};
+    use crate::field::Field;
+    use crate::scene::Boundary;
     use crate::volume::{Lattice, Samples};
 
     /// A grid that no lattice can be is no advice, nor a fault of a bake that did not ask for it.

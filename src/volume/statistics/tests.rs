@@ -172,3 +172,25 @@ fn integers_that_floats_do_not_hold_are_counted() {
         assert_eq!(VolumeStatistics::of(&volume([2, 2, 2], samples)).rounded, 0);
     }
 }
+
+/// Marks for missing samples, at either end, in floats and integers; not a background, however common, nor two values.
+#[test]
+fn marks_for_missing_samples_suggest_no_sweep() {
+    let ramp = |mark: f64, scale: f64| -> Samples {
+        Samples::F64((0..1000).map(|i| if i % 4 == 0 { mark } else { scale * f64::from(i % 10 + i / 100) }).collect())
+    };
+    for (samples, fill) in [
+        (ramp(-1e30, 1.0), Some(-1e30)),
+        (ramp(1e20, 1e3), Some(1e20)),
+        (ramp(-9999.0, 5.0), Some(-9999.0)),
+        (ramp(f64::MAX, 1.0), Some(f64::MAX)),
+        (ramp(-1000.0, 100.0), None),
+        (ramp(0.0, 1.0), None),
+        (Samples::U8((0..1000).map(|i| u8::from(i % 3 > 0)).collect()), None),
+        (Samples::I16((0..1000).map(|i| if i % 2 == 0 { -32768 } else { i % 7 }).collect()), Some(-32768.0)),
+    ] {
+        let s = VolumeStatistics::of(&volume([10; 3], samples));
+        assert_eq!((s.fill, s.sweep.is_none()), (fill, fill.is_some()), "{s:?}");
+        assert_eq!(s.without_sweep().is_some_and(|why| why.contains("as if these were missing")), fill.is_some());
+    }
+}

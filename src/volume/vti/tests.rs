@@ -199,7 +199,7 @@ fn the_scalars_are_chosen_by_rule() {
         let lattice = Lattice::aligned([2; 3], DVec3::ZERO, DVec3::ONE).unwrap();
         let active_scalars = active.map(str::to_string);
         let file = VtiFile { lattice, point_data, field_data: vec![], field_strings: vec![], active_scalars };
-        file.into_scalars().map(|(_, s)| s.get(0))
+        file.into_scalars(None).map(|(_, s)| s.get(0))
     };
     let all = || vec![array("rgb", 3, 1), array("a", 1, 2), array("value", 1, 3)];
     assert_eq!(choose(Some("a"), all()).unwrap(), 2.0);
