@@ -8,7 +8,7 @@ use isolume::bake::{BakeOptions, BakeSettings, Engine, Preset, bake};
 use isolume::embree::{Device, GraphTracer, SurfaceTracer};
 use isolume::export::bake_file;
 use isolume::field::{Field, Sweep};
-use isolume::fitted_grid::{GridFit, Wish};
+use isolume::fitted_grid::{FitSample, GridFit};
 use isolume::flattened::Side;
 use isolume::illumination_grid::shepard;
 use isolume::isovalue_axis::IsovalueAxis;
@@ -143,7 +143,7 @@ fn main() {
             RadianceSample { position, radiance: position, ..RadianceSample::default() }
         })
         .collect();
-    let wishes: Vec<Wish> = samples.iter().map(Wish::from).collect();
+    let wishes: Vec<FitSample> = samples.iter().map(FitSample::from).collect();
     let start = shepard(&scene.field, lattice, &masks, &samples, 8, &|_| true);
     // Noise of its own for each half.
     let halves = |o: usize| {

@@ -16,7 +16,7 @@ pub(crate) use settings::common_size;
 pub use settings::{BakeOptions, BakeSettings, Engine, Interpolation, MOST_BANDS, StrategyName};
 pub use time::TimeEstimate;
 
-use crate::checkpoint::{self, Checkpoint};
+use crate::checkpoint::{Checkpoint, Saved};
 use crate::embree::Device;
 use crate::error::{Error, Result};
 use crate::field::Field;
@@ -161,10 +161,26 @@ impl Lit {
     }
 }
 
-/// Stages `first` and the next of a checkpoint.
-fn stages(checkpoint: Option<&Checkpoint>, first: u32) -> [checkpoint::Stage<'_>; 2] {
-    [first, first + 1].map(|n| checkpoint.map_or(checkpoint::Stage::UNSAVED, |c| c.stage(n)))
+/// What an engine works with, whatever it lights.
+#[derive(Clone, Copy)]
+struct Context<'a> {
+    settings: &'a BakeSettings,
+    device: &'a Device,
+    progress: Progress<'a>,
+    checkpoint: Option<&'a Checkpoint>,
 }
+
+impl<'a> Context<'a> {
+    /// What is saved of stages `first` and the next of field `number`: one of each side.
+    fn saved(&self, number: u32, first: u32) -> [Saved<'a>; 2] {
+        let first = STAGES * number + first;
+        [first, first + 1].map(|n| self.checkpoint.map_or(Saved::NOWHERE, |c| c.stage(n)))
+    }
+}
+
+/// Stages of a checkpoint that a field has: per side the cache's, the points', and the places' beside them. Sweeps have
+/// one in place of the cache's.
+const STAGES: u32 = 6;
 
 /// Illuminates every isosurface of the sweep.
 ///
@@ -209,12 +225,13 @@ pub fn bake_fields(
         Policy::Independent => jobs.chunks(1).collect(),
     };
     let mut bakes = Vec::new();
+    let context = Context { settings, device, progress, checkpoint };
     for group in groups {
         let lit = match settings.engine {
-            Engine::Photon => photon_engine::light(group, settings, device, progress, checkpoint)?,
-            Engine::Sweep => sweep_engine::light(&group[0], settings, device, progress, checkpoint)?,
+            Engine::Photon => photon_engine::light(group, context)?,
+            Engine::Sweep => sweep_engine::light(&group[0], context)?,
         };
-        bakes.extend(finish(group, lit, scene.exposure(), &digest, settings, device)?);
+        bakes.extend(finish(group, lit, scene.exposure(), &digest, context)?);
     }
     if resumed_blocks > 0 {
         for Bake { report, .. } in &mut bakes {
@@ -332,8 +349,7 @@ fn finish(
     mut lit: Lit,
     exposure: f64,
     digest: &str,
-    settings: &BakeSettings,
-    device: &Device,
+    Context { settings, device, .. }: Context,
 ) -> Result<Vec<Bake>> {
     let s = lit.seconds;
     let fields = std::mem::take(&mut lit.fields);

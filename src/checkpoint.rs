@@ -66,16 +66,16 @@ pub enum Held {
     Damage,
 }
 
-/// One stage of a job, with its checkpoint if there is one.
+/// What a checkpoint, if there is one, keeps of one stage of its job.
 #[derive(Clone, Copy, Debug)]
-pub struct Stage<'a> {
+pub struct Saved<'a> {
     checkpoint: Option<&'a Checkpoint>,
     number: u32,
 }
 
-impl Stage<'_> {
-    /// A stage that nobody saves.
-    pub const UNSAVED: Stage<'static> = Stage { checkpoint: None, number: 0 };
+impl Saved<'_> {
+    /// Of a stage that nobody saves.
+    pub const NOWHERE: Saved<'static> = Saved { checkpoint: None, number: 0 };
 
     /// A finished block, if it was saved with exactly `length` bytes.
     pub fn load(&self, block: usize, length: usize) -> Option<Vec<u8>> {
@@ -187,8 +187,8 @@ impl Checkpoint {
     }
 
     /// Stage `number` of the job.
-    pub fn stage(&self, number: u32) -> Stage<'_> {
-        Stage { checkpoint: Some(self), number }
+    pub fn stage(&self, number: u32) -> Saved<'_> {
+        Saved { checkpoint: Some(self), number }
     }
 
     /// Blocks held.
@@ -318,7 +318,7 @@ mod tests {
         assert!(again.resume().unwrap());
         assert_eq!(again.stage(1).load(7, 3), Some(vec![1, 2, 3]));
         assert_eq!(
-            (again.stage(1).load(7, 4), again.stage(1).load(8, 3), Stage::UNSAVED.load(7, 3)),
+            (again.stage(1).load(7, 4), again.stage(1).load(8, 3), Saved::NOWHERE.load(7, 3)),
             (None, None, None)
         );
         // Due at once: written with each block.

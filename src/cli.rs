@@ -284,7 +284,14 @@ impl Info {
 
 #[cfg(test)]
 mod tests {
-    use super::spelt_out;
+    use super::{Cli, spelt_out};
+    use clap::CommandFactory;
+
+    /// No two options of a verb share a name.
+    #[test]
+    fn verbs_are_sound() {
+        Cli::command().debug_assert();
+    }
 
     #[test]
     fn numbers_are_spelt_out() {

@@ -27,16 +27,16 @@ const SETTLED: f64 = 1e-5;
 
 /// What a place of the lattice should look like.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Wish {
+pub struct FitSample {
     /// Where, local frame.
     pub position: Vec3,
-    /// Light wished for.
+    /// Light that the fit is to have there.
     pub light: Vec3,
     /// How much it counts, among samples of equal |∇h|.
     pub weight: f32,
 }
 
-impl From<&RadianceSample> for Wish {
+impl From<&RadianceSample> for FitSample {
     fn from(s: &RadianceSample) -> Self {
         Self { position: s.position, light: s.radiance, weight: 1.0 }
     }
@@ -93,7 +93,7 @@ impl<'a> GridFit<'a> {
 
     /// Improves `start`, light at the nodes (Shepard's, say). Beside the grid it takes 84 bytes per free node and 114
     /// per sample.
-    pub fn light(&self, samples: &[Wish], mut start: Vec<[f32; 3]>) -> Vec<[f32; 3]> {
+    pub fn light(&self, samples: &[FitSample], mut start: Vec<[f32; 3]>) -> Vec<[f32; 3]> {
         let fitted = self.solve(samples, &|o| Vec3::from_array(start[o]));
         (self.tick)(self.lattice.len() as u64);
         for (o, light) in self.free.members(0..self.lattice.len()).zip(fitted) {
@@ -107,22 +107,22 @@ impl<'a> GridFit<'a> {
     /// samples' errors instead of their light and `start` tells those of the nodes that it started from. From samples
     /// in a cell's corner the fit extrapolates, and enlarges them. It is linear, so errors go through it as light does;
     /// three draws know the variance of one node to about 4/5, that of many nodes' light well.
-    pub(crate) fn variances(&self, errors: &[Wish], start: &(dyn Fn(usize) -> Vec3 + Sync)) -> Vec<f32> {
+    pub(crate) fn variances(&self, errors: &[FitSample], start: &(dyn Fn(usize) -> Vec3 + Sync)) -> Vec<f32> {
         let fitted = self.solve(errors, start);
         fitted.into_iter().map(|draws| draws.length_squared() / 3.0).collect()
     }
 
     /// Improves a grid that blends `samples`, and its standard errors.
     pub(crate) fn improve(&self, grid: &mut IlluminationGrid, samples: Vec<RadianceSample>) {
-        let mut wishes: Vec<Wish> = samples.iter().map(Wish::from).collect();
+        let mut targets: Vec<FitSample> = samples.iter().map(FitSample::from).collect();
         let errors: Vec<f32> = samples.iter().map(|s| s.variance.sqrt()).collect();
         drop(samples);
-        grid.radiance = self.light(&wishes, std::mem::take(&mut grid.radiance));
-        for ((n, wish), &error) in (0..).zip(&mut wishes).zip(&errors) {
-            wish.light = draws(n, error);
+        grid.radiance = self.light(&targets, std::mem::take(&mut grid.radiance));
+        for ((n, target), &error) in (0..).zip(&mut targets).zip(&errors) {
+            target.light = draws(n, error);
         }
         let start = |o: usize| draws((errors.len() + o) as u64, grid.std_error[o]);
-        let variances = self.variances(&wishes, &start);
+        let variances = self.variances(&targets, &start);
         for (o, variance) in self.free.members(0..self.lattice.len()).zip(variances) {
             if grid.std_error[o].is_finite() {
                 grid.std_error[o] = variance.sqrt();
@@ -131,7 +131,7 @@ impl<'a> GridFit<'a> {
     }
 
     /// Light at the nodes that are fitted, in rising order: what `start` tells of all nodes, made to fit the samples.
-    fn solve(&self, samples: &[Wish], start: &(dyn Fn(usize) -> Vec3 + Sync)) -> Vec<Vec3> {
+    fn solve(&self, samples: &[FitSample], start: &(dyn Fn(usize) -> Vec3 + Sync)) -> Vec<Vec3> {
         let Self { field, lattice, free, pull, tick } = *self;
         let sorted = &Sorted::new(field, lattice, samples);
         let [nx, ny, nz] = sorted.dims;
@@ -213,7 +213,7 @@ fn divide(a: DVec3, b: DVec3) -> Vec3 {
 
 impl Sorted {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "cells are clamped, weights are f32")]
-    fn new(field: &Field, lattice: &Lattice, samples: &[Wish]) -> Self {
+    fn new(field: &Field, lattice: &Lattice, samples: &[FitSample]) -> Self {
         let (dims, cells) = (lattice.dims(), lattice.cells());
         let scale = lattice.far() / field.lattice().far();
         let mut placed: Vec<Placed> = samples
@@ -328,11 +328,11 @@ mod tests {
             (squares / 4096.0).sqrt()
         };
         let before = error(&start);
-        let wishes: Vec<Wish> = samples.iter().map(Wish::from).collect();
+        let targets: Vec<FitSample> = samples.iter().map(FitSample::from).collect();
         let free = NodeSet::new(field.lattice().len(), |o| start.mask[o] != Mask::Empty);
         let with = |pull: f32| {
             let fit = GridFit { pull, ..GridFit::new(&field, field.lattice(), &free, &|_| true) };
-            let radiance = fit.light(&wishes, start.radiance.clone());
+            let radiance = fit.light(&targets, start.radiance.clone());
             error(&IlluminationGrid { radiance, ..start.clone() })
         };
         // These samples have no noise.
@@ -353,13 +353,13 @@ mod tests {
             let free = NodeSet::new(lattice.len(), |_| true);
             let mut rng = Rng::stream(3, Stage::Test, 0);
             let mut next = || rng.unit() as f32;
-            let wishes: Vec<Wish> = (0..3000)
+            let targets: Vec<FitSample> = (0..3000)
                 .map(|_| {
                     let position = 6.0 * Vec3::new(next(), next(), next());
-                    Wish { position, light: Vec3::splat(unit * (1.0 + position.y)), weight: 1.0 }
+                    FitSample { position, light: Vec3::splat(unit * (1.0 + position.y)), weight: 1.0 }
                 })
                 .collect();
-            GridFit::new(&field, &lattice, &free, &|_| true).light(&wishes, vec![[0.0; 3]; lattice.len()])
+            GridFit::new(&field, &lattice, &free, &|_| true).light(&targets, vec![[0.0; 3]; lattice.len()])
         };
         let plain = fitted(1.0, 1.0);
         // Nanometres in metres, and as much light as is taken.
@@ -389,19 +389,19 @@ mod tests {
                 )
             })
             .collect();
-        let wishes = |light: &mut dyn FnMut(usize) -> Vec3| -> Vec<Wish> {
-            at.iter().enumerate().map(|(n, &position)| Wish { position, light: light(n), weight: 1.0 }).collect()
+        let targets = |light: &mut dyn FnMut(usize) -> Vec3| -> Vec<FitSample> {
+            at.iter().enumerate().map(|(n, &position)| FitSample { position, light: light(n), weight: 1.0 }).collect()
         };
         let node = |o: usize| 0.03 + 0.02 * (o % 3) as f32;
         let drawn = |o: usize| draws((at.len() + o) as u64, node(o));
         let fit = GridFit::new(&field, &lattice, &free, &|_| true);
-        let said = fit.variances(&wishes(&mut |n| draws(n as u64, errors[n])), &drawn);
+        let said = fit.variances(&targets(&mut |n| draws(n as u64, errors[n])), &drawn);
         let mut normal = |deviation: f32| Vec3::from_array([(); 3].map(|()| 5.0 + deviation * rng.normal() as f32));
         let mut found = vec![0.0; said.len()];
         const FITS: usize = 40;
         for _ in 0..FITS {
             let start = (0..lattice.len()).map(|o| normal(node(o)).to_array()).collect();
-            let light = fit.light(&wishes(&mut |n| normal(errors[n])), start);
+            let light = fit.light(&targets(&mut |n| normal(errors[n])), start);
             for (found, o) in found.iter_mut().zip(free.members(0..lattice.len())) {
                 *found += (Vec3::from_array(light[o]) - 5.0).length_squared() / (3 * FITS) as f32;
             }

@@ -77,9 +77,9 @@ pub fn masks(field: &Field, lattice: &Lattice) -> Vec<Mask> {
     out
 }
 
-/// Points this far outside the sweep, in its units, may hold light of their own,
+/// How far outside the sweep, in its units, points may hold light of their own.
 const OVERSHOOT: f64 = 0.25;
-/// and if h bends less than this there: level sets on a plateau beside a steep edge are dark, and no end to interpolate
+/// How much h may bend at such points: level sets on a plateau beside a steep edge are dark, and no end to interpolate
 /// from.
 const BEND: f64 = 0.8;
 

@@ -105,7 +105,7 @@ impl NodeSet {
             .collect()
     }
 
-    /// Bytes of a set over so many points.
+    /// Bytes of a set over `points` points.
     pub const fn bytes(points: u64) -> u64 {
         points / 4
     }

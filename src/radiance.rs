@@ -1,7 +1,7 @@
 //! Radiance samples: direct light by shadow rays, indirect light from the photon map or by final gather. \[BB09 §2.3\]
 
 use crate::brdf::reflected;
-use crate::checkpoint;
+use crate::checkpoint::Saved;
 use crate::direct::{Receiver, direct_irradiance, luminance};
 use crate::flattened::Side;
 use crate::gather::gathered_irradiance;
@@ -111,7 +111,7 @@ impl<T: Tracer> Sampler<'_, T> {
     /// returning false stops early.
     pub fn samples(&self, positions: &[Vec3], tick: Tick) -> RadianceSamples {
         let place = |n: usize| (n as u64, positions[n]);
-        sample_places(self, positions.len(), &place, checkpoint::Stage::UNSAVED, 0, tick)
+        sample_places(self, positions.len(), &place, Saved::NOWHERE, 0, tick)
     }
 
     /// The sample at `position`, its random numbers keyed by `key`; `None` where ∇h vanishes, no light between a
@@ -172,7 +172,7 @@ impl<T: Tracer> Sampler<'_, T> {
         &self,
         places: &[(u64, Vec3)],
         out: &mut [Option<RadianceSample>],
-        saved: checkpoint::Stage<'_>,
+        saved: Saved<'_>,
         block: usize,
     ) -> [u64; 2] {
         if let Some(bytes) = saved.load(block, 16 + RadianceSample::SAVED * places.len()) {
@@ -196,7 +196,7 @@ pub fn sample_places<T: Tracer>(
     sampler: &Sampler<'_, T>,
     count: usize,
     place: &(dyn Fn(usize) -> (u64, Vec3) + Sync),
-    saved: checkpoint::Stage<'_>,
+    saved: Saved<'_>,
     first: usize,
     tick: Tick,
 ) -> RadianceSamples {

@@ -8,7 +8,7 @@ mod flats;
 mod pools;
 
 use crate::brdf::reflected;
-use crate::checkpoint;
+use crate::checkpoint::Saved;
 use crate::direct::{Receiver, direct_irradiance};
 use crate::field::Field;
 use crate::flat::{self, FlatLight};
@@ -125,14 +125,14 @@ pub struct NodeBand<'a> {
     /// From the lowest to the highest.
     pub range: RangeInclusive<f32>,
     /// Where blocks of the nodes of each side (lower, higher) are kept and looked for.
-    pub saved: [checkpoint::Stage<'a>; 2],
+    pub saved: [Saved<'a>; 2],
     /// The number of the first of these blocks.
     pub first: usize,
 }
 
 impl NodeBand<'_> {
     /// The whole sweep, kept nowhere.
-    pub const WHOLE: Self = NodeBand { range: 0.0..=1.0, saved: [checkpoint::Stage::UNSAVED; 2], first: 0 };
+    pub const WHOLE: Self = NodeBand { range: 0.0..=1.0, saved: [Saved::NOWHERE; 2], first: 0 };
 }
 
 /// Isovalues beyond a band, in units of the sweep, whose cells a hit may be rounded into.
@@ -219,7 +219,8 @@ impl RadianceCache {
         self.nodes.iter_mut().for_each(|n| *n = None);
     }
 
-    /// Which of `points` nodes to store if those are known that `known` picks: these, or all.
+    /// Which of `points` nodes to store if those are known that `known` picks: these, or all where they are so many that
+    /// lookups without their numbers are worth the room.
     pub fn room(points: usize, known: impl Fn(usize) -> bool + Sync) -> NodeSet {
         room(points, &NodeSet::new(points, known))
     }
@@ -375,7 +376,7 @@ impl<T: Tracer> Fill<'_, T> {
         side: Side,
         map: &PhotonMap<'_>,
         before: Option<(&NodeSet, &[[f32; 3]])>,
-        saved: checkpoint::Stage<'_>,
+        saved: Saved<'_>,
     ) -> Vec<[f32; 3]> {
         let mut nodes = vec![[f32::NAN; 3]; self.stored.len()];
         let known = |o: usize| {

@@ -48,7 +48,7 @@ mod solid;
 mod state;
 mod totals;
 
-use crate::checkpoint::Stage;
+use crate::checkpoint::Saved;
 use crate::error::{Error, Result};
 use crate::flat::FlatLight;
 use crate::flattened::Side;
@@ -245,7 +245,7 @@ fn numbered([nx, ny, nz]: [usize; 3]) -> bool {
 /// volume, if there are more than [`MOST_POLYGONS`], or about 2³¹ points or more, and for the inside of capped solids
 /// if there may be light in it: that needs the photon engine.
 pub fn sweep(scene: &Scene, settings: &SweepSettings, tick: &(dyn Fn(f64) -> bool + Sync)) -> Result<SweepResult> {
-    sweep_resumable(scene, settings, Stage::UNSAVED, tick)
+    sweep_resumable(scene, settings, Saved::NOWHERE, tick)
 }
 
 /// As [`sweep`], keeping what is finished in `saved` (whole passes, whenever the checkpoint is due or `tick` ends the
@@ -256,7 +256,7 @@ pub fn sweep(scene: &Scene, settings: &SweepSettings, tick: &(dyn Fn(f64) -> boo
 pub fn sweep_resumable(
     scene: &Scene,
     settings: &SweepSettings,
-    saved: Stage,
+    saved: Saved,
     tick: &(dyn Fn(f64) -> bool + Sync),
 ) -> Result<SweepResult> {
     supported(scene)?;
@@ -348,7 +348,7 @@ struct Run<'a> {
     mirror: Mirror<'a>,
     sides: &'a [Side],
     isa: Isa,
-    saved: Stage<'a>,
+    saved: Saved<'a>,
     spare: &'a Spare,
 }
 

@@ -3,10 +3,10 @@
 
 use super::bands::Band;
 use crate::brdf::reflected;
-use crate::checkpoint;
+use crate::checkpoint::Saved;
 use crate::direct::luminance;
 use crate::field::Field;
-use crate::fitted_grid::{GridFit, Wish, draws};
+use crate::fitted_grid::{FitSample, GridFit, draws};
 use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, local_position, own_light, stand_ins};
@@ -170,7 +170,7 @@ impl<'a> GridPoints<'a> {
         band: Band,
         light: &mut PointLight,
         apart: &(dyn Fn(usize) -> bool + Sync),
-        saved: checkpoint::Stage<'_>,
+        saved: Saved<'_>,
         tick: Tick,
     ) -> Counts {
         let PointLight { grid, halves, direct } = light;
@@ -391,7 +391,7 @@ impl<'a> Beside<'a> {
         sampler: &Sampler<'_, T>,
         band: Band,
         light: &mut [BesideLight],
-        saved: checkpoint::Stage<'_>,
+        saved: Saved<'_>,
         tick: Tick,
     ) -> Counts {
         let isovalue = |n: usize| (self.field.value(self.positions[n].as_dvec3()) as f32).clamp(0.0, 1.0);
@@ -461,9 +461,9 @@ impl<'a> Beside<'a> {
             start += run.len();
         }
         let free = NodeSet::new(self.lattice.len(), |o| grid.mask[o] == Mask::Filled && lit.binary_search(&o).is_ok());
-        let wishes = |wish: &(dyn Fn(usize) -> Vec3 + Sync)| -> Vec<Wish> {
+        let targets = |target: &(dyn Fn(usize) -> Vec3 + Sync)| -> Vec<FitSample> {
             let places = self.positions.par_iter().enumerate().filter(|(n, _)| light[*n].variance >= 0.0);
-            places.map(|(n, &position)| Wish { position, light: wish(n), weight: 1.0 }).collect()
+            places.map(|(n, &position)| FitSample { position, light: target(n), weight: 1.0 }).collect()
         };
         let places = self.len() as u64;
         let before = |o: usize| match free.slot(o) {
@@ -471,12 +471,12 @@ impl<'a> Beside<'a> {
             None => draws(places + o as u64, grid.std_error[o]),
         };
         let fit = GridFit::new(self.field, self.lattice, &free, &|_| true);
-        let variances = fit.variances(&wishes(&own), &before);
+        let variances = fit.variances(&targets(&own), &before);
         for ((o, variance), (_, common)) in lit.into_iter().zip(variances).zip(errors) {
             grid.std_error[o] = (variance + common).sqrt();
         }
-        let wishes = wishes(&|n| light[n].radiance);
-        grid.radiance = fit.light(&wishes, grid.radiance);
+        let targets = targets(&|n| light[n].radiance);
+        grid.radiance = fit.light(&targets, grid.radiance);
         grid.split = grid.split.map(|split| self.fit_parts(scene, side, split, light, &free));
         grid
     }
@@ -489,12 +489,16 @@ impl<'a> Beside<'a> {
             places.map(|(position, l)| Parts::new(scene, position.as_dvec3(), side, l.radiance, l.direct)).collect();
         let full = parts.iter().map(|parts| luminance(parts.open)).fold(f64::MIN_POSITIVE, f64::max);
         let places = self.positions.par_iter().zip(light).zip(parts).with_min_len(1024);
-        let parts: Vec<[Wish; 2]> = places
+        let parts: Vec<[FitSample; 2]> = places
             .map(|((&position, l), parts)| {
                 let lit = if l.variance >= 0.0 { 1.0 } else { 0.0 };
                 #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
                 let counts = lit * (luminance(parts.open) / full).powi(2) as f32;
-                [(parts.indirect, lit), (parts.visible, counts)].map(|(light, weight)| Wish { position, light, weight })
+                [(parts.indirect, lit), (parts.visible, counts)].map(|(light, weight)| FitSample {
+                    position,
+                    light,
+                    weight,
+                })
             })
             .collect();
         let Split { mut indirect, mut visible } = split;
@@ -512,8 +516,8 @@ impl<'a> Beside<'a> {
             start += run.len();
         }
         let fitted = |n: usize, start| {
-            let wishes: Vec<Wish> = parts.par_iter().map(|parts| parts[n]).filter(|w| w.weight > 0.0).collect();
-            GridFit::new(self.field, self.lattice, free, &|_| true).light(&wishes, start)
+            let targets: Vec<FitSample> = parts.par_iter().map(|parts| parts[n]).filter(|w| w.weight > 0.0).collect();
+            GridFit::new(self.field, self.lattice, free, &|_| true).light(&targets, start)
         };
         let (indirect, mut visible) = (fitted(0, indirect), fitted(1, visible));
         let shares = visible.as_flattened_mut().par_iter_mut().with_min_len(1 << 14);

@@ -6,7 +6,7 @@ use super::{BakeSettings, Engine, Interpolation, MOST_BANDS, StrategyName};
 use crate::checkpoint;
 use crate::embree::{Device, GraphTracer};
 use crate::error::{Error, Result};
-use crate::fitted_grid::Wish;
+use crate::fitted_grid::FitSample;
 use crate::flat;
 use crate::flattened::Side;
 use crate::irradiance_caching;
@@ -46,8 +46,8 @@ const CACHING: u64 = 12 + 16 + irradiance_caching::BYTES;
 const PLACE: u64 = 12 + 8 + 4;
 const BESIDE: u64 = size_of::<BesideLight>() as u64;
 
-/// Bytes of them while they are fitted: the wish, and sorted by cells with what cells say. Smoothing before takes 80.
-const WISH: u64 = size_of::<Wish>() as u64;
+/// Bytes of them while they are fitted: the sample, and sorted by cells with what cells say. Smoothing before takes 80.
+const FITTED_SAMPLE: u64 = size_of::<FitSample>() as u64;
 const SORTED: u64 = 40 + 40 + 12;
 
 /// Bytes per point and side of a grid (radiance, standard error, mask), of light that is split, and the direct
@@ -223,7 +223,7 @@ struct Parts {
     beside: u64,
     filled: u64,
     /// What each place is fitted to.
-    wishes: u64,
+    fitted: u64,
     /// Samples of all sides.
     samples: u64,
     /// Scattered samples and their interpolation.
@@ -373,7 +373,7 @@ impl Parts {
             voxels,
             points,
             grids: side_points * (GRID + if settings.split { SPLIT } else { 0 }),
-            wishes: if settings.split { 3 * WISH } else { WISH },
+            fitted: if settings.split { 3 * FITTED_SAMPLE } else { FITTED_SAMPLE },
             gathered: stored * (known * CACHED + places * DONE_SIDE) + known * CACHED,
             halves: census.halves,
             slices: census.slices,
@@ -400,7 +400,7 @@ impl Parts {
         let cache = 12 * if self.cached > 0 { stored } else { 0 };
         let sets = 4 * NodeSet::bytes(self.voxels) + NodeSet::bytes(2 * self.points);
         let Self { base, flats, photons, maps, grids, halves, beside, .. } = *self;
-        let fitting = beside * (self.wishes + SORTED) + self.filled * FITTED;
+        let fitting = beside * (self.fitted + SORTED) + self.filled * FITTED;
         let light = base + flats + grids + beside * (PLACE + BESIDE);
         let bands = bands.len() as u64;
         let waiting = checkpoint::MOST_WAITING as u64;

@@ -3,9 +3,8 @@
 use super::bands::{Band, Levels, REACH};
 use super::contacts::{Contacts, Wedge};
 use super::grid_points::{Beside, BesideLight, Counts, GridPoints, PointLight, rays_beside};
-use super::{BakeSettings, Interpolation, Lit, PhotonCounts, stages};
-use crate::checkpoint::Checkpoint;
-use crate::embree::{Device, GraphTracer, pyramids};
+use super::{BakeSettings, Context, Interpolation, Lit, PhotonCounts};
+use crate::embree::{GraphTracer, pyramids};
 use crate::error::{Error, Result};
 use crate::fitted_grid::GridFit;
 use crate::flat;
@@ -16,7 +15,7 @@ use crate::isovalue_axis::IsovalueAxis;
 use crate::mask::Mask;
 use crate::node_set::NodeSet;
 use crate::photon::trace_photons;
-use crate::progress::{Clock, Progress, Tick};
+use crate::progress::{Clock, Tick};
 use crate::radiance::{BLOCK, Indirect, RadianceSample, Sampler, sample_places};
 use crate::radiance_cache::{NodeBand, NodePhotons, RadianceCache};
 use crate::sampling::{Strategy, positions};
@@ -35,13 +34,8 @@ pub(super) struct Job {
 }
 
 /// Lights the fields of one 4D scene, `jobs` by number: the same photons, walls and cache serve all.
-pub(super) fn light(
-    jobs: &[Job],
-    settings: &BakeSettings,
-    device: &Device,
-    progress: Progress,
-    checkpoint: Option<&Checkpoint>,
-) -> Result<Lit> {
+pub(super) fn light(jobs: &[Job], context: Context) -> Result<Lit> {
+    let Context { settings, device, progress, .. } = context;
     let mut lit = Lit::default();
     let clock = Clock::start();
     let first = &jobs[0].scene;
@@ -93,7 +87,7 @@ pub(super) fn light(
         let begun = Instant::now();
         let clock = Clock::start();
         for ((job, tracer), source) in jobs.iter().zip(&tracers).zip(&sources).filter(|_| gather) {
-            let saved = stages(checkpoint, STAGES * job.number);
+            let saved = context.saved(job.number, 0);
             let first = band.number * RadianceCache::blocks(&job.scene);
             let nodes = NodeBand { range: band.range(), saved, first };
             cache.fill(&job.scene, tracer, source, &cache_settings, nodes, &|n| stage.tick(n * node));
@@ -101,7 +95,7 @@ pub(super) fn light(
         lit.spend(clock, |s| &mut s.cache);
         let clock = Clock::start();
         for ((field, tracer), source) in fields.iter_mut().zip(&tracers).zip(&sources) {
-            let counts = field.sample(band, tracer, (&cache, source), settings, checkpoint, &|n| stage.tick(n));
+            let counts = field.sample(band, tracer, (&cache, source), context, &|n| stage.tick(n));
             lit.counts += counts;
         }
         lit.spend(clock, |s| &mut s.samples);
@@ -128,9 +122,6 @@ pub(super) fn light(
     lit.flats = cache.into_shown_flats();
     Ok(lit)
 }
-
-/// Stages of a checkpoint that a field has: per side the cache's, the points', and the places' beside them.
-pub(super) const STAGES: u32 = 6;
 
 /// The light of one field while it is gathered.
 struct FieldLight<'a> {
@@ -208,10 +199,10 @@ impl<'a> FieldLight<'a> {
         band: Band,
         tracer: &GraphTracer<'_>,
         (cache, source): (&RadianceCache, &NodePhotons<'_>),
-        settings: &BakeSettings,
-        checkpoint: Option<&Checkpoint>,
+        context: Context,
         tick: Tick,
     ) -> Counts {
+        let settings = context.settings;
         let Job { scene, number, .. } = self.job;
         let mut counts = Counts::default();
         for SideLight { side, points, scattered } in &mut self.sides {
@@ -220,7 +211,7 @@ impl<'a> FieldLight<'a> {
             let rays @ [gather_rays, shadow_rays] = [settings.gather_rays, settings.shadow_rays];
             let (gathered, seed, each) = (indirect(gather_rays), settings.seed, rays_of(rays));
             let sampler = Sampler { scene, tracer, indirect: &gathered, side: *side, shadow_rays, seed };
-            let saved = |kind: u32| stages(checkpoint, STAGES * number + kind)[side.index()];
+            let saved = |kind: u32| context.saved(*number, kind)[side.index()];
             match (&self.places, points) {
                 (Places::Grid(grid, beside, contacts), Some((at_points, at_beside))) => {
                     let apart = |o: usize| contacts.holds(o);

@@ -4,18 +4,18 @@
 use super::bands::Band;
 use super::contacts::{Contacts, Wedge};
 use super::grid_points::{Beside, Counts, STAND_INS, rays_beside, split};
-use super::photon_engine::{Job, STAGES};
-use super::{BakeSettings, Lit, stages};
+use super::photon_engine::Job;
+use super::{Context, Lit};
 use crate::brdf::reflected;
-use crate::checkpoint::{Checkpoint, Stage};
-use crate::embree::{Device, GraphTracer};
+use crate::checkpoint::Saved;
+use crate::embree::GraphTracer;
 use crate::error::Result;
 use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, local_position};
 use crate::neighbourhood::neighbourhood;
 use crate::node_set::NodeSet;
-use crate::progress::{Clock, Progress};
+use crate::progress::Clock;
 use crate::radiance::{Indirect, Sampler, sample_places};
 use crate::radiance_cache::RadianceCache;
 use crate::scene::{Scene, Surface};
@@ -31,13 +31,8 @@ const STEPS: f64 = 1000.0;
 /// voxel, and what lies behind it is lit by lines that a sweep mixes a voxel further.
 const NEAR: f64 = 1.5;
 
-pub(super) fn light(
-    Job { number, scene, lattice, masks }: &Job,
-    settings: &BakeSettings,
-    device: &Device,
-    progress: Progress,
-    checkpoint: Option<&Checkpoint>,
-) -> Result<Lit> {
+pub(super) fn light(Job { number, scene, lattice, masks }: &Job, context: Context) -> Result<Lit> {
+    let Context { settings, device, progress, .. } = context;
     let mut lit = Lit::default();
     // Sweeps light the lattice they run on: a finer grid is a finer copy of the same field.
     let fine;
@@ -50,7 +45,7 @@ pub(super) fn light(
     let clock = Clock::start();
     let stage = progress.stage("sweep", STEPS as u64);
     let done = std::sync::atomic::AtomicU64::new(0);
-    let [saved, _] = stages(checkpoint, STAGES * number);
+    let [saved, _] = context.saved(*number, 0);
     let swept = sweep_resumable(scene, &settings.sweep(), saved, &|fraction| {
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 … 1000")]
         let now = (fraction * STEPS) as u64;
@@ -86,7 +81,7 @@ pub(super) fn light(
         let [gather_rays, shadow_rays] = rays_beside(rays);
         let (indirect, seed) = (Indirect::Gather(&cache, gather_rays), settings.seed);
         let sampler = Sampler { scene, tracer: &tracer, indirect: &indirect, side: s.side, shadow_rays, seed };
-        let saved = stages(checkpoint, STAGES * number + 4)[s.side.index()];
+        let saved = context.saved(*number, 4)[s.side.index()];
         let mut light = beside.dark();
         let counts = beside.sample(&sampler, Band::WHOLE, &mut light, saved, &|n| stage.tick(n));
         lit.counts += counts;
@@ -95,7 +90,7 @@ pub(super) fn light(
         let sampler = Sampler { indirect: &indirect, shadow_rays, ..sampler };
         // Keys of a point beside; none of these is one.
         let place = |n: usize| ((STAND_INS * near[n]) as u64, local_position(&scene.field, lattice, near[n]).as_vec3());
-        let sampled = sample_places(&sampler, near.len(), &place, Stage::UNSAVED, 0, &|n| stage.tick(n));
+        let sampled = sample_places(&sampler, near.len(), &place, Saved::NOWHERE, 0, &|n| stage.tick(n));
         lit.counts += Counts::from(&sampled);
         let mut grid = swept_grid((&own, masks), outgoing(scene, &own, s.irradiance), s.std_error);
         for (&o, sample) in near.iter().zip(&sampled.samples) {

@@ -188,9 +188,9 @@ fn timed_sweep(scene: &Scene, pilot: &SweepSettings) -> Result<SweepParts> {
 struct SweepParts {
     /// Once: reading the field before, and writing the result behind.
     once: f64,
-    /// A replicate's luminaire points on the lattice,
+    /// A replicate's luminaire points on the lattice.
     points: f64,
-    /// and on walls.
+    /// A replicate's luminaire points on walls.
     walls: f64,
     /// A pass without its directions; what goes before the first one is about the same.
     pass: f64,

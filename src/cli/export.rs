@@ -29,7 +29,8 @@ pub(super) struct Export {
     /// The array to write (default: radiance of a bake, the scalars of a volume)
     #[arg(long, value_name = "NAME")]
     array: Option<String>,
-    /// What the world's axes mean, for a .nrrd or .vti: lps, ras or las (default: as the volume's own file said)
+    /// What the world's axes mean, for a .nrrd or .vti: lps, ras or las (default: as the volume's own file said);
+    /// nothing is turned
     #[arg(long, value_name = "SPACE")]
     space: Option<String>,
     #[command(flatten)]

@@ -10,8 +10,9 @@ use super::Kind;
 pub(crate) trait Work {
     type Output;
 
-    /// Does it. What is always inlined into this, as this must be itself, is compiled for the set, what it only calls
-    /// is not: closures that the library calls (`map`, `from_fn`) are either.
+    /// Does it. Implementations, and what is to be vectorised in them, are `#[inline(always)]`: only code that is inlined
+    /// here is compiled for the instruction set; functions that are called, and closures that the standard library
+    /// calls (`map`, `from_fn`), may not be.
     fn work(self) -> Self::Output;
 }
 

@@ -75,17 +75,17 @@ pub(super) struct PhotonDensity<'a> {
 /// Radii in bins: the least, which reaches the next bins, the largest.
 const LEAST: f32 = 1.05;
 const MOST: f32 = 5.0;
-/// Bins one after the other want radii that are alike: photons are first counted in so many times the radius of the bin
-/// before,
+/// Photons are first counted within this times the radius of the bin before: neighbours want radii that are alike.
 const MARGIN: f32 = 1.15;
-/// in runs of so many bins, so that the threads' number does not tell, the first of which has none before it.
+/// Bins in a run. Each run begins anew, so that results do not depend on the number of threads …
 const RUN: usize = 512;
+/// … with this radius, in bins, since its first bin has none before it.
 const FIRST: f32 = 1.75;
 /// What radii grow by where bins are few.
 const WIDER: f32 = 1.5;
-/// Photons of an estimate per photon of a bin, and how many photons bins are meant to hold on average. Fewer would take
-/// longer to fit than to trace.
+/// Photons of an estimate per photon of a bin.
 const SHARE: f64 = 8.0;
+/// How many photons bins are meant to hold on average, least and most. Fewer would take longer to fit than to trace.
 const FILL: [f64; 2] = [4.0, 8.0];
 
 /// Bins one after the other whose light is to be found.

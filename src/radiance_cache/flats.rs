@@ -17,10 +17,10 @@ use glam::DVec3;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// So many times as many shadow rays go from texels beside which a luminaire is seen in part as from others: pictures
-/// show their noise, which gathers average.
+/// Factor on the shadow rays of texels beside which a luminaire is seen in part: pictures show their noise, which
+/// gathers average.
 const PENUMBRA: u32 = 4;
-/// Of fewer than these it is so many times these.
+/// Least shadow rays to which that factor applies.
 const LEAST_FEW: u32 = 32;
 
 /// A flat's textures; `None` of what reflects nothing.

@@ -135,10 +135,22 @@ pub struct RawOptions {
     #[arg(long = "raw-endian", value_name = "ORDER")]
     pub endian: Option<String>,
     /// World distance between samples of a headerless file, negative where an axis is flipped (default: 1,1,1)
-    #[arg(long = "raw-spacing", value_name = "DX,DY,DZ", value_delimiter = ',', allow_hyphen_values = true)]
+    #[arg(
+        id = "raw-spacing",
+        long = "raw-spacing",
+        value_name = "DX,DY,DZ",
+        value_delimiter = ',',
+        allow_hyphen_values = true
+    )]
     pub spacing: Option<Vec<f64>>,
     /// World position of the first sample of a headerless file (default: 0,0,0)
-    #[arg(long = "raw-origin", value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true)]
+    #[arg(
+        id = "raw-origin",
+        long = "raw-origin",
+        value_name = "X,Y,Z",
+        value_delimiter = ',',
+        allow_hyphen_values = true
+    )]
     pub origin: Option<Vec<f64>>,
     /// Bytes to skip at the start of a headerless file (default: 0)
     #[arg(long = "raw-skip", value_name = "BYTES")]

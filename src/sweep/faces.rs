@@ -39,8 +39,8 @@ pub(super) fn inwards(j: usize, n: usize) -> isize {
 }
 
 /// The two lines along u around node `i` of `nu`, and the weights of the second and of the row before, as
-/// [`super::accumulate`] has them: on a side the first is nearer, and light `goes_on` linearly from both or stays what
-/// it is there. `line0` is the line just beyond node 0, −1 of which is missing.
+/// [`super::accumulate`] has them: on a side the first is nearer, and light is extrapolated linearly from both
+/// (`goes_on`) or clamped. `line0` is the line just beyond node 0, −1 of which is missing.
 #[inline(always)]
 pub(super) fn around(
     (i, nu): (usize, usize),

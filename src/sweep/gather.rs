@@ -53,12 +53,19 @@ type Row<'a> = [&'a mut [f32]; 3];
 /// Rows of nodes in memory, each of which one row of lines of a family adds to.
 type Rows<'a> = Vec<Mutex<Row<'a>>>;
 
+/// What a row of lines brings.
+#[derive(Default)]
+struct LineRow {
+    light: RowLight,
+    gaps: RowGaps,
+    ends: RowEnds,
+}
+
 /// What a thread needs beside its rows.
 pub(super) struct Workspace {
     pack: Pack,
-    light: [RowLight; 2],
-    gaps: [RowGaps; 2],
-    ends: [RowEnds; 2],
+    /// A row of lines and the one before it, by turns.
+    lines: [LineRow; 2],
     /// Slice and place along v of the rows of nodes beside a row of lines.
     nodes: Vec<[usize; 2]>,
 }
@@ -278,19 +285,15 @@ impl Pass<'_> {
         let plan = family.plan;
         let size = plan.shear.layout.dims[2] * plan.width;
         let spare = self.workspaces.lock().expect("no thread panics").pop();
-        let empty = || Workspace {
-            pack: Pack::with_rows(0),
-            light: Default::default(),
-            gaps: Default::default(),
-            ends: Default::default(),
-            nodes: Vec::new(),
-        };
+        let empty = || Workspace { pack: Pack::with_rows(0), lines: Default::default(), nodes: Vec::new() };
         let mut work = spare.unwrap_or_else(empty);
         work.pack.fit(plan.shear.layout.dims[2]);
-        work.light.iter_mut().flatten().for_each(|l| l.resize(size, 0.0));
-        work.ends.iter_mut().flatten().for_each(|ends| ends.resize(plan.width, 0));
         let packs = if family.source.gaps { size / LANES } else { 0 };
-        work.gaps.iter_mut().for_each(|g| g.resize(packs, 0));
+        for row in &mut work.lines {
+            row.light.iter_mut().for_each(|l| l.resize(size, 0.0));
+            row.ends.iter_mut().for_each(|ends| ends.resize(plan.width, 0));
+            row.gaps.resize(packs, 0);
+        }
         let mut walked = None;
         while let Some(n) = runs.next(own) {
             let q = lines[n];
@@ -302,15 +305,12 @@ impl Pass<'_> {
             }
             let mut arrivals = arrivals[n].lock().expect("no thread panics");
             self.row_of_lines(family, q, &mut work, n % 2, Some(&mut arrivals));
-            let (this, before) = (n % 2, 1 - n % 2);
-            let light = [&work.light[this], &work.light[before]];
-            let gaps = [&work.gaps[this], &work.gaps[before]];
-            let ends = [&work.ends[this], &work.ends[before]];
+            let around = [&work.lines[n % 2], &work.lines[1 - n % 2]];
             let mut coming = nodes.first().map(|&at| self.ask(family, rows, at));
             for (i, &at) in nodes.iter().enumerate() {
                 let next = nodes.get(i + 1).map(|&at| self.ask(family, rows, at));
                 let row = std::mem::replace(&mut coming, next);
-                self.accumulate(family, (light, gaps, ends), &mut row.expect("asked for before"), at);
+                self.accumulate(family, around, &mut row.expect("asked for before"), at);
             }
             work.nodes = nodes;
             walked = Some(q);
@@ -328,7 +328,7 @@ impl Pass<'_> {
         mut arrivals: Option<&mut Arrivals>,
     ) {
         let plan = family.plan;
-        let pack = &mut work.pack;
+        let (pack, row) = (&mut work.pack, &mut work.lines[which]);
         let within = q >= plan.first[1] && q < plan.first[1] + plan.count[1] as isize;
         if within {
             pack.begin(plan, &family.source, q);
@@ -340,13 +340,13 @@ impl Pass<'_> {
                 if family.way.capped && family.way.strict {
                     pack.lasts = [[0; LANES]; 2];
                 }
-                note(pack, &mut work.ends[which], start);
+                note(pack, &mut row.ends, start);
                 let light = family.light();
                 let place = (plan.width, start);
-                self.isa.scan(pack, family.way, light, &mut work.light[which], place);
+                self.isa.scan(pack, family.way, light, &mut row.light, place);
                 if family.source.gaps {
-                    let (light, out) = ((family.way, light, family.back), &mut work.light[which]);
-                    self.isa.look_through_gaps(pack, light, out, &mut work.gaps[which], place);
+                    let light = (family.way, light, family.back);
+                    self.isa.look_through_gaps(pack, light, &mut row.light, &mut row.gaps, place);
                 }
             }
             if let Some(arrivals) = &mut arrivals {
@@ -372,13 +372,7 @@ impl Pass<'_> {
 
     /// Adds what a row of lines and the one before it brought to a row of nodes: each node takes its four nearest lines
     /// by bilinear weights, which go on linearly on Ω's faces ([`inwards`]), times the cosine of its own normal.
-    fn accumulate(
-        &self,
-        family: &Family,
-        (light, gaps, ends): ([&RowLight; 2], [&RowGaps; 2], [&RowEnds; 2]),
-        row: &mut Row,
-        [k, j]: [usize; 2],
-    ) {
+    fn accumulate(&self, family: &Family, around: [&LineRow; 2], row: &mut Row, [k, j]: [usize; 2]) {
         let plan = family.plan;
         let layout = &plan.shear.layout;
         let [nu, nv, _] = layout.dims;
@@ -388,12 +382,12 @@ impl Pass<'_> {
         let (whole, fu) = plan.shift[0][k];
         let line0 = (-whole - plan.first[0]).unsigned_abs();
         let light: [[&[f32]; 3]; 2] =
-            light.map(|light| std::array::from_fn(|c| &light[c][k * plan.width..][..plan.width]));
+            around.map(|lines| std::array::from_fn(|c| &lines.light[c][k * plan.width..][..plan.width]));
         let at = k * layout.stride[1] + j * layout.stride[0];
         // Normals and light of the row's run, from its first node on.
         let (first, run) = self.geometry.lit_rows_of(layout).run(at / nu);
         let n = &family.normals[run];
-        let gaps = gaps.map(|gaps| gaps.get(k * plan.width / LANES..).unwrap_or_default());
+        let gaps = around.map(|lines| lines.gaps.get(k * plan.width / LANES..).unwrap_or_default());
         let rims = self.geometry.rims(layout);
         let lit = self.geometry.lit_blocks(layout);
         let [e0, e1, e2] = row;
@@ -402,7 +396,7 @@ impl Pass<'_> {
             row: [j, k],
             slope: plan.shear.slope,
             light,
-            ends,
+            ends: around.map(|lines| &lines.ends),
             line0,
             weights: [fu, fv],
             goes_on: family.goes_on,

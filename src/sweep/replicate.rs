@@ -183,72 +183,88 @@ impl Run<'_> {
             if self.saved.due() {
                 self.saved.save(0, || state.bytes(Some(&now), flats));
             }
-            let kind = self.kind(&now);
-            if kind == Kind::Late && now.corrected {
-                now.late = LATE - 1;
-                now.defect = Vec::new();
-                flats.no_defect();
-            }
-            let lines = self.lines(kind, &now, state.done());
-            let few = if kind == Kind::Level { self.lines(Kind::Coarse, &now, state.done()) } else { Vec::new() };
-            let more = if kind == Kind::Late && now.late + 1 == LATE { 0.0 } else { 3.0 };
-            let total = (few.len() + lines.len()) * self.sides.len();
-            let bounce = now.bounce + 1;
-            let mut family = 0;
-            let mut ask = || {
-                family += 1;
-                let passes = bounce as f64 - 1.0 + f64::from(family) / total as f64;
-                progress(passes / (bounce as f64 + more))
-            };
-            let by_few = if few.is_empty() {
-                None
-            } else {
-                let Some(received) = self.bounce(&pass, &now.light, (&few, false), flats, &mut ask) else {
+            match self.pass(&pass, state, &mut now, flats, progress) {
+                Some(received) if now.late == LATE || now.bounce == s.max_bounces => {
+                    indirect = received;
+                    break;
+                }
+                Some(received) => self.spare.keep(received.into_iter().flatten()),
+                None => {
                     self.saved.save(0, || state.bytes(Some(&now), flats));
                     return None;
-                };
-                let nodes: Vec<_> = received.iter().map(|e| HalfPlanes::new(e, 1.0, None)).collect();
-                self.spare.keep(received.into_iter().flatten());
-                Some((nodes, flats.indirect()))
-            };
-            // What goes on linearly may grow from bounce to bounce where light is rough, and what is nearest cannot:
-            // until light has settled, that does.
-            let goes_on = kind != Kind::Coarse;
-            let Some(received) = self.bounce(&pass, &now.light, (&lines, goes_on), flats, &mut ask) else {
-                self.saved.save(0, || state.bytes(Some(&now), flats));
-                return None;
-            };
-            now.bounce = bounce;
-            state.counts.families += total as u64;
-            state.counts.gather_rays += state.counts.valid * total as u64;
-            let settles = matches!(kind, Kind::Coarse | Kind::Level);
-            if kind == Kind::Level {
-                now.settling.again();
+                }
             }
-            let omega = now.settling.omega();
-            let settling = if settles {
-                Some((omega, flats.settle(omega, self.mirror.black())))
-            } else {
-                now.late += usize::from(kind == Kind::Late);
-                now.settling.since += 1;
-                flats.reflect(true);
-                None
-            };
-            if now.late == LATE || bounce == s.max_bounces {
-                indirect = received;
-                break;
-            }
-            self.reflect(state, &mut now, flats, &received, settling);
-            if let Some((nodes, flats_by_few)) = by_few {
-                // (T − T₁) x₁. [Stetter78]
-                now.defect = nodes.into_iter().zip(&received).map(|(few, all)| few.short_of(all)).collect();
-                flats.correct(flats_by_few);
-                (now.corrected, now.late) = (true, 0);
-            }
-            self.spare.keep(received.into_iter().flatten());
         }
         state.see(&now);
         Some(indirect)
+    }
+
+    /// One pass, and what nodes and flats reflect of it unless it is the last. Returns what nodes received; `None` if
+    /// `progress` stopped it: then it can be repeated.
+    fn pass(
+        &self,
+        pass: &Pass,
+        state: &mut State,
+        now: &mut Passes,
+        flats: &mut Flats,
+        progress: &dyn Fn(f64) -> bool,
+    ) -> Option<Vec<Planes>> {
+        let s = self.settings;
+        let kind = self.kind(now);
+        if kind == Kind::Late && now.corrected {
+            now.late = LATE - 1;
+            now.defect = Vec::new();
+            flats.no_defect();
+        }
+        let lines = self.lines(kind, now, state.done());
+        let few = if kind == Kind::Level { self.lines(Kind::Coarse, now, state.done()) } else { Vec::new() };
+        let more = if kind == Kind::Late && now.late + 1 == LATE { 0.0 } else { 3.0 };
+        let total = (few.len() + lines.len()) * self.sides.len();
+        let bounce = now.bounce + 1;
+        let mut family = 0;
+        let mut ask = || {
+            family += 1;
+            let passes = bounce as f64 - 1.0 + f64::from(family) / total as f64;
+            progress(passes / (bounce as f64 + more))
+        };
+        let by_few = if few.is_empty() {
+            None
+        } else {
+            let received = self.bounce(pass, &now.light, (&few, false), flats, &mut ask)?;
+            let nodes: Vec<_> = received.iter().map(|e| HalfPlanes::new(e, 1.0, None)).collect();
+            self.spare.keep(received.into_iter().flatten());
+            Some((nodes, flats.indirect()))
+        };
+        // What goes on linearly may grow from bounce to bounce where light is rough, and what is nearest cannot: until
+        // light has settled, that does.
+        let goes_on = kind != Kind::Coarse;
+        let received = self.bounce(pass, &now.light, (&lines, goes_on), flats, &mut ask)?;
+        now.bounce = bounce;
+        state.counts.families += total as u64;
+        state.counts.gather_rays += state.counts.valid * total as u64;
+        if kind == Kind::Level {
+            now.settling.again();
+        }
+        let omega = now.settling.omega();
+        let settling = if matches!(kind, Kind::Coarse | Kind::Level) {
+            Some((omega, flats.settle(omega, self.mirror.black())))
+        } else {
+            now.late += usize::from(kind == Kind::Late);
+            now.settling.since += 1;
+            flats.reflect(true);
+            None
+        };
+        if now.late == LATE || bounce == s.max_bounces {
+            return Some(received);
+        }
+        self.reflect(state, now, flats, &received, settling);
+        if let Some((nodes, flats_by_few)) = by_few {
+            // (T − T₁) x₁. [Stetter78]
+            now.defect = nodes.into_iter().zip(&received).map(|(few, all)| few.short_of(all)).collect();
+            flats.correct(flats_by_few);
+            (now.corrected, now.late) = (true, 0);
+        }
+        Some(received)
     }
 
     /// Irradiance of each side's nodes by one bounce along all `lines`, beyond whose last ones it `goes_on` linearly or

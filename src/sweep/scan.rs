@@ -49,8 +49,8 @@ impl Pack {
     /// For every sample, the radiance that its ray meets which leaves downhill: B where h is first back at the sample's
     /// value, or what stands at the end. \[BSV93: all nearest greater values, one line per lane\]
     ///
-    /// Uphill the ray of the same line runs inside the solid; which way is downhill tells the neighbouring samples, as
-    /// the receiver normal does. Writes slice k to `out` at k · width + start.
+    /// Uphill the ray of the same line runs inside the solid. Whether downhill is +τ or −τ is decided by the samples
+    /// beside it, as the receiver normal is. Writes slice k to `out` at k · width + start.
     pub(super) fn scan(&mut self, way: Way, light: Light, out: &mut [Vec<f32>], place: (usize, usize)) {
         self.link(way, true);
         self.link(way, false);

@@ -12,8 +12,8 @@ use glam::DVec3;
 use rayon::prelude::*;
 use std::f32::consts::PI;
 
-/// One node of so many tells how much better replicates are together: of 16, and not more than 65 536 to 131 071 in
-/// all.
+/// Of every `stride`th node all replicates are kept, to estimate how much better than independent ones they are
+/// together: of 65 536 to 131 071 of many nodes, of a sixteenth of fewer.
 pub(super) fn stride(nodes: usize) -> usize {
     (nodes >> 16).max(16)
 }

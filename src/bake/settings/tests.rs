@@ -58,3 +58,13 @@ fn options_without_effect_are_named() {
     let smoothed = BakeOptions { smoothing: Some(true), ..BakeOptions::default() };
     assert_eq!(idle(&smoothed, Engine::Photon), "");
 }
+
+#[test]
+fn counts_may_have_exponents() {
+    for (text, n) in [("12", 12), ("1e6", 1_000_000), ("2.5e3", 2500), ("0", 0), ("18446744073709551615", u64::MAX)] {
+        assert_eq!(count(text), Ok(n), "{text}");
+    }
+    for text in ["", "1.5", "-1", "-1e3", "1e16", "nan", "inf", "1e"] {
+        assert!(count(text).is_err(), "{text}");
+    }
+}
