@@ -255,6 +255,7 @@ impl Info {
     fn run(self) -> Result<()> {
         one_frame(&self.file)?;
         let vti = !self.read.raw.given() && self.file.extension().is_some_and(|e| e.eq_ignore_ascii_case("vti"));
+        let mut array = None;
         let (volume, bake) = if vti {
             let file = VtiFile::read(&self.file)?;
             // Whatever it says of itself, its samples can be examined.
@@ -262,6 +263,11 @@ impl Info {
                 say!("warning: {}", e.in_file(&self.file));
                 None
             });
+            if let Ok((name, all)) = file.scalars(self.read.array.as_deref())
+                && all.len() > 1
+            {
+                array = Some(format!("`{name}` of `{}`; --array names another", all.join("`, `")));
+            }
             let mut volume = Volume::of_vti(&self.file, file, self.read.array.as_deref())?;
             volume.lattice = self.read.place.of(volume.lattice, &self.file)?;
             (volume, bake)
@@ -276,7 +282,13 @@ impl Info {
             }
             println!("{all:#}");
         } else {
-            print!("{}{}", statistics.to_text(), bake.map_or_else(String::new, |b| b.to_text()));
+            print!("{}", statistics.to_text());
+            // A bake's arrays are its own.
+            match (bake, array) {
+                (Some(bake), _) => print!("{}", bake.to_text()),
+                (None, Some(array)) => println!("{:<18}{array}", "array"),
+                (None, None) => {}
+            }
         }
         Ok(())
     }

@@ -166,7 +166,7 @@ pub struct SceneOptions {
     pub isovalues: Option<Vec<f64>>,
     /// An isovalue that a suggested sweep is widened to hold.
     #[arg(skip)]
-    pub held: Option<f64>,
+    pub wanted: Option<f64>,
     /// The moment of a series of volumes; between two of its frames, their blend
     #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
     pub time: Option<f64>,
@@ -202,7 +202,7 @@ impl SceneOptions {
 
     /// A suggested sweep, widened to hold what it must.
     fn widened(&self, [lo, hi]: [f64; 2]) -> [f64; 2] {
-        self.held.filter(|c| c.is_finite()).map_or([lo, hi], |c| [lo.min(c), hi.max(c)])
+        self.wanted.filter(|c| c.is_finite()).map_or([lo, hi], |c| [lo.min(c), hi.max(c)])
     }
 
     /// The first flag that is given, if any.

@@ -85,7 +85,7 @@ impl ReferenceArgs {
         if self.integrator == Integrator::Path && (self.photons.is_some() || self.photons_per_estimate.is_some()) {
             return Err(Error::Invalid("--photons, --photons-per-estimate: are for --integrator photon".into()));
         }
-        let options = SceneOptions { held: Some(self.isovalue), ..self.scene.clone() };
+        let options = SceneOptions { wanted: Some(self.isovalue), ..self.scene.clone() };
         let Opened { scene, baked, .. } = open_scene(&self.input, &options, self.field.as_deref())?;
         let of_bake = baked.is_some();
         baked.map_or(Ok(()), |b| b.whole()).map_err(|e| e.in_file(&self.input))?;

@@ -198,7 +198,7 @@ impl Render {
             found => found,
         };
         let Some(baked) = baked else {
-            let options = SceneOptions { held: Some(self.isovalue), ..self.scene.clone() };
+            let options = SceneOptions { wanted: Some(self.isovalue), ..self.scene.clone() };
             return Ok(Source::Unbaked(load(&self.file, &options)?.scene));
         };
         gather.map_or(Ok(()), |g| g.check(&baked)).map_err(|e| e.in_file(&self.file))?;

@@ -30,10 +30,21 @@ fn fault(path: &Path, text: &str, error: &toml::de::Error, takes: impl Fn(&str) 
             let table = table_of(&text[..at]);
             format!("unknown {what} `{found}`{table}; {meant}known: {}", known.join(", "))
         }
+        (None, _) if message == "duplicate key" => twice(text[..at].rfind('\n').map_or(text, |end| &text[end + 1..])),
         (None, Some(key)) => wrong_value(text, &message, &key, takes),
         (None, None) => message,
     };
     Error::Invalid(format!("{}:{line}: {explained}", path.display()))
+}
+
+/// What is wrong with a key or a table that begins a line of `rest` and was there before.
+fn twice(rest: &str) -> String {
+    let line = rest.lines().next().unwrap_or_default().trim();
+    match line.strip_prefix('[').and_then(|header| header.split_once(']')) {
+        Some(("volume", _)) => "[volume] is there already; of several volumes each is a [[volume]]".into(),
+        Some((name, _)) => format!("[{name}] is there already"),
+        None => format!("{} is there already", line.split('=').next().unwrap_or_default().trim()),
+    }
 }
 
 /// What is wrong with the value of `key`, of which serde says `message`.

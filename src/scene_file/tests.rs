@@ -83,6 +83,17 @@ fn errors_name_file_line_and_key() {
     assert!(e.contains("scene.toml:3: unknown key `foo`; known: volume"), "{e}");
     let e = error_of("[volume]\ngenerator = \"bumps\"\n[volume.foo]\nx = 1\n");
     assert!(e.contains("scene.toml:3: unknown key `foo` in [volume]; known: file"), "{e}");
+    for (text, words) in [
+        ("[volume]\nsize = 9\n size = 10\n", "scene.toml:3: size is there already"),
+        (
+            "[volume]\nsize = 9\n[volume]\nsize = 9\n",
+            "scene.toml:3: [volume] is there already; of several volumes each",
+        ),
+        ("[box]\n[volume]\n [box]\n", "scene.toml:3: [box] is there already"),
+    ] {
+        let e = error_of(text);
+        assert!(e.contains(words) && !e.contains('\n'), "{e}");
+    }
     let e = error_of("isovalue = [1, 2]\n[volume]\ngenerator = \"bumps\"\n");
     assert!(e.contains("scene.toml:1: unknown key `isovalue`; did you mean `isovalues`?"), "{e}");
     let e = error_of("isovalues = [5, 5]\n[volume]\ngenerator = \"bumps\"\nsize = 9\n");

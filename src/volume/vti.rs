@@ -68,6 +68,16 @@ impl VtiFile {
         Ok((lattice, scalars(point_data, array, active_scalars.as_deref())?))
     }
 
+    /// The name of what [`VtiFile::into_scalars`] gives, and the names of all point data of one component.
+    ///
+    /// # Errors
+    /// As [`VtiFile::into_scalars`].
+    pub fn scalars(&self, array: Option<&str>) -> Result<(&str, Vec<&str>)> {
+        let chosen = chosen(&self.point_data, array, self.active_scalars.as_deref())?;
+        let all = self.point_data.iter().filter(|a| a.components == 1).map(|a| &*a.name);
+        Ok((&self.point_data[chosen].name, all.collect()))
+    }
+
     /// What the file says that the world's axes mean; the default if it says nothing that is understood.
     pub fn space(&self) -> Space {
         let text = self.field_strings.iter().find(|(key, _)| key == SPACE);
@@ -114,27 +124,34 @@ pub fn read_plane(path: &Path) -> Result<Option<Plane>> {
 }
 
 /// The scalars to render, see [`VtiFile::into_scalars`].
-fn scalars(point_data: Vec<VtiArray>, array: Option<&str>, active: Option<&str>) -> Result<Samples> {
-    let scalar = |a: &&VtiArray| a.components == 1;
-    let named = |name: &str| point_data.iter().filter(scalar).position(|a| a.name == name);
-    let count = point_data.iter().filter(scalar).count();
-    let chosen = match array {
+fn scalars(mut point_data: Vec<VtiArray>, array: Option<&str>, active: Option<&str>) -> Result<Samples> {
+    let chosen = chosen(&point_data, array, active)?;
+    Ok(point_data.swap_remove(chosen).samples)
+}
+
+/// Which array these are.
+fn chosen(point_data: &[VtiArray], array: Option<&str>, active: Option<&str>) -> Result<usize> {
+    let mut scalars = (0..point_data.len()).filter(|&n| point_data[n].components == 1);
+    let named = |name: &str| scalars.clone().find(|&n| point_data[n].name == name);
+    let found = match array {
         Some(array) => named(array),
-        None => active.and_then(named).or_else(|| named("value")).or_else(|| (count == 1).then_some(0)),
+        None => active.and_then(named).or_else(|| named("value")).or_else(|| {
+            let first = scalars.next();
+            first.filter(|_| scalars.next().is_none())
+        }),
     };
-    let Some(chosen) = chosen else {
+    found.ok_or_else(|| {
         let list: Vec<String> =
             point_data.iter().map(|a| format!("`{}` ({} components)", a.name, a.components)).collect();
         let list = if list.is_empty() { "there are none".to_string() } else { list.join(", ") };
-        return Err(Error::Invalid(match array {
+        Error::Invalid(match array {
             Some(array) => format!("has no point data `{array}` of 1 component; there are: {list}"),
             None => format!(
                 "cannot tell which point data to use: {list}. Name a 1-component array with --array, or as array in \
                  [volume] (cell data are not read: convert them to point data)"
             ),
-        }));
-    };
-    Ok(point_data.into_iter().filter(|a| a.components == 1).nth(chosen).expect("found above").samples)
+        })
+    })
 }
 
 /// Where an image's samples stand.

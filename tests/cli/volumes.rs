@@ -334,6 +334,8 @@ fn what_a_file_does_not_say_is_said_beside_it() {
     refused(dir, &["info", "plain.npy", "--array", "p"], &["no named arrays"]);
     assert_eq!(range(&["two.vti", "--array", "p"]), serde_json::json!([1.0, 8.0]));
     assert_eq!(range(&["two.vti", "--array", "q"]), serde_json::json!([1.0, 9.0]));
+    let said = text(&ok(dir, &["info", "two.vti", "--array", "q"]).stdout);
+    assert!(said.contains("`q` of `p`, `q`"), "{said}");
     assert_eq!(range(&["two.vtk"]), serde_json::json!([1.0, 8.0]));
     assert_eq!(range(&["two.vtk", "--array", "q r"]), serde_json::json!([1.0, 9.0]));
     assert_eq!(range(&["two.vtk", "--array", "s"]), serde_json::json!([6.0, 7.0]));
