@@ -25,6 +25,7 @@ use crate::flattened::Side;
 use crate::illumination_grid::{GridSize, IlluminationGrid};
 use crate::isa::Isa;
 use crate::mask::{Mask, masks, stand_ins, unknown_share};
+use crate::photon::check_power;
 use crate::progress::{Clock, Progress};
 use crate::scene::{Policy, Scene};
 use crate::sweep;
@@ -295,11 +296,12 @@ fn has_places(field: &Field, grid: &Lattice, seed: u64) -> bool {
 /// Whether the engine can light the scene, and the grid can hold its light.
 ///
 /// # Errors
-/// `NotSupported` as [`sweep::supported`]; `Invalid` for a grid so coarse that no isosurface passes near its points,
-/// and for a sweep so thin that none of its isosurfaces has a place.
+/// `NotSupported` as [`sweep::supported`]; `Invalid` as [`check_power`], for a grid so coarse that no isosurface passes
+/// near its points, and for a sweep so thin that none of its isosurfaces has a place.
 pub fn supported(scene: &Scene, settings: &BakeSettings) -> Result<()> {
-    if settings.engine == Engine::Sweep {
-        can_sweep(scene)?;
+    match settings.engine {
+        Engine::Sweep => can_sweep(scene)?,
+        Engine::Photon => check_power(scene, settings.photons)?,
     }
     // Grids as fine as the volume hold what it holds, and are looked at when their light is computed.
     (0..scene.fields()).try_for_each(|number| {

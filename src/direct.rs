@@ -61,6 +61,14 @@ pub fn luminance(rgb: DVec3) -> f64 {
     rgb.dot(DVec3::new(0.2126, 0.7152, 0.0722))
 }
 
+/// Luminous reflectance: the share of the luminance of `light` that `albedo` reflects; of no light, that of white light.
+/// Variances of luminance become those of reflected light by its square: exactly, where noise is coloured as the light.
+#[inline]
+pub fn luminous_reflectance(albedo: DVec3, light: DVec3) -> f64 {
+    let arrives = luminance(light);
+    if arrives > 0.0 { luminance(albedo * light) / arrives } else { luminance(albedo) }
+}
+
 /// Irradiance that all luminaires would give without obstacles at `p` (local frame) with unit normal `n` (world).
 /// \[Lambert1760\]
 pub fn open_irradiance(scene: &Scene, p: DVec3, n: DVec3) -> DVec3 {
@@ -74,8 +82,9 @@ const LEAST_RAYS: u32 = 8;
 /// Fewer rays that agree do not speak for the rest: ending there takes slivers of light away and brings none back.
 pub(crate) const LEAST_UNANIMOUS: u32 = 64;
 
-/// Shadow rays for a receiver that may get the irradiance `open` (luminance), of at most `shadow_rays`: all from half
-/// the scene's E₀ on, and down to an eighth where there is less to get, so that light is equally certain everywhere.
+/// Shadow rays for a receiver that may get the irradiance `open` (of its brightest channel, as E₀ is), of at most
+/// `shadow_rays`: all from half the scene's E₀ on, and down to an eighth where there is less to get, so that light is
+/// equally certain everywhere.
 fn budget(reference_irradiance: f64, open: f64, shadow_rays: u32) -> u32 {
     let mut rays = shadow_rays;
     let mut full = 0.5 * reference_irradiance;
@@ -112,7 +121,7 @@ pub fn direct_irradiance<T: Tracer>(
             continue;
         }
         let Some(aim) = Aim::best(light, x, receiver.normal) else { continue };
-        let budget = budget(scene.reference_irradiance(), luminance(light.emission) * open, shadow_rays);
+        let budget = budget(scene.reference_irradiance(), light.emission.max_element() * open, shadow_rays);
         let pilot = (budget / 4).max(LEAST_UNANIMOUS);
         let index = key.index.wrapping_mul(scene.luminaires().len() as u64).wrapping_add(u64::from(l));
         let set = Key { index, ..key }.set();
@@ -191,8 +200,6 @@ mod tests {
         }
     }
 
-    /// Slivers of light and of shadow, in the mean over receivers' point sets, however many rays: what ended where the
-    /// first rays agreed lost half of the narrowest.
     #[test]
     fn budgets_fall_with_what_there_is_to_get_but_not_below_eight_rays() {
         for (open, rays, expected) in
@@ -202,6 +209,18 @@ mod tests {
         }
     }
 
+    /// Where noise is coloured as the light, the reflected luminance is a multiple of what arrives.
+    #[test]
+    fn luminance_is_reflected_by_the_light_that_there_is() {
+        let (grey, blue) = (DVec3::splat(0.75), DVec3::new(0.0, 0.0, 0.75));
+        assert!((luminous_reflectance(grey, DVec3::new(3.0, 0.1, 7.0)) - 0.75).abs() < 1e-12);
+        assert!((luminous_reflectance(blue, DVec3::Z * 9.0) - 0.75).abs() < 1e-12);
+        assert_eq!(luminous_reflectance(blue, DVec3::X), 0.0);
+        assert!((luminous_reflectance(blue, DVec3::ZERO) - 0.75 * 0.0722).abs() < 1e-12);
+    }
+
+    /// Slivers of light and of shadow, in the mean over receivers' point sets, however many rays: what ended where the
+    /// first rays agreed lost half of the narrowest.
     #[test]
     fn slivers_of_light_and_shadow_are_found_in_the_mean() {
         let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::splat(0.125)).unwrap();

@@ -3,6 +3,7 @@
 
 mod emitter;
 
+use crate::error::{Error, Result};
 use crate::flat;
 use crate::flattened::{FlattenedRay, Side, Target};
 use crate::isovalue_axis::IsovalueAxis;
@@ -12,7 +13,7 @@ use crate::rng::{Rng, Stage};
 use crate::scene::Scene;
 use crate::tracer::Tracer;
 use crate::warp::{Frame, cosine_hemisphere};
-use emitter::{Emitter, Flight};
+use emitter::{Emitter, Flight, power_of_one};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use std::ops::AddAssign;
@@ -217,6 +218,24 @@ pub struct PhotonSettings {
 const CHUNK: u64 = 1 << 14;
 /// Chunks whose parts are joined at once.
 const ROUND: usize = 32;
+
+/// What power of a photon f32 holds to a hundredth, whatever its density in isovalue makes of it.
+const POWERS: std::ops::RangeInclusive<f64> = 1e-41..=1e36;
+
+/// Whether f32 holds the power of `count` photons, which is that of lengths squared times emission.
+///
+/// # Errors
+/// `Invalid` if it does not.
+pub fn check_power(scene: &Scene, count: u64) -> Result<()> {
+    let power = power_of_one(scene, count);
+    if power == 0.0 || POWERS.contains(&power) {
+        return Ok(());
+    }
+    Err(Error::Invalid(format!(
+        "photons of power {power:.0e} (emission times area) do not fit 32-bit floats; choose another unit of length or \
+         of emission"
+    )))
+}
 
 /// Emits and traces `settings.count` photons. `tick` is called with the number of photons done, from any thread;
 /// returning false stops the work early with what is done.

@@ -2,7 +2,7 @@
 
 use crate::brdf::reflected;
 use crate::checkpoint::Saved;
-use crate::direct::{Receiver, direct_irradiance, luminance};
+use crate::direct::{Receiver, direct_irradiance, luminous_reflectance};
 use crate::flattened::Side;
 use crate::gather::gathered_irradiance;
 use crate::nearest::Neighbours;
@@ -14,6 +14,7 @@ use crate::scene::Scene;
 use crate::tracer::Tracer;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
+use std::f64::consts::PI;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Where indirect light comes from.
@@ -154,15 +155,16 @@ impl<T: Tracer> Sampler<'_, T> {
             }
         };
         let albedo = scene.surface.albedo.at(isovalue);
-        let scale = luminance(albedo) / std::f64::consts::PI;
+        let variance_of = |e: DVec3, variance: f64| variance * (luminous_reflectance(albedo, e) / PI).powi(2);
+        let indirect_variance = variance_of(mean, variance);
         Some(RadianceSample {
             position,
             // The cache's flats may be a little negative where few photons land.
             radiance: (reflected(albedo, (direct.mean + mean).max(DVec3::ZERO)) + scene.surface.emission).as_vec3(),
-            variance: ((direct.variance + variance) * scale * scale) as f32,
+            variance: (variance_of(direct.mean, direct.variance) + indirect_variance) as f32,
             direct: direct.mean.as_vec3(),
             indirect: halves.map(|h| h.as_vec3()),
-            indirect_variance: (variance * scale * scale) as f32,
+            indirect_variance: indirect_variance as f32,
         })
     }
 

@@ -17,7 +17,7 @@ use crate::error::{Error, Result};
 use crate::export::ply;
 use crate::isosurface;
 use crate::isovalue_axis::IsovalueAxis;
-use crate::photon::{PhotonSettings, trace_photons};
+use crate::photon::{PhotonSettings, check_power, trace_photons};
 use crate::progress::Tick;
 use crate::rng::{Rng, Stage};
 use crate::scene::Scene;
@@ -158,7 +158,7 @@ fn companion_meshes(scene: &Scene, isovalue: f32) -> Result<Vec<(Scene, SurfaceM
 /// `tick(n)` reports n of batches × vertices done; returning false ends it.
 ///
 /// # Errors
-/// `Interrupted` if `tick` ends it; as [`Integrator::check`]; from the extraction of companions' isosurfaces.
+/// `Interrupted` if `tick` ends it; as [`Integrator::check`] and, of photons, [`check_power`]; from the extraction of companions' isosurfaces.
 #[allow(clippy::cast_possible_truncation, reason = "batches are few")]
 pub fn reference<T: Tracer>(
     scene: &Scene,
@@ -169,6 +169,9 @@ pub fn reference<T: Tracer>(
     tick: Tick,
 ) -> Result<Reference> {
     settings.integrator.check(scene)?;
+    if settings.integrator == Integrator::Photon {
+        check_power(scene, settings.photons)?;
+    }
     let side = scene.surface.outside;
     let companions = match settings.integrator {
         Integrator::Path => Vec::new(),

@@ -8,7 +8,7 @@
 
 use super::BakeSettings;
 use super::grid_points::{Counts, STAND_INS};
-use crate::direct::{Receiver, direct_irradiance, luminance};
+use crate::direct::{Receiver, direct_irradiance, luminance, luminous_reflectance};
 use crate::flattened::{Departure, Side, SurfacePoint, Target};
 use crate::gather::gathered_irradiance;
 use crate::illumination_grid::IlluminationGrid;
@@ -218,11 +218,12 @@ impl<'a> Contacts<'a> {
         // Of white surfaces that touch face to face nothing would ever be lost.
         let lost = 1.0 - (share * share * polygon.albedo * level_set).min(DVec3::splat(MOST_KEPT));
         let met = (white + share * (polygon.albedo * opening - shown)) / lost;
-        let opened = luminance(level_set * share * polygon.albedo / lost) / PI;
+        let seen_again = level_set * share * polygon.albedo / lost;
+        let variance_of = |e: DVec3, variance: f64| variance * (luminous_reflectance(seen_again, e) / PI).powi(2);
         // By the channels' shares of the light that is there.
         let (before, after) = (luminance(white), luminance(white / lost));
         let gain = if before > 0.0 { after / before } else { 1.0 };
-        let variance = opened * opened * (direct.variance + gathered.variance);
+        let variance = variance_of(direct.mean, direct.variance) + variance_of(gathered.mean, gathered.variance);
         Some(Solved { light: met.max(DVec3::ZERO), gain, variance })
     }
 }

@@ -4,7 +4,7 @@
 use super::bands::Band;
 use crate::brdf::reflected;
 use crate::checkpoint::Saved;
-use crate::direct::luminance;
+use crate::direct::{luminance, luminous_reflectance};
 use crate::field::Field;
 use crate::fitted_grid::{FitSample, GridFit, draws};
 use crate::flattened::Side;
@@ -29,7 +29,8 @@ pub(super) const STAND_INS: usize = 4;
 /// The rays of such a place, of the gather and shadow rays of a point of the grid: points are fitted to places of their
 /// own and of their neighbours.
 pub(super) fn rays_beside([gather, shadow]: [u32; 2]) -> [u32; 2] {
-    [(gather / 4).max(gather.min(2)), (shadow / 8).max(shadow.min(2))]
+    // Halves of as many rays are compared.
+    [(gather / 4).next_multiple_of(2).max(gather.min(2)), (shadow / 8).max(shadow.min(2))]
 }
 
 /// What samples cost.
@@ -301,8 +302,10 @@ pub(super) fn split(
 #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
 fn smoothed_light(scene: &Scene, p: Vec3, radiance: Vec3, [a, b]: Halves, smoothed: Smoothed) -> (Vec3, f32) {
     let albedo = scene.surface.albedo.at(f64::from(scene.field.value(p.as_dvec3()) as f32));
-    let change = reflected(albedo, (smoothed.mean - 0.5 * (a + b)).as_dvec3());
-    let scale = (luminance(albedo) / PI) as f32;
+    // Of a gather below 0 the radiance holds nothing.
+    let gathered = (0.5 * (a + b)).max(Vec3::ZERO);
+    let change = reflected(albedo, (smoothed.mean - gathered).as_dvec3());
+    let scale = (luminous_reflectance(albedo, smoothed.mean.as_dvec3()) / PI) as f32;
     ((radiance + change.as_vec3()).max(Vec3::ZERO), smoothed.variance * scale * scale)
 }
 
@@ -529,7 +532,10 @@ impl<'a> Beside<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::field::Sweep;
     use crate::rng::{Rng, Stage};
+    use crate::scene::{Boundary, Surface};
+    use crate::volume::{Samples, Volume};
 
     /// Two gather rays have two halves, whose difference is their noise; nobody gets more rays than are asked for.
     #[test]
@@ -539,6 +545,27 @@ mod tests {
         {
             assert_eq!(rays_beside(rays), fewer, "{rays:?}");
         }
+    }
+
+    /// Sharpened nodes may make a gather negative, of which radiance holds nothing: what is smoothed takes nothing off.
+    #[test]
+    fn gathers_below_zero_leave_no_specks() {
+        let lattice = Lattice::aligned([3; 3], DVec3::ZERO, DVec3::ONE).unwrap();
+        let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[0] as f64).collect();
+        let volume = Volume::new("x", lattice, Samples::F64(samples)).unwrap();
+        let field = Field::new(&volume, Sweep::new(0.0, 2.0).unwrap()).unwrap();
+        let surface = Surface { albedo: DVec3::splat(0.5).into(), ..Surface::default() };
+        let scene = Scene::new(field, surface, Boundary::Open, Vec::new()).unwrap();
+        let light = |radiance: f32, halves: [f32; 2], mean: f32| {
+            let smoothed = Smoothed { mean: Vec3::splat(mean), variance: 4.0 };
+            smoothed_light(&scene, Vec3::ONE, Vec3::splat(radiance), halves.map(Vec3::splat), smoothed)
+        };
+        let half = 0.5 / std::f32::consts::PI;
+        let (dark, variance) = light(0.2, [-0.3, -0.1], 0.0);
+        assert_eq!(dark, Vec3::splat(0.2));
+        assert!((variance / (4.0 * half * half) - 1.0).abs() < 1e-6);
+        assert!((light(0.2, [-0.3, 0.1], 0.2).0 - (0.2 + 0.2 * half)).abs().max_element() < 1e-7);
+        assert!((light(0.2, [0.1, 0.3], 0.3).0 - (0.2 + 0.1 * half)).abs().max_element() < 1e-7);
     }
 
     #[test]

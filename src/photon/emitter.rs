@@ -54,7 +54,7 @@ pub(super) struct Emitter<'a> {
     pub scene: &'a Scene,
     pub settings: &'a PhotonSettings,
     sources: Vec<Source>,
-    /// Of all sources, by their brightest channel.
+    /// [`total`] of them.
     power: f64,
 }
 
@@ -67,10 +67,20 @@ struct Drawn {
     power: DVec3,
 }
 
+/// Power of all sources, by their brightest channel.
+fn total(sources: &[Source]) -> f64 {
+    sources.iter().map(|s| s.power().max_element()).sum()
+}
+
+/// Power of one of `count` photons, by its brightest channel.
+pub(super) fn power_of_one(scene: &Scene, count: u64) -> f64 {
+    total(&sources(scene)) / count.max(1) as f64
+}
+
 impl<'a> Emitter<'a> {
     pub(super) fn new(scene: &'a Scene, settings: &'a PhotonSettings) -> Self {
         let sources = sources(scene);
-        let power = sources.iter().map(|s| s.power().max_element()).sum();
+        let power = total(&sources);
         Self { scene, settings, sources, power }
     }
 

@@ -251,7 +251,7 @@ impl<'a> PhotonDensity<'a> {
                 sum += tally.luminance;
                 squares += tally.squares;
             }
-            if squares > 0.0 { sum * sum / squares } else { 0.0 }
+            if squares > 0.0 { sum * (sum / squares) } else { 0.0 }
         };
         // Their number grows as the cube of the radius; where too few tell how fast, look farther.
         let mut known = first.min(MOST);
@@ -419,6 +419,17 @@ mod tests {
 
     fn splat(photons: usize) -> EstimateSettings {
         EstimateSettings { estimator: Estimator::Splat, photons, tau: 1.0, ..EstimateSettings::default() }
+    }
+
+    /// Light as bright as emission may be is that of dim light, bit for bit.
+    #[test]
+    fn radii_do_not_depend_on_power() {
+        let (scene, dim) = (ramp(21), landed(7, 21, 20_000, |p| p.x < 10.5));
+        let factor = 60f32.exp2();
+        let bright: Vec<SurfacePhoton> = dim.iter().map(|p| SurfacePhoton { power: factor * p.power, ..*p }).collect();
+        let [dim, bright] = [dim, bright].map(|landed| PhotonDensity::new(&scene, &landed, |_| true, splat(64)));
+        assert!(dim.light.iter().zip(&bright.light).all(|(a, b)| a.radius == b.radius && factor * a.value == b.value));
+        assert!(dim.light.iter().filter(|light| light.radius > LEAST).count() > 100);
     }
 
     /// Behind the last cell of a row of bins comes the first of the next, where it is bright.

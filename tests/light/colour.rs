@@ -2,10 +2,12 @@
 
 use crate::support::*;
 use glam::DVec3;
-use isolume::bake::{Bake, BakeSettings, Engine};
+use isolume::bake::{Bake, BakeSettings, Engine, supported};
+use isolume::direct::luminance;
 use isolume::embree::{Device, GraphTracer};
 use isolume::flattened::Side;
 use isolume::luminaire::unoccluded;
+use isolume::mask::Mask;
 use isolume::reference::{ReferenceSettings, reference};
 use isolume::reflectance::Reflectance;
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
@@ -157,4 +159,49 @@ fn colours_of_other_isovalues_change_nothing() {
     }
     println!("{same} points below keep every bit, {changed} above do not");
     assert!(same > 100 && changed > 1000, "{same} {changed}");
+}
+
+/// Light of one channel that surfaces take up in that alone is what white light is, ray by ray: as many of them, and
+/// as uncertain.
+#[test]
+fn light_of_one_colour_is_as_certain_as_white() {
+    let white = bumps(lattice([13; 3], DVec3::ZERO, DVec3::ONE));
+    let found = |channels: DVec3| {
+        let polygons = white.polygons().iter().cloned().map(|mut p| {
+            p.albedo = DVec3::splat(0.75);
+            p.emission *= channels;
+            p
+        });
+        let surface = Surface { albedo: (0.75 * channels).into(), ..Surface::default() };
+        let scene = Scene::new(white.field.clone(), surface, Boundary::Open, polygons.collect()).unwrap();
+        let bake = run(&scene, &BakeSettings { gather_rays: 16, shadow_rays: 32, ..at_nodes(1) });
+        let grid = &bake.sides[0].1;
+        let points = || (0..grid.mask.len()).filter(|&o| grid.mask[o] == Mask::Valid);
+        let light: f64 = points().map(|o| luminance(DVec3::from_array(grid.radiance[o].map(f64::from)))).sum();
+        (bake.report.rays, points().map(|o| f64::from(grid.std_error[o])).sum::<f64>() / light)
+    };
+    let (rays, error) = found(DVec3::ONE);
+    assert!(error > 0.005, "{error}");
+    for channel in [DVec3::X, DVec3::Y, DVec3::Z] {
+        let (own, told) = found(channel);
+        println!("{channel}: {own} of {rays} rays, {told:.5} of {error:.5}");
+        assert!((own as f64 / rays as f64 - 1.0).abs() < 1e-3 && (told / error - 1.0).abs() < 0.02, "{channel}");
+    }
+}
+
+/// Photons whose power f32 does not hold were no light at all.
+#[test]
+fn photons_of_too_much_or_too_little_power_are_refused() {
+    for (step, emission, fits) in
+        [(1e13, 1e18, false), (1e-16, 1e-15, false), (1e16, 1.0, true), (1e-12, 1e-15, true), (1e-9, 1e18, true)]
+    {
+        let lattice = lattice([9; 3], DVec3::ZERO, DVec3::splat(8.0 * step));
+        let planes = field(lattice, 0.0, 8.0 * step, |x| x.z);
+        let mut walls = cornell_box(planes.lattice(), 0.0).unwrap();
+        walls.iter_mut().filter(|p| p.emission != DVec3::ZERO).for_each(|p| p.emission = DVec3::splat(emission));
+        let scene = Scene::new(planes, Surface::default(), Boundary::Open, walls).unwrap();
+        let found = supported(&scene, &at_nodes(1)).map_err(|e| e.to_string());
+        assert!(found.clone().err().is_none_or(|e| e.contains("do not fit 32-bit floats")), "{found:?}");
+        assert_eq!(found.is_ok(), fits, "{step:e}, {emission:e}");
+    }
 }
