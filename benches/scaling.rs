@@ -143,7 +143,7 @@ fn main() {
             RadianceSample { position, radiance: position, ..RadianceSample::default() }
         })
         .collect();
-    let wishes: Vec<FitSample> = samples.iter().map(FitSample::from).collect();
+    let targets: Vec<FitSample> = samples.iter().map(FitSample::from).collect();
     let start = shepard(&scene.field, lattice, &masks, &samples, 8, &|_| true);
     // Noise of its own for each half.
     let halves = |o: usize| {
@@ -206,7 +206,7 @@ fn main() {
             Box::new(|| {
                 let free = NodeSet::new(lattice.len(), |o| start.mask[o] != Mask::Empty);
                 let fit = GridFit::new(&scene.field, lattice, &free, &|_| true);
-                drop(black_box(fit.light(&wishes, start.radiance.clone())));
+                drop(black_box(fit.light(&targets, start.radiance.clone())));
             }),
         ),
         ("sweep, direct", Box::new(|| swept(8, 64, 1))),
@@ -228,7 +228,7 @@ fn main() {
     println!(
         "bumps {SIZE}³, {} sampled nodes, {} fitted samples; the least wall seconds of {TURNS}",
         nodes.len() / 5,
-        wishes.len()
+        targets.len()
     );
     println!(
         "  {:14} {:>8} {:>8} {:>8} {:>8} {:>8} {:>8}",

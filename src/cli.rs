@@ -123,16 +123,22 @@ struct Info {
 /// More are of no use to any machine, and take long to start.
 const MOST_THREADS: usize = 1024;
 
-/// The arguments as clap knows them: `-.5` as `-0.5`, and the two numbers of `--isovalues` apart, which other lists have
-/// commas between.
+/// The arguments as clap knows them: `-.5` as `-0.5`, and the two numbers of `--isovalues` apart, which other lists
+/// have commas between.
 fn spelt_out(arguments: impl Iterator<Item = OsString>) -> Vec<OsString> {
     let is_number = |text: &str| text.parse::<f64>().is_ok();
     let mut all: Vec<OsString> = Vec::new();
+    const SWEEP: &str = "--isovalues";
     for argument in arguments {
-        let sweep = all.last().is_some_and(|before| before == "--isovalues");
-        let numbers = argument.to_str().and_then(|text| text.split_once(','));
-        match numbers.filter(|(lo, hi)| sweep && is_number(lo) && is_number(hi)) {
-            Some((lo, hi)) => all.extend([lo.into(), hi.into()]),
+        let text = argument.to_str().unwrap_or_default();
+        let joined = text.strip_prefix(SWEEP).and_then(|rest| rest.strip_prefix('='));
+        let apart = all.last().is_some_and(|before| before == SWEEP).then_some(text);
+        let numbers = joined.or(apart).and_then(|text| text.split_once(',')).map(|(lo, hi)| (lo.trim(), hi.trim()));
+        match numbers.filter(|(lo, hi)| is_number(lo) && is_number(hi)) {
+            Some((lo, hi)) => {
+                all.extend(joined.map(|_| SWEEP.into()));
+                all.extend([lo.into(), hi.into()]);
+            }
             None => all.push(argument),
         }
     }
@@ -313,6 +319,7 @@ mod tests {
             (&["--isovalues", "-.5", "3"], "--isovalues -0.5 3"),
             (&["--isovalues", "-500,.5"], "--isovalues -500 .5"),
             (&["--isovalues", "-.5,5"], "--isovalues -0.5 5"),
+            (&["--isovalues=5, 15", "-q"], "--isovalues 5 15 -q"),
             (&["--isovalues", "a,5"], "--isovalues a,5"),
             (&["--origin", "1,2"], "--origin 1,2"),
         ] {

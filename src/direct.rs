@@ -61,10 +61,13 @@ pub fn luminance(rgb: DVec3) -> f64 {
     rgb.dot(DVec3::new(0.2126, 0.7152, 0.0722))
 }
 
-/// Luminous reflectance: the share of the luminance of `light` that `albedo` reflects; of no light, that of white light.
-/// Variances of luminance become those of reflected light by its square: exactly, where noise is coloured as the light.
+/// Luminous reflectance: the share of the luminance of `light` that `albedo` reflects; of no light, that of white
+/// light. Variances of luminance become those of reflected light by its square: exactly, where noise is coloured as the
+/// light.
 #[inline]
 pub fn luminous_reflectance(albedo: DVec3, light: DVec3) -> f64 {
+    // Noise may leave a little less than nothing in a channel.
+    let light = light.max(DVec3::ZERO);
     let arrives = luminance(light);
     if arrives > 0.0 { luminance(albedo * light) / arrives } else { luminance(albedo) }
 }
@@ -216,6 +219,8 @@ mod tests {
         assert!((luminous_reflectance(grey, DVec3::new(3.0, 0.1, 7.0)) - 0.75).abs() < 1e-12);
         assert!((luminous_reflectance(blue, DVec3::Z * 9.0) - 0.75).abs() < 1e-12);
         assert_eq!(luminous_reflectance(blue, DVec3::X), 0.0);
+        let mixed = luminous_reflectance(DVec3::new(0.63, 0.065, 0.05), DVec3::new(0.3, -0.089, 0.0));
+        assert!((mixed - 0.63).abs() < 1e-12, "{mixed}");
         assert!((luminous_reflectance(blue, DVec3::ZERO) - 0.75 * 0.0722).abs() < 1e-12);
     }
 

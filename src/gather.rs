@@ -51,8 +51,8 @@ pub struct Gathered {
 const NEAR: f64 = 1.0;
 /// Such hits in a row at most.
 const CORNERS: usize = 4;
-/// Of a receiver's rays that land so one in this many goes on, with the weight of all: Russian roulette on what light in
-/// corners adds to what the cache says. \[Arvo90\]
+/// Of a receiver's rays that land so one in this many goes on, with the weight of all: Russian roulette on what light
+/// in corners adds to what the cache says. \[Arvo90\]
 const SHARE: u64 = 8;
 /// A receiver's first rays, which show whether it is sealed off from all that is far.
 const PILOT: u32 = 16;

@@ -96,7 +96,7 @@ impl fmt::Debug for dyn Observer + '_ {
 pub enum Progress<'a> {
     /// Nowhere.
     Quiet,
-    /// To standard error: bars on a terminal, a line per stage otherwise.
+    /// To standard error: bars on a terminal, otherwise a line per stage, and one a minute while it lasts.
     Shown,
     /// To an observer, and nothing to standard error.
     Watched(&'a dyn Observer),

@@ -219,8 +219,8 @@ impl RadianceCache {
         self.nodes.iter_mut().for_each(|n| *n = None);
     }
 
-    /// Which of `points` nodes to store if those are known that `known` picks: these, or all where they are so many that
-    /// lookups without their numbers are worth the room.
+    /// Which of `points` nodes to store if those are known that `known` picks: these, or all where they are so many
+    /// that lookups without their numbers are worth the room.
     pub fn room(points: usize, known: impl Fn(usize) -> bool + Sync) -> NodeSet {
         room(points, &NodeSet::new(points, known))
     }

@@ -158,7 +158,8 @@ fn companion_meshes(scene: &Scene, isovalue: f32) -> Result<Vec<(Scene, SurfaceM
 /// `tick(n)` reports n of batches × vertices done; returning false ends it.
 ///
 /// # Errors
-/// `Interrupted` if `tick` ends it; as [`Integrator::check`] and, of photons, [`check_power`]; from the extraction of companions' isosurfaces.
+/// `Interrupted` if `tick` ends it; as [`Integrator::check`] and, of photons, [`check_power`]; from the extraction of
+/// companions' isosurfaces.
 #[allow(clippy::cast_possible_truncation, reason = "batches are few")]
 pub fn reference<T: Tracer>(
     scene: &Scene,

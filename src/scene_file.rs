@@ -315,7 +315,10 @@ pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
     let read = |path: &Path| single.read(path, &options.read);
     let volume = match (&series, options.time) {
         (Some(series), time) => frames::moment(series, time, input, read).map_err(blame(key, true))?,
-        (None, None) => single.load(&folder, &options.read).map_err(blame(key, false))?,
+        (None, None) => {
+            let flags = options.read != ReadOptions::default();
+            single.load(&folder, &options.read).map_err(|e| blame(single.key_of(&e), flags)(e))?
+        }
         (None, Some(time)) => {
             return Err(Error::invalid(input, format!("is a single volume: --time {time} chooses of a series")));
         }

@@ -56,10 +56,11 @@ impl SurfaceMesh {
         if mesh.triangles.is_empty() {
             let finite = scene.field.samples().iter().filter(|h| h.is_finite()).map(|h| f64::from(*h));
             let [lo, hi] = finite.fold([f64::INFINITY, f64::NEG_INFINITY], |[lo, hi], h| [h.min(lo), h.max(hi)]);
-            return Err(Error::Invalid(format!(
-                "there is no surface at this isovalue; choose another (the data span {})",
-                brief_span([lo, hi].map(|h| scene.field.sweep().from_unit(h)))
-            )));
+            let [lo, hi] = [lo, hi].map(|h| scene.field.sweep().from_unit(h));
+            // In units of the sweep an end at 0 may have become nearly that.
+            let data = [lo, hi].map(|x| if x.abs() < 1e-6 * (hi - lo) { 0.0 } else { x });
+            let span = if lo < hi { format!(" (the data span {})", brief_span(data)) } else { String::new() };
+            return Err(Error::Invalid(format!("there is no surface at this isovalue; choose another{span}")));
         }
         let outside = scene.surface.outside;
         mesh.face_outside(scene.lattice().axes(), outside == Side::Higher);

@@ -241,9 +241,9 @@ fn numbered([nx, ny, nz]: [usize; 3]) -> bool {
 /// while bounces converge), and ends the work by returning false.
 ///
 /// # Errors
-/// `Interrupted` if `tick` ended it. `NotSupported` for several fields that light each other, if a polygon that is not a luminaire stands inside the
-/// volume, if there are more than [`MOST_POLYGONS`], or about 2³¹ points or more, and for the inside of capped solids
-/// if there may be light in it: that needs the photon engine.
+/// `Interrupted` if `tick` ended it. `NotSupported` for several fields that light each other, if a polygon that is not
+/// a luminaire stands inside the volume, if there are more than [`MOST_POLYGONS`], or about 2³¹ points or more, and for
+/// the inside of capped solids if there may be light in it: that needs the photon engine.
 pub fn sweep(scene: &Scene, settings: &SweepSettings, tick: &(dyn Fn(f64) -> bool + Sync)) -> Result<SweepResult> {
     sweep_resumable(scene, settings, Saved::NOWHERE, tick)
 }

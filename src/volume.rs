@@ -13,9 +13,12 @@ pub mod npy;
 pub mod nrrd;
 pub mod plane;
 pub mod raw;
+mod space;
 pub mod statistics;
 pub mod tiff;
 pub mod vti;
+
+pub use space::Space;
 
 use crate::digits::Shortest;
 use crate::error::{Error, Result};
@@ -394,40 +397,6 @@ impl Samples {
     }
 }
 
-/// Where a patient's directions lie in the world: the first letter names what x grows towards, and so on. Coordinates
-/// are never turned from one to the other; formats that hold the name pass it on.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Space {
-    /// Left, posterior, superior: that of DICOM and ITK, which is meant where nothing is said.
-    #[default]
-    LeftPosteriorSuperior,
-    /// Right, anterior, superior: that of NIfTI.
-    RightAnteriorSuperior,
-    /// Left, anterior, superior.
-    LeftAnteriorSuperior,
-}
-
-impl Space {
-    /// NRRD's name.
-    pub fn name(self) -> &'static str {
-        match self {
-            Space::LeftPosteriorSuperior => "left-posterior-superior",
-            Space::RightAnteriorSuperior => "right-anterior-superior",
-            Space::LeftAnteriorSuperior => "left-anterior-superior",
-        }
-    }
-
-    /// The space of a [`Space::name`] or its initials.
-    pub fn from_name(name: &str) -> Option<Self> {
-        match name.to_ascii_lowercase().as_str() {
-            "left-posterior-superior" | "lps" => Some(Space::LeftPosteriorSuperior),
-            "right-anterior-superior" | "ras" => Some(Space::RightAnteriorSuperior),
-            "left-anterior-superior" | "las" => Some(Space::LeftAnteriorSuperior),
-            _ => None,
-        }
-    }
-}
-
 /// A scalar volume: samples on a lattice.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Volume {
@@ -515,6 +484,7 @@ impl Volume {
                 path,
                 "is no image of VTK's (.vti): resample it to one, as ParaView's `Resample To Image` does",
             )),
+            ("pvd", "") => Err(Error::not_supported(path, "is a series: name one of its files")),
             ("npz", "") => Err(Error::not_supported(path, "holds several arrays: save one as a .npy")),
             _ => Err(Error::not_supported(
                 path,

@@ -187,7 +187,7 @@ impl Bake {
         // A trial run may be for another machine.
         let fits = plan.check_machine();
         let unfit = if self.dry_run { fits.err() } else { fits.map(|()| None)? };
-        plan.warn(said)?;
+        plan.warn(said, self.scene.time.is_some())?;
         if progress.is_shown() || self.dry_run {
             plan.announce();
         }

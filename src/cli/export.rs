@@ -112,9 +112,12 @@ impl Export {
                 format!("is a volume with one array, `value`, and has no `{name}`"),
             ));
         }
-        let array = self.array.clone().filter(|_| is_vtk);
-        let read = ReadOptions { array, place: self.place.clone(), raw: self.raw.clone() };
-        let volume = read.open(&self.input)?;
+        let read = |array| ReadOptions { array, place: self.place.clone(), raw: self.raw.clone() }.open(&self.input);
+        let volume = match self.array.clone().filter(|_| is_vtk) {
+            // What every volume's array is called once it is written.
+            Some(name) if name == "value" => read(Some(name)).or_else(|_| read(None))?,
+            name => read(name)?,
+        };
         let (lattice, space) = (volume.lattice.clone(), volume.space);
         Ok(Array { lattice, space, name: "value".into(), components: 1, samples: volume.into_samples() })
     }

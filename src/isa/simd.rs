@@ -10,9 +10,9 @@ use super::Kind;
 pub(crate) trait Work {
     type Output;
 
-    /// Does it. Implementations, and what is to be vectorised in them, are `#[inline(always)]`: only code that is inlined
-    /// here is compiled for the instruction set; functions that are called, and closures that the standard library
-    /// calls (`map`, `from_fn`), may not be.
+    /// Does it. Implementations, and what is to be vectorised in them, are `#[inline(always)]`: only code that is
+    /// inlined here is compiled for the instruction set; functions that are called, and closures that the standard
+    /// library calls (`map`, `from_fn`), may not be.
     fn work(self) -> Self::Output;
 }
 

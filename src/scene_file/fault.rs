@@ -40,7 +40,8 @@ fn fault(path: &Path, text: &str, error: &toml::de::Error, takes: impl Fn(&str) 
 /// What is wrong with a key or a table that begins a line of `rest` and was there before.
 fn twice(rest: &str) -> String {
     let line = rest.lines().next().unwrap_or_default().trim();
-    match line.strip_prefix('[').and_then(|header| header.split_once(']')) {
+    let header = line.starts_with('[').then(|| line.trim_start_matches('['));
+    match header.and_then(|header| header.split_once(']')) {
         Some(("volume", _)) => "[volume] is there already; of several volumes each is a [[volume]]".into(),
         Some((name, _)) => format!("[{name}] is there already"),
         None => format!("{} is there already", line.split('=').next().unwrap_or_default().trim()),

@@ -26,7 +26,8 @@ pub struct ReadOptions {
 /// Where samples stand, instead of where their file says.
 #[derive(Clone, Debug, Default, PartialEq, clap::Args)]
 pub struct PlaceOptions {
-    /// World distance between samples along x, y and z, negative to turn an axis round (default: as the file says, or 1)
+    /// World distance between samples along x, y and z, negative to turn an axis round (default: as the file says, or
+    /// 1)
     #[arg(long, value_name = "DX,DY,DZ", value_delimiter = ',', allow_hyphen_values = true)]
     pub spacing: Option<Vec<f64>>,
     /// World position of the first sample (default: as the file says, or 0,0,0)
@@ -71,6 +72,18 @@ impl VolumeSource {
         flags.or(self).open(path)
     }
 
+    /// The path of the key that an error of its one volume is about.
+    pub(super) fn key_of(&self, error: &Error) -> &'static [&'static str] {
+        let text = error.to_string();
+        let about = |words: &[&str]| words.iter().any(|word| text.contains(word));
+        match self {
+            Self { array: Some(_), .. } if about(&["point data", "named arrays"]) => &["volume", "array"],
+            Self { spacing: Some(_), .. } if about(&["lattice", "axes", "spacing"]) => &["volume", "spacing"],
+            Self { origin: Some(_), .. } if about(&["lattice", "origin"]) => &["volume", "origin"],
+            _ => self.key(),
+        }
+    }
+
     /// Its one volume.
     pub(super) fn load(&self, folder: &Path, flags: &ReadOptions) -> Result<Volume> {
         self.check()?;
@@ -105,10 +118,12 @@ impl PlaceOptions {
             return Ok(lattice);
         }
         let (axes, now) = (lattice.axes(), lattice.spacing());
-        let spacing = triple(&self.spacing, "spacing", path)?.unwrap_or(now);
         let origin = triple(&self.origin, "origin", path)?.unwrap_or(lattice.origin());
-        let [x, y, z] = [0, 1, 2].map(|a| axes.col(a) / now[a] * spacing[a]);
-        Lattice::new(lattice.dims(), origin, DMat3::from_cols(x, y, z)).map_err(|e| e.in_file(path))
+        let axes = triple(&self.spacing, "spacing", path)?.map_or(axes, |spacing| {
+            let [x, y, z] = [0, 1, 2].map(|a| axes.col(a) / now[a] * spacing[a]);
+            DMat3::from_cols(x, y, z)
+        });
+        Lattice::new(lattice.dims(), origin, axes).map_err(|e| e.in_file(path))
     }
 }
 

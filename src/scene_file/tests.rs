@@ -89,6 +89,7 @@ fn errors_name_file_line_and_key() {
             "[volume]\nsize = 9\n[volume]\nsize = 9\n",
             "scene.toml:3: [volume] is there already; of several volumes each",
         ),
+        ("[volume]\nsize = 9\n[[volume]]\nsize = 9\n", "scene.toml:3: [volume] is there already; of several"),
         ("[box]\n[volume]\n [box]\n", "scene.toml:3: [box] is there already"),
     ] {
         let e = error_of(text);

@@ -62,6 +62,9 @@ pub struct VolumeStatistics {
 /// See [`VolumeStatistics::fill`].
 const APART: f64 = 90.0;
 
+/// The share of samples from which on a value is more than one of many.
+const COMMON: f64 = 0.01;
+
 /// Volumes of at most so many values may be of labels.
 const LABELS: usize = 32;
 
@@ -116,27 +119,29 @@ impl VolumeStatistics {
         statistics.percentiles = Some(PERCENTILES.map(|p| distribution.percentile(p)));
         statistics.histogram = Some(distribution.histogram());
         (statistics.commonest, statistics.commonest_share) = (Some(commonest), Some(share));
-        statistics.fill = distribution.is_apart(commonest).then_some(commonest);
+        statistics.fill = (share >= COMMON && distribution.is_apart(commonest)).then_some(commonest);
         let survey = sweep::Survey::of(volume, [min, max]);
         statistics.flat = survey.flat;
         let integer = !matches!(volume.samples(), Samples::F32(_) | Samples::F64(_));
         // Measured fields may never take the same value twice; then the fullest bin tells the background.
-        let background = if share >= 0.01 { commonest } else { distribution.fullest() };
+        let background = if share >= COMMON { commonest } else { distribution.fullest() };
         statistics.sweep = survey.suggest(background, integer).filter(|_| statistics.fill.is_none());
         statistics
     }
 
     /// Why no sweep is suggested and what to do, for people; `None` if one is.
     pub fn without_sweep(&self) -> Option<String> {
-        let why = match self.range {
-            _ if self.sweep.is_some() => return None,
-            None => "none of its samples is finite: it holds no isosurface".into(),
-            Some(_) if let (Some(fill), Some(share)) = (self.fill, self.commonest_share) => format!(
+        if let (None, Some(fill), Some(share)) = (self.sweep, self.fill, self.commonest_share) {
+            return Some(format!(
                 "{:.1} % of its samples are {}, far from all others, as if these were missing: make them NaN (other files \
                  than those of integers hold it), or choose a sweep (--isovalues, or `isovalues` in a scene file)",
                 100.0 * share,
                 brief(fill)
-            ),
+            ));
+        }
+        let why = match self.range {
+            _ if self.sweep.is_some() => return None,
+            None => "none of its samples is finite: it holds no isosurface".into(),
             Some([min, max]) if min < max => format!(
                 "its samples, {}, suggest none (they are too far apart, or no neighbours are finite); choose one \
                  (--isovalues, or `isovalues` in a scene file)",

@@ -27,7 +27,7 @@ fn files_are_told_apart_by_their_extension() {
     assert!(!at("c.png").exists());
     std::fs::write(at("d.xyz"), []).unwrap();
     let message = Volume::open(at("d.xyz")).unwrap_err().to_string();
-    assert!(message.contains("d.xyz") && message.contains(".nii.gz"), "{message}");
+    assert!(message.contains("d.xyz") && message.contains(".nii, "), "{message}");
     assert!(matches!(Volume::open(at("none.vti")), Err(Error::Io { .. })));
     std::fs::write(at("e.raw"), []).unwrap();
     assert!(Volume::open(at("e.raw")).unwrap_err().to_string().contains("no header"));

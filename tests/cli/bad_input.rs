@@ -180,7 +180,7 @@ fn messages_say_what_to_do_instead() {
     ] {
         refused(dir, verb, &["rho_%", "takes one frame"]);
     }
-    let outside = ["reference", "b.npy", "--isovalue", "0.0001", "-o", "r.ply"];
+    let outside = ["reference", "b.npy", "--isovalue", "0.0001", "-o", "r.ply", "--isovalues", "0.3,0.7"];
     refused(dir, &outside, &["--isovalue 0.0001: outside the sweep", "--isovalues"]);
     let bake = ["bake", "b.npy", "-o", "out.vti", "-q"];
     refused(dir, &[&bake[..], &["--tau", "inf"]].concat(), &["tau inf: must be above 0 and finite"]);

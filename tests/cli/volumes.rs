@@ -389,14 +389,15 @@ fn isovalues_outside_a_suggested_sweep_are_in_it() {
     refused(dir, &[&given[..], &few].concat(), &["outside the sweep 10 … 20"]);
 }
 
-/// A world of another handedness, walls of another unit, sweeps and colours beside the data, grids that leave points out.
+/// A world of another handedness, walls of another unit, sweeps and colours beside the data, grids that leave points
+/// out.
 #[test]
 fn what_does_not_fit_together_is_warned_of() {
     let dir = Folder::new();
     let dir = dir.path();
     let lattice = Lattice::aligned([9; 3], DVec3::splat(100.0), DVec3::splat(20.0)).unwrap();
     let h =
-        |o: usize| (20.0 * (1.0 - lattice.ijk(o).map(|i| (i as f64 - 4.0).powi(2)).iter().sum::<f64>() / 48.0)) as f32;
+        |o: usize| (20.0 * (1.0 - lattice.ijk(o).map(|i| (i as f64 - 4.0).powi(2)).iter().sum::<f64>() / 20.0)) as f32;
     let samples = Samples::F32((0..lattice.len()).map(h).collect());
     let mut volume = Volume::new("v", lattice.clone(), samples).unwrap();
     volume.write(dir.join("v.vti")).unwrap();
@@ -408,8 +409,10 @@ fn what_does_not_fit_together_is_warned_of() {
     fs::write(dir.join("m.mtl"), "newmtl wall\nKd 0.5 0.5 0.5\nnewmtl lamp\nKe 1 1 1\n").unwrap();
     fs::write(dir.join("unit.obj"), format!("mtllib m.mtl\n{}{}", square(0.0, "wall"), square(1.0, "lamp"))).unwrap();
     let bake = |args: &[&str]| {
-        let given = ["bake", "v.vti", "-o", "o.vti", "--isovalues", "5,15", "--engine", "sweep"];
-        text(&ok(dir, &[&given[..], &QUICK, args].concat()).stderr)
+        let given =
+            ["bake", "v.vti", "-o", "o.vti", "--directions", "8", "--light-points", "4", "--wall-resolution", "8"];
+        let sweep: &[&str] = if args.contains(&"--isovalues") { &[] } else { &["--isovalues", "5,15"] };
+        text(&ok(dir, &[&given[..], sweep, args].concat()).stderr)
     };
     let nothing = bake(&[]);
     assert!(!nothing.contains("warning"), "{nothing}");

@@ -60,12 +60,12 @@ impl Plan {
         self.memory.check_machine(self.settings.engine)
     }
 
-    /// Prints what a user may not expect, but for what has been `said`.
+    /// Prints what a user may not expect, but for what has been `said`; of one `frame` of many, perhaps.
     ///
     /// # Errors
     /// As [`warnings`].
-    pub(super) fn warn(&self, said: &mut BTreeSet<String>) -> Result<()> {
-        for warning in warnings(self.scene(), &self.loaded.volumes(), &self.options, &self.settings)? {
+    pub(super) fn warn(&self, said: &mut BTreeSet<String>, frame: bool) -> Result<()> {
+        for warning in warnings(self.scene(), &self.loaded.volumes(), &self.options, &self.settings, frame)? {
             if said.insert(warning.clone()) {
                 say!("warning: {warning}");
             }

@@ -9,10 +9,11 @@ use crate::illumination_grid::GridSize;
 use crate::polygon::Polygon;
 use crate::scene::{Scene, Surface};
 use crate::sweep::{lit_mostly_within, lit_within_solids};
-use crate::volume::Volume;
+use crate::volume::{Lattice, Volume};
 use glam::DVec3;
 
-/// What a user may not expect of the bake of `scene` that `options` ask for and `settings` describe.
+/// What a user may not expect of the bake of `scene`, which may be one `frame` of many, that `options` ask for and
+/// `settings` describe.
 ///
 /// # Errors
 /// As [`left_out`].
@@ -21,6 +22,7 @@ pub(super) fn warnings(
     volumes: &[&Volume],
     options: &BakeOptions,
     settings: &BakeSettings,
+    frame: bool,
 ) -> Result<Vec<String>> {
     let mut lines = options.idle(settings);
     for volume in volumes {
@@ -76,9 +78,11 @@ pub(super) fn warnings(
         lines.extend(long_voxels(scene));
     }
     lines.extend(spaces(volumes));
-    lines.extend(scene.members().iter().zip(volumes).filter_map(|(m, volume)| beyond(m.field.sweep(), volume)));
+    // The sweep of a series is that of all its frames.
+    let alone = scene.members().into_iter().zip(volumes).filter(|_| !frame);
+    lines.extend(alone.filter_map(|(m, volume)| beyond(m.field.sweep(), volume)));
     lines.extend(scene.members().iter().filter_map(|m| single_colour(&m.surface)));
-    lines.extend(resampled(scene, settings.grid));
+    lines.extend(scene.members().iter().find_map(|m| resampled(m.field.lattice(), settings.grid)));
     lines.extend(elsewhere(scene));
     Ok(lines)
 }
@@ -120,8 +124,8 @@ fn single_colour(surface: &Surface) -> Option<String> {
 }
 
 /// Of a grid that does not hold the volume's points.
-fn resampled(scene: &Scene, grid: GridSize) -> Option<String> {
-    let (volume, grid) = (scene.lattice(), grid.lattice(scene.lattice()).ok()?);
+fn resampled(volume: &Lattice, grid: GridSize) -> Option<String> {
+    let grid = grid.lattice(volume).ok()?;
     let whole = grid.cells().iter().zip(volume.cells()).all(|(fine, coarse)| fine % coarse == 0);
     let [[x, y, z], [nx, ny, nz]] = [grid.dims(), volume.dims()];
     (!whole).then(|| {
@@ -145,26 +149,28 @@ fn elsewhere(scene: &Scene) -> Option<String> {
     let corners = members.iter().flat_map(|m| m.field.lattice().corners().map(|p| m.field.lattice().to_world(p)));
     let [volume_lo, volume_hi] = bounds(&mut corners.into_iter());
     let size = volume_hi - volume_lo;
-    // The volumes are [0, 1]³.
-    let of = |p: &Polygon| bounds(&mut p.vertices().iter().map(|x| (*x - volume_lo) / size));
+    let of = |p: &Polygon| bounds(&mut p.vertices().iter().copied());
     let away = |p: &&Polygon| {
         let [lo, hi] = of(p);
-        p.emission == DVec3::ZERO && (lo - 1.0).max(-hi).max_element() > FAR
+        let gap = (lo - volume_hi).max(volume_lo - hi).max_element();
+        p.emission == DVec3::ZERO && gap > FAR * size.max_element()
     };
     if let Some(p) = scene.polygons().iter().find(away) {
         return Some(format!("'{}' is more than {FAR} times the volume's size away; is it in the same unit?", p.name));
     }
     let all = scene.polygons().iter().map(of);
     let [lo, hi] = all.fold([DVec3::INFINITY, DVec3::NEG_INFINITY], |[a, b], [lo, hi]| [a.min(lo), b.max(hi)]);
-    let (extent, within) = (hi - lo, (hi.min(DVec3::ONE) - lo.max(DVec3::ZERO)).max(DVec3::ZERO));
-    // Lamps that hang side by side may hang anywhere.
-    let room = extent.min_element() > 1e-3 * extent.max_element();
-    (room && within.element_product() < HELD).then(|| {
+    let extent = hi - lo;
+    let held = (hi.min(volume_hi) - lo.max(volume_lo)).max(DVec3::ZERO) / size;
+    // A wall, or lamps without any, may be anywhere.
+    let walls = scene.polygons().iter().any(|p| p.emission == DVec3::ZERO);
+    let room = walls && extent.min_element() > 1e-3 * extent.max_element();
+    (room && held.element_product() < HELD).then(|| {
         let spans = |lo: DVec3, hi: DVec3| [0, 1, 2].map(|a| brief_span([lo[a], hi[a]])).join(" × ");
         format!(
             "walls and luminaires stand beside the volume, not around it: they span {}, the volume {}; are both in the \
              same unit and place?",
-            spans(volume_lo + lo * size, volume_lo + hi * size),
+            spans(lo, hi),
             spans(volume_lo, volume_hi)
         )
     })
@@ -188,7 +194,7 @@ mod tests {
     use super::*;
     use crate::field::Field;
     use crate::scene::Boundary;
-    use crate::volume::{Lattice, Samples};
+    use crate::volume::Samples;
 
     /// A grid that no lattice can be is no advice, nor a fault of a bake that did not ask for it.
     #[test]
@@ -204,5 +210,32 @@ mod tests {
         assert!(advice.contains("3.2 times") && advice.contains("13×3×3"), "{advice}");
         assert_eq!(said([5, 3, 3], DVec3::new(1.0, 1.3, 1.0)), None);
         assert_eq!(said([600_000, 2, 2], DVec3::new(20.0, 1.0, 1.0)), None);
+    }
+
+    /// Rooms much higher than a thin volume, lamps by themselves and walls beyond an open room are where they are meant
+    /// to be; a room of another size or place is not.
+    #[test]
+    fn surroundings_elsewhere_are_told() {
+        let lattice = Lattice::aligned([33, 33, 3], DVec3::ZERO, DVec3::ONE).unwrap();
+        let samples = (0..lattice.len()).map(|o| (o % 2) as u8).collect();
+        let volume = Volume::new("v", lattice, Samples::U8(samples)).unwrap();
+        let field = std::sync::Arc::new(Field::new(&volume, Sweep::new(0.2, 0.8).unwrap()).unwrap());
+        let square = |z: f64, half: f64, emission: f64| {
+            let at = |x: f64, y: f64| DVec3::new(16.0 + half * x, 16.0 + half * y, z);
+            let corners = vec![at(-1.0, -1.0), at(1.0, -1.0), at(1.0, 1.0), at(-1.0, 1.0)];
+            Polygon::new("square", corners, DVec3::splat(0.5), DVec3::splat(emission)).unwrap()
+        };
+        let told = |polygons: Vec<Polygon>| {
+            elsewhere(&Scene::new(field.clone(), Surface::default(), Boundary::Open, polygons).unwrap())
+        };
+        assert_eq!(told(Vec::new()), None);
+        assert_eq!(told(vec![square(-1.0, 20.0, 0.0), square(40.0, 20.0, 0.0), square(39.0, 5.0, 1.0)]), None);
+        assert_eq!(told(vec![square(50.0, 5.0, 1.0), square(60.0, 5.0, 1.0)]), None);
+        assert_eq!(told(vec![square(900.0, 5.0, 1.0)]), None);
+        assert_eq!(told(vec![square(-1.0, 20.0, 0.0)]), None);
+        let beside = told(vec![square(50.0, 20.0, 0.0), square(60.0, 20.0, 1.0)]).unwrap();
+        assert!(beside.contains("-4 … 36 × -4 … 36 × 50 … 60, the volume 0 … 32 × 0 … 32 × 0 … 2"), "{beside}");
+        assert!(told(vec![square(0.0, 1.0, 0.0), square(1.0, 1.0, 1.0)]).is_some());
+        assert!(told(vec![square(400.0, 20.0, 0.0)]).unwrap().contains("'square' is more than 10 times"));
     }
 }

@@ -1,0 +1,35 @@
+//! What the world's axes mean in a patient.
+
+/// Where a patient's directions lie in the world: the first letter names what x grows towards, and so on. Coordinates
+/// are never turned from one to the other; formats that hold the name pass it on.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Space {
+    /// Left, posterior, superior: that of DICOM and ITK, which is meant where nothing is said.
+    #[default]
+    LeftPosteriorSuperior,
+    /// Right, anterior, superior: that of NIfTI.
+    RightAnteriorSuperior,
+    /// Left, anterior, superior.
+    LeftAnteriorSuperior,
+}
+
+impl Space {
+    /// NRRD's name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Space::LeftPosteriorSuperior => "left-posterior-superior",
+            Space::RightAnteriorSuperior => "right-anterior-superior",
+            Space::LeftAnteriorSuperior => "left-anterior-superior",
+        }
+    }
+
+    /// The space of a [`Space::name`] or its initials.
+    pub fn from_name(name: &str) -> Option<Self> {
+        match name.to_ascii_lowercase().as_str() {
+            "left-posterior-superior" | "lps" => Some(Space::LeftPosteriorSuperior),
+            "right-anterior-superior" | "ras" => Some(Space::RightAnteriorSuperior),
+            "left-anterior-superior" | "las" => Some(Space::LeftAnteriorSuperior),
+            _ => None,
+        }
+    }
+}
