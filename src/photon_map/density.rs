@@ -245,13 +245,14 @@ impl<'a> PhotonDensity<'a> {
         let wanted = self.settings.photons as f32;
         // Photons of equal power that would be as noisy as those around.
         let count = |near: &[Neighbour]| {
-            let (mut sum, mut squares) = (0.0f32, 0.0f32);
+            // Squares of sums do not fit f32 where light is bright.
+            let (mut sum, mut squares) = (0f64, 0f64);
             for neighbour in near {
                 let tally = &tallies[neighbour.number as usize];
-                sum += tally.luminance;
-                squares += tally.squares;
+                sum += f64::from(tally.luminance);
+                squares += f64::from(tally.squares);
             }
-            if squares > 0.0 { sum * (sum / squares) } else { 0.0 }
+            if squares > 0.0 { (sum * sum / squares) as f32 } else { 0.0 }
         };
         // Their number grows as the cube of the radius; where too few tell how fast, look farther.
         let mut known = first.min(MOST);
