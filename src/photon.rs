@@ -219,8 +219,8 @@ const CHUNK: u64 = 1 << 14;
 /// Chunks whose parts are joined at once.
 const ROUND: usize = 32;
 
-/// What power of a photon f32 holds to a hundredth, whatever its density in isovalue makes of it.
-const POWERS: std::ops::RangeInclusive<f64> = 1e-41..=1e36;
+/// What power of a photon f32 holds to a hundredth or two, whatever its density in isovalue makes of it.
+const POWERS: std::ops::RangeInclusive<f64> = 1e-43..=1e36;
 
 /// Whether f32 holds the power of `count` photons, which is that of lengths squared times emission.
 ///
