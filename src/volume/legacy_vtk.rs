@@ -253,7 +253,7 @@ fn attributes(
     (mut section, mut tuples): Part,
     name: Option<&str>,
 ) -> Result<Samples> {
-    // The writer of names with blanks.
+    // VTK's writer puts %20 for a blank in a name.
     let named = |word: &str| name.is_none_or(|name| name == word.replace("%20", " "));
     let mut field: Option<Array> = None;
     while let Some(words) = cursor.words() {
