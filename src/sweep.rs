@@ -37,7 +37,6 @@ mod points;
 mod receivers;
 mod reflect;
 mod replicate;
-mod runs;
 mod scan;
 mod segments;
 mod settling;
@@ -47,6 +46,7 @@ mod slits;
 mod solid;
 mod state;
 mod totals;
+mod work_queue;
 
 use crate::checkpoint::Saved;
 use crate::error::{Error, Result};
@@ -64,14 +64,14 @@ use glam::DVec3;
 use grid::Geometry;
 use lit_rows::LitRows;
 use open_share::open_over_sweep;
-use planes::Spare;
+use planes::PlanePool;
 use points::Points;
 use rayon::prelude::*;
-use reflect::Mirror;
+use reflect::Reflector;
 pub(crate) use replicate::bright;
 use slits::Slits;
 use state::State;
-use totals::Focus;
+use totals::Deblur;
 
 /// How to sweep.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -274,36 +274,36 @@ pub fn sweep_resumable(
         state.counts.valid =
             (0..nodes).into_par_iter().with_min_len(1 << 14).filter(|&at| geometry.valid(at)).count() as u64;
     }
-    let spare = Spare::default();
+    let pool = PlanePool::default();
     let isa = Isa::current();
     let run = Run {
         scene,
         settings,
         geometry: &geometry,
         slits: &slits,
-        mirror: Mirror::new(scene, &geometry, &slits, isa),
+        reflector: Reflector::new(scene, &geometry, &slits, isa),
         sides: &sides,
         isa,
         saved,
-        spare: &spare,
+        pool: &pool,
     };
     let dims = scene.lattice().dims();
-    let focus = Focus { dims, lit: |at| geometry.lit(at) };
+    let deblur = Deblur { dims, lit: |at| geometry.lit(at) };
     run.direct(&mut state, &mut flats, tick).ok_or(Error::Interrupted)?;
     while state.done() < replicates {
         let done = state.done() as f64;
         let progress = |x: f64| tick(DIRECT_SHARE + (1.0 - DIRECT_SHARE) * (done + x) / replicates as f64);
         let indirect = run.replicate(&mut state, passes.take(), &mut flats, &progress).ok_or(Error::Interrupted)?;
-        state.add(&indirect, &flats, (scene, geometry.lit_rows(), &focus));
-        spare.keep(indirect.into_iter().flatten());
+        state.add(&indirect, &flats, (scene, geometry.lit_rows(), &deblur));
+        pool.keep(indirect.into_iter().flatten());
     }
-    spare.clear();
+    pool.clear();
     let (lit, rows) = (geometry.all_lit(), geometry.into_lit_rows());
     saved.save(0, || state.bytes(None, &flats));
     let State { total, flats: mut sums, bounces, residual, counts, .. } = state;
     sums.iter_mut().flatten().flatten().for_each(|x| *x /= replicates as f32);
     let flats = flats.export(&sums, &sides, scene.surface.outside);
-    let mut sides = total.finish(&rows, &Focus { dims, lit: |at| lit[at] }, settings.direct);
+    let mut sides = total.finish(&rows, &Deblur { dims, lit: |at| lit[at] }, settings.direct);
     let world = |o: usize| scene.lattice().to_world(DVec3::from_array(scene.lattice().ijk(o).map(|i| i as f64)));
     let dark = slits.hidden.iter().map(|hidden| hidden.0).filter(|&o| scene.covers(world(o)));
     for o in dark {
@@ -345,11 +345,11 @@ struct Run<'a> {
     settings: &'a SweepSettings,
     geometry: &'a Geometry<'a>,
     slits: &'a Slits,
-    mirror: Mirror<'a>,
+    reflector: Reflector<'a>,
     sides: &'a [Side],
     isa: Isa,
     saved: Saved<'a>,
-    spare: &'a Spare,
+    pool: &'a PlanePool,
 }
 
 impl Run<'_> {
@@ -379,7 +379,7 @@ impl Run<'_> {
                 sides: self.sides,
                 points: Points { seed: s.seed, replicate: number, replicates, count: points },
                 isa: self.isa,
-                spare: self.spare,
+                pool: self.pool,
             };
             let Some(direct) = direct.light(flats, &mut ask) else {
                 self.saved.save(0, || state.bytes(None, flats));
@@ -387,12 +387,12 @@ impl Run<'_> {
             };
             state.counts.shadow_rays += state.counts.valid * lights as u64;
             let rest = state.total.add_direct(direct, self.scene, self.geometry.lit_rows());
-            self.spare.keep(rest.into_iter().flatten());
+            self.pool.keep(rest.into_iter().flatten());
         }
         if first < replicates {
             state.total.average_direct();
             // Passes need fewer planes.
-            self.spare.clear();
+            self.pool.clear();
             flats.average_direct(state.total.lit);
         }
         Some(())

@@ -11,7 +11,7 @@ use super::fans::Fans;
 use super::flats::Flats;
 use super::grid::Geometry;
 use super::open_share::OpenShare;
-use super::planes::{Planes, Spare};
+use super::planes::{PlanePool, Planes};
 use super::points::Points;
 use super::receivers::Emitter;
 use crate::flattened::Side;
@@ -53,7 +53,7 @@ pub(super) struct Direct<'a> {
     pub sides: &'a [Side],
     pub points: Points,
     pub isa: Isa,
-    pub spare: &'a Spare,
+    pub pool: &'a PlanePool,
 }
 
 /// Σ V g and Σ g of every side at every place of planes, over points of a luminaire; whatever factor all g of one have.
@@ -63,7 +63,7 @@ impl Direct<'_> {
     /// Direct irradiance of every node, one set of planes per side; that of the flats is added to theirs at the end.
     /// `tick` is asked before every point; `None` if it stopped the work.
     pub(super) fn light(&self, flats: &mut Flats, tick: &mut dyn FnMut() -> bool) -> Option<Vec<Planes>> {
-        let mut planes: Vec<Planes> = self.sides.iter().map(|_| self.spare.black(self.geometry.places())).collect();
+        let mut planes: Vec<Planes> = self.sides.iter().map(|_| self.pool.black(self.geometry.places())).collect();
         let corners = self.scene.lattice().corners().map(|p| self.scene.lattice().to_world(p));
         let lights = (0..).zip(self.scene.luminaires());
         let shares: Vec<OpenShare> = lights.clone().map(|light| self.points.open_share(self.scene, light)).collect();

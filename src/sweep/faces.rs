@@ -40,13 +40,13 @@ pub(super) fn inwards(j: usize, n: usize) -> isize {
 
 /// The two lines along u around node `i` of `nu`, and the weights of the second and of the row before, as
 /// [`super::accumulate`] has them: on a side the first is nearer, and light is extrapolated linearly from both
-/// (`goes_on`) or clamped. `line0` is the line just beyond node 0, −1 of which is missing.
+/// (`extrapolates`) or clamped. `line0` is the line just beyond node 0, −1 of which is missing.
 #[inline(always)]
 pub(super) fn around(
     (i, nu): (usize, usize),
     line0: usize,
     [fu, fv]: [f32; 2],
-    goes_on: bool,
+    extrapolates: bool,
 ) -> ([usize; 2], [f32; 2]) {
     let (lines, f) = match i {
         _ if nu == 2 => ([line0, line0], 0.0),
@@ -54,7 +54,7 @@ pub(super) fn around(
         i if i == nu - 1 => ([line0 + nu - 2, line0 + nu - 3], fu - 1.0),
         i => ([line0 + i, line0 + i - 1], fu),
     };
-    (lines, if goes_on { [f, fv] } else { [f, fv].map(|f| f.clamp(0.0, 1.0)) })
+    (lines, if extrapolates { [f, fv] } else { [f, fv].map(|f| f.clamp(0.0, 1.0)) })
 }
 
 /// Whether node `j` of `n` is on a side.
@@ -77,14 +77,14 @@ const NONE: u16 = u16::MAX;
 
 /// What lit nodes on Ω's faces touch: per face, which is 2 · axis, + 1 for the far one, and node of it the number of a
 /// wall that reflects, or [`NONE`]; nothing of faces that no wall touches.
-pub(super) struct Touching<'a> {
+pub(super) struct FaceWalls<'a> {
     scene: &'a Scene,
     walls: [Vec<u16>; 6],
 }
 
 /// Radiance of the walls that nodes on Ω's faces touch.
-pub(super) struct Touched<'a> {
-    touching: &'a Touching<'a>,
+pub(super) struct FaceWallLight<'a> {
+    face_walls: &'a FaceWalls<'a>,
     radiance: [Vec<Half4>; 6],
 }
 
@@ -108,7 +108,7 @@ fn node(dims: [usize; 3], face: usize, at: usize) -> [usize; 3] {
     ijk
 }
 
-impl<'a> Touching<'a> {
+impl<'a> FaceWalls<'a> {
     #[allow(clippy::cast_possible_truncation, reason = "fewer than 2¹⁶ polygons")]
     pub(super) fn new(scene: &'a Scene, geometry: &Geometry, flats: &Flats) -> Self {
         let (lattice, dims) = (scene.lattice(), geometry.dims);
@@ -141,9 +141,10 @@ impl<'a> Touching<'a> {
 
     /// What `side` of the level sets sees there now, times the scale that [`Flats::packed`] has.
     #[allow(clippy::cast_possible_truncation, reason = "texture coordinates")]
-    pub(super) fn now(&self, geometry: &Geometry, flats: &Flats, side: Side) -> Touched<'_> {
+    pub(super) fn now(&self, geometry: &Geometry, flats: &Flats, side: Side) -> FaceWallLight<'_> {
         let (lattice, dims) = (self.scene.lattice(), geometry.dims);
-        let stands = Light { b: &[], flats: &flats.packed, isovalues: flats.isovalues, axis: &flats.axis, across: 0 };
+        let stands =
+            Light { b: &[], back: &[], flats: &flats.packed, isovalues: flats.isovalues, axis: &flats.axis, across: 0 };
         let radiance = std::array::from_fn(|face| {
             let shown = |(at, &number): (usize, &u16)| {
                 let Some(wall) = self.scene.polygons().get(usize::from(number)) else { return Half4::default() };
@@ -157,17 +158,17 @@ impl<'a> Touching<'a> {
             };
             self.walls[face].par_iter().enumerate().map(shown).collect()
         });
-        Touched { touching: self, radiance }
+        FaceWallLight { face_walls: self, radiance }
     }
 }
 
-impl Touched<'_> {
+impl FaceWallLight<'_> {
     /// Radiance of the wall that node `ijk` touches with the side of `axis`.
     #[inline]
     fn at(&self, axis: usize, ijk: [usize; 3]) -> Option<[f32; 3]> {
         let face = 2 * axis + usize::from(ijk[axis] > 0);
-        let at = place(self.touching.scene.lattice().dims(), axis, ijk);
-        let wall = *self.touching.walls[face].get(at)?;
+        let at = place(self.face_walls.scene.lattice().dims(), axis, ijk);
+        let wall = *self.face_walls.walls[face].get(at)?;
         (wall != NONE).then(|| colour(self.radiance[face][at]))
     }
 }
@@ -186,9 +187,9 @@ pub(super) struct Sides<'a> {
     pub line0: usize,
     pub weights: [f32; 2],
     /// As [`around`].
-    pub goes_on: bool,
+    pub extrapolates: bool,
     pub stands: Light<'a>,
-    pub touched: &'a Touched<'a>,
+    pub wall_light: &'a FaceWallLight<'a>,
 }
 
 impl Sides<'_> {
@@ -198,13 +199,13 @@ impl Sides<'_> {
     pub(super) fn radiance(&self, i: usize, c: f32, forward: bool) -> [f32; 3] {
         let [nu, nv, _] = self.layout.dims;
         let [j, k] = self.row;
-        let ([near, far], [f, fv]) = around((i, nu), self.line0, self.weights, self.goes_on);
+        let ([near, far], [f, fv]) = around((i, nu), self.line0, self.weights, self.extrapolates);
         let sides = [leaves(i, nu, self.slope[0]), leaves(j, nv, self.slope[1])];
         if let Some(side) = sides.iter().position(|side| *side == Some(forward)) {
             let axes = self.layout.axes;
             let mut ijk = [0; 3];
             (ijk[axes[0]], ijk[axes[1]], ijk[axes[2]]) = (i, j, k);
-            if let Some(radiance) = self.touched.at(axes[side], ijk) {
+            if let Some(radiance) = self.wall_light.at(axes[side], ijk) {
                 return radiance;
             }
             let nearest = if f > 0.5 { far } else { near };

@@ -5,9 +5,9 @@
 use super::faces::around;
 use super::fans::{HIGHER, LOWER, sample};
 use super::grid::ring;
-use super::half::{Half4, colour};
+use super::half::colour;
 use super::pack::{LANES, OUTSIDE, Pack};
-use super::scan::{Light, Way};
+use super::scan::{Light, ScanRule};
 
 /// Nodes beside gaps that are lit, by rows of memory.
 pub(super) struct Rims {
@@ -100,8 +100,8 @@ pub(super) struct Around {
 
 impl Around {
     /// Those of node `i` of `nu`, as [`around`] has them.
-    pub(super) fn new(i: (usize, usize), line0: usize, weights: [f32; 2], goes_on: bool) -> Self {
-        let (lines, [f, fv]) = around(i, line0, weights, goes_on);
+    pub(super) fn new(i: (usize, usize), line0: usize, weights: [f32; 2], extrapolates: bool) -> Self {
+        let (lines, [f, fv]) = around(i, line0, weights, extrapolates);
         Self { lines, weights: [1.0 - fv, fv].map(|row| [row * (1.0 - f), row * f]) }
     }
 
@@ -189,12 +189,13 @@ impl Pack {
     }
 
     /// Looks again along lanes with gaps, which [`Pack::scan`] takes for ends of Ω: beside one the sample itself stands
-    /// for what is missing, as in the first and the last slice, and rays go on beyond. `back` holds B of the other
-    /// side, nothing if that is dark. Writes down in `gaps` which lanes of a slice have no sample.
+    /// for what is missing, as in the first and the last slice, and rays go on beyond. Writes down in `gaps` which
+    /// lanes of a slice have no sample.
     #[inline(always)]
     pub(super) fn look_through_gaps(
         &mut self,
-        (way, light, back): (Way, Light, &[Half4]),
+        rule: ScanRule,
+        light: Light,
         out: &mut [Vec<f32>],
         gaps: &mut [u16],
         (width, start): (usize, usize),
@@ -216,7 +217,7 @@ impl Pack {
             while again != 0 {
                 let lane = again.trailing_zeros() as usize;
                 again &= again - 1;
-                let rgb = self.look_again((way, light, back), (row, lane));
+                let rgb = self.look_again(rule, light, (row, lane));
                 for c in 0..3 {
                     out[c][(row - 1) * width + start + lane] = rgb[c];
                 }
@@ -249,7 +250,7 @@ impl Pack {
     }
 
     /// The radiance that a sample's ray meets that leaves downhill, through gaps and beside them.
-    fn look_again(&self, (way, light, back): (Way, Light, &[Half4]), (row, lane): (usize, usize)) -> [f32; 3] {
+    fn look_again(&self, rule: ScanRule, light: Light, (row, lane): (usize, usize)) -> [f32; 3] {
         let value = self.h[row][lane];
         let beside = |row: usize| {
             let h = self.h[row.clamp(1, self.h.len() - 2)][lane];
@@ -260,24 +261,24 @@ impl Pack {
             Ok(node) => Met::Front(node),
             // Cuts hide the gaps beyond.
             Err(end) if end != self.lasts[usize::from(!forward)][lane] as usize => Met::End(end),
-            Err(_) if self.cuts.iter().any(|cut| cut.lane == lane) => self.step_beyond(way, (row, lane), forward),
-            Err(_) => self.beyond(way, (row, lane), forward),
+            Err(_) if self.cuts.iter().any(|cut| cut.lane == lane) => self.step_beyond(rule, (row, lane), forward),
+            Err(_) => self.beyond(rule, (row, lane), forward),
         };
         match met {
             Met::Front(node) => colour(light.b[node as usize]),
-            Met::Back(node) => colour(back.get(node as usize).copied().unwrap_or_default()),
-            Met::End(place) => light.end(place, way.sign * value),
-            Met::Within(place) => light.other_end(place, way.sign * value),
+            Met::Back(node) => colour(light.back.get(node as usize).copied().unwrap_or_default()),
+            Met::End(place) => light.end(place, rule.sign * value),
+            Met::Within(place) => light.other_end(place, rule.sign * value),
             Met::Dark => [0.0; 3],
         }
     }
 
     /// What the ray of a sample meets that meets nothing up to the next gap, or up to the end of its line, along a lane
     /// without cuts: from run to run of samples, by links outside the solid.
-    fn beyond(&self, way: Way, (row, lane): (usize, usize), forward: bool) -> Met {
+    fn beyond(&self, rule: ScanRule, (row, lane): (usize, usize), forward: bool) -> Met {
         let d = usize::from(!forward);
         let value = self.h[row][lane];
-        let above = |h: f32| if way.strict { h > value } else { h >= value };
+        let above = |h: f32| if rule.strict { h > value } else { h >= value };
         let mut row = self.reentries[d][row][lane];
         let returned = row != NONE;
         while row != NONE {
@@ -296,7 +297,7 @@ impl Pack {
                 loop {
                     let next = if forward { at + 1 } else { at.wrapping_sub(1) };
                     if next >= self.h.len() || !self.was_read(next) {
-                        return self.exit(way, (value, returned), lane, forward);
+                        return self.exit(rule, (value, returned), lane, forward);
                     }
                     let h = self.h[next][lane];
                     if h == OUTSIDE {
@@ -311,17 +312,17 @@ impl Pack {
             }
             row = self.reentries[d][row as usize][lane];
         }
-        self.exit(way, (value, returned), lane, forward)
+        self.exit(rule, (value, returned), lane, forward)
     }
 
     /// What a ray of isovalue `value` meets that meets no level set, whether it came back from a gap (`returned`) or
     /// not: what stands at the end of its line; from within the solid a cap, which is black, or a wall as the other
     /// side sees it.
-    fn exit(&self, way: Way, (value, returned): (f32, bool), lane: usize, forward: bool) -> Met {
+    fn exit(&self, rule: ScanRule, (value, returned): (f32, bool), lane: usize, forward: bool) -> Met {
         let end = self.lasts[usize::from(!forward)][lane] as usize;
         match self.border(lane, forward) {
-            Some(h) if way.capped && returned && h >= value => Met::Dark,
-            Some(h) if returned && (h > value || !way.strict && h == value) => Met::Within(end),
+            Some(h) if rule.capped && returned && h >= value => Met::Dark,
+            Some(h) if returned && (h > value || !rule.strict && h == value) => Met::Within(end),
             _ => Met::End(end),
         }
     }
@@ -334,15 +335,15 @@ impl Pack {
     }
 
     /// The same along a lane with cuts, sample by sample.
-    fn step_beyond(&self, way: Way, (row, lane): (usize, usize), forward: bool) -> Met {
+    fn step_beyond(&self, rule: ScanRule, (row, lane): (usize, usize), forward: bool) -> Met {
         let d = usize::from(!forward);
         let (mut from, mut gone, mut returned) = (row, false, false);
         let value = self.h[from][lane];
-        let mut crossing = Crossing::new(value, way.strict);
+        let mut crossing = Crossing::new(value, rule.strict);
         let mut position = self.awake.binary_search(&u32::try_from(row).expect("a row")).expect("a row that was read");
         loop {
             position = if forward { position + 1 } else { position.wrapping_sub(1) };
-            let Some(&row) = self.awake.get(position) else { return self.exit(way, (value, returned), lane, forward) };
+            let Some(&row) = self.awake.get(position) else { return self.exit(rule, (value, returned), lane, forward) };
             let row = row as usize;
             let between = from.min(row)..from.max(row);
             let mut cuts = self.cuts.iter().filter(|c| c.lane == lane && between.contains(&c.row));
@@ -380,7 +381,7 @@ mod tests {
     use crate::isovalue_axis::IsovalueAxis;
     use crate::rng::{Rng, Stage};
     use crate::sweep::fans::{SAMPLED, march_row};
-    use crate::sweep::half::{decode, encode};
+    use crate::sweep::half::{Half4, decode, encode};
     use crate::sweep::pack::Cut;
 
     /// Samples of a line: small numbers, so that many are as great as others, and gaps.
@@ -440,12 +441,13 @@ mod tests {
             pack.spans = [[0.0; LANES], [(ROWS - 3) as f64; LANES]];
             pack.cuts = vec![Cut { row: 14, lane: 3, places: [12, 16] }, Cut { row: 27, lane: 3, places: [20, 24] }];
             pack.open_gaps();
-            let way = Way { strict: seed % 2 == 1, sign: 1.0, capped: seed % 4 == 2 };
-            let light = Light { b: &front, flats: &flats, isovalues: 4, axis: &IsovalueAxis::EVEN, across: 0 };
+            let rule = ScanRule { strict: seed % 2 == 1, sign: 1.0, capped: seed % 4 == 2 };
+            let light =
+                Light { b: &front, back: &back, flats: &flats, isovalues: 4, axis: &IsovalueAxis::EVEN, across: 0 };
             let mut out = vec![vec![0f32; (ROWS - 2) * LANES]; 3];
-            pack.scan(way, light, &mut out, (LANES, 0));
+            pack.scan(rule, light, &mut out, (LANES, 0));
             let mut missing = [0; ROWS - 2];
-            Isa::current().look_through_gaps(&mut pack, (way, light, &back), &mut out, &mut missing, (LANES, 0));
+            Isa::current().look_through_gaps(&mut pack, rule, light, &mut out, &mut missing, (LANES, 0));
             for (slice, missing) in missing.iter().enumerate() {
                 let there = |lane: usize| missing >> lane & 1 == 0;
                 assert!((0..LANES).all(|lane| there(lane) == (pack.h[slice + 1][lane] != OUTSIDE)), "slice {slice}");
@@ -460,7 +462,7 @@ mod tests {
                     let beside = |row: usize| if h(row) == OUTSIDE { value } else { h(row) };
                     // Beyond the first and the last slice the sample itself stands for what is missing.
                     let forward = beside((row + 1).min(ROWS - 2)) < beside((row - 1).max(1));
-                    let above = |row: usize| if way.strict { h(row) > value } else { h(row) >= value };
+                    let above = |row: usize| if rule.strict { h(row) > value } else { h(row) >= value };
                     let rest: Vec<usize> = if forward { (row..ROWS).collect() } else { (0..=row).rev().collect() };
                     let mut expected = flats[if forward { 4 } else { 8 }];
                     let (mut gone, mut returned) = (false, false);
@@ -486,7 +488,7 @@ mod tests {
                         }
                         if to == 0 || to == ROWS - 1 {
                             counts[2] += usize::from(gone);
-                            if way.capped && returned && h(from) != OUTSIDE && above(from) {
+                            if rule.capped && returned && h(from) != OUTSIDE && above(from) {
                                 expected = [encode(0.0); 4];
                                 counts[4] += 1;
                             }

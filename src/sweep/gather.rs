@@ -4,7 +4,7 @@ use super::accumulate::{Lines, cosine};
 use super::arrive;
 use super::directions::{Layout, Shear};
 use super::ends::{Ends, Standing};
-use super::faces::{RowEnds, Sides, Touched, Touching, inwards, note, on_side};
+use super::faces::{FaceWallLight, FaceWalls, RowEnds, Sides, inwards, note, on_side};
 use super::flats::Flats;
 use super::gaps::Around;
 use super::grid::{Geometry, Source};
@@ -13,11 +13,11 @@ use super::incoming::{Arrivals, Incoming};
 use super::lit_rows::LitRows;
 use super::normals::decode;
 use super::pack::{LANES, Pack, Plan};
-use super::planes::{Planes, Spare};
+use super::planes::{PlanePool, Planes};
 use super::reflect::Reflected;
-use super::runs::Runs;
-use super::scan::{Light, Way};
+use super::scan::{Light, ScanRule};
 use super::simd::prefetch;
+use super::work_queue::WorkQueue;
 use crate::flattened::Side;
 use crate::isa::Isa;
 use crate::scene::Scene;
@@ -31,13 +31,13 @@ pub(super) struct Pass<'a> {
     pub geometry: &'a Geometry<'a>,
     /// Where polygons stand, and what Ω's faces touch.
     pub standing: &'a [Standing],
-    pub touching: Touching<'a>,
+    pub face_walls: FaceWalls<'a>,
     /// The sides that receive; the first owns lines without samples.
     pub sides: &'a [Side],
     /// The instruction set of the hot loops.
     pub isa: Isa,
     /// Memory to use again.
-    pub spare: &'a Spare,
+    pub pool: &'a PlanePool,
     pub workspaces: Mutex<Vec<Workspace>>,
 }
 
@@ -74,8 +74,8 @@ pub(super) struct Workspace {
 pub(super) struct Bounce<'a> {
     /// Each goes both ways.
     pub lines: &'a [Shear],
-    /// As [`Sides::goes_on`].
-    pub goes_on: bool,
+    /// As [`Sides::extrapolates`].
+    pub extrapolates: bool,
     /// What nodes reflect.
     pub light: &'a Reflected,
     /// What flats reflect; they receive too.
@@ -90,7 +90,7 @@ struct Receivers<'a> {
     /// What the other side's do; nothing if that is dark.
     back: &'a [Half4],
     normals: &'a [u32],
-    touched: &'a Touched<'a>,
+    wall_light: &'a FaceWallLight<'a>,
     rows: Rows<'a>,
 }
 
@@ -104,11 +104,11 @@ struct Family<'a> {
     normals: &'a [u32],
     ends: &'a Ends,
     flats: &'a Flats,
-    touched: &'a Touched<'a>,
+    wall_light: &'a FaceWallLight<'a>,
     walls: arrive::Walls<'a>,
-    way: Way,
-    /// As [`Sides::goes_on`].
-    goes_on: bool,
+    rule: ScanRule,
+    /// As [`Sides::extrapolates`].
+    extrapolates: bool,
     /// The direction times what |ω·N| weighs.
     omega: [f32; 3],
 }
@@ -118,10 +118,11 @@ impl Family<'_> {
         let across = self.flats.across().cast_signed();
         Light {
             b: self.source.b,
+            back: self.back,
             flats: &self.flats.packed,
             isovalues: self.flats.isovalues,
             axis: &self.flats.axis,
-            across: if self.way.strict { -across } else { across },
+            across: if self.rule.strict { -across } else { across },
         }
     }
 }
@@ -155,21 +156,21 @@ impl Pass<'_> {
         );
         let of = |n: usize| bounce.light.b.get(n).map_or(&[][..], |b| &b[..]);
         let lines = bounce.lines;
-        let mut e = self.spare.black(self.geometry.places());
-        let touched = self.touching.now(self.geometry, bounce.flats, side);
+        let mut e = self.pool.black(self.geometry.places());
+        let wall_light = self.face_walls.now(self.geometry, bounce.flats, side);
         let split = lines.partition_point(|s| !s.layout.transposed);
         // Walls receive what one family brought while the next is under way.
         let mut arrivals = Vec::new();
         // Darkness is the same in both orders.
         for (transposed, some) in [(true, &lines[split..]), (false, &lines[..split])] {
             let Some(any) = some.first() else { continue };
-            let turned = transposed.then(|| self.geometry.transposed_normals(self.spare));
+            let turned = transposed.then(|| self.geometry.transposed_normals(self.pool));
             let receivers = Receivers {
                 side,
                 b: of(n),
                 back: of(1 - n),
                 normals: turned.as_ref().unwrap_or(&self.geometry.normals),
-                touched: &touched,
+                wall_light: &wall_light,
                 rows: node_rows(&mut e, self.geometry.lit_rows_of(&any.layout)),
             };
             for shear in some {
@@ -180,8 +181,8 @@ impl Pass<'_> {
             }
             drop(receivers);
             if let Some(turned) = turned {
-                self.spare.keep_numbers(turned);
-                e = self.geometry.untransposed(e, self.spare);
+                self.pool.keep_numbers(turned);
+                e = self.geometry.untransposed(e, self.pool);
             }
         }
         incoming.receive(self.isa, &arrivals);
@@ -237,9 +238,9 @@ impl Pass<'_> {
             normals: receivers.normals,
             ends: &ends,
             flats,
-            touched: receivers.touched,
-            way: Way { strict: side == Side::Higher, sign, capped: self.scene.is_capped() },
-            goes_on: bounce.goes_on,
+            wall_light: receivers.wall_light,
+            rule: ScanRule { strict: side == Side::Higher, sign, capped: self.scene.is_capped() },
+            extrapolates: bounce.extrapolates,
             omega: (shear.omega * share).as_vec3().to_array(),
             walls,
         };
@@ -249,9 +250,9 @@ impl Pass<'_> {
         let lines: Vec<isize> = below.into_iter().chain(near.0..=near.1).chain(above).collect();
         let arrivals: Vec<Mutex<Arrivals>> = lines.iter().map(|_| Mutex::default()).collect();
         let threads = rayon::current_num_threads();
-        let runs = Runs::new(lines.len(), threads);
+        let queue = WorkQueue::new(lines.len(), threads);
         let shares = || {
-            let share = |own| self.rows_of_lines(&family, (&lines, &arrivals), &receivers.rows, (&runs, own));
+            let share = |own| self.rows_of_lines(&family, (&lines, &arrivals), &receivers.rows, (&queue, own));
             (0..threads).into_par_iter().with_max_len(1).for_each(share);
         };
         rayon::join(shares, || incoming.receive(self.isa, &before));
@@ -280,7 +281,7 @@ impl Pass<'_> {
         family: &Family,
         (lines, arrivals): (&[isize], &[Mutex<Arrivals>]),
         rows: &Rows,
-        (runs, own): (&Runs, usize),
+        (queue, own): (&WorkQueue, usize),
     ) {
         let plan = family.plan;
         let size = plan.shear.layout.dims[2] * plan.width;
@@ -295,7 +296,7 @@ impl Pass<'_> {
             row.gaps.resize(packs, 0);
         }
         let mut walked = None;
-        while let Some(n) = runs.next(own) {
+        while let Some(n) = queue.next(own) {
             let q = lines[n];
             let mut nodes = std::mem::take(&mut work.nodes);
             self.nodes(plan, q, &mut nodes);
@@ -337,16 +338,15 @@ impl Pass<'_> {
             let p = plan.first[0] + start as isize;
             if self.isa.read(pack, plan, &family.source, p, q) {
                 self.isa.end(pack, plan, family.ends, family.flats, p, q);
-                if family.way.capped && family.way.strict {
+                if family.rule.capped && family.rule.strict {
                     pack.lasts = [[0; LANES]; 2];
                 }
                 note(pack, &mut row.ends, start);
                 let light = family.light();
                 let place = (plan.width, start);
-                self.isa.scan(pack, family.way, light, &mut row.light, place);
+                self.isa.scan(pack, family.rule, light, &mut row.light, place);
                 if family.source.gaps {
-                    let light = (family.way, light, family.back);
-                    self.isa.look_through_gaps(pack, light, &mut row.light, &mut row.gaps, place);
+                    self.isa.look_through_gaps(pack, family.rule, light, &mut row.light, &mut row.gaps, place);
                 }
             }
             if let Some(arrivals) = &mut arrivals {
@@ -399,9 +399,9 @@ impl Pass<'_> {
             ends: around.map(|lines| &lines.ends),
             line0,
             weights: [fu, fv],
-            goes_on: family.goes_on,
+            extrapolates: family.extrapolates,
             stands: family.light(),
-            touched: family.touched,
+            wall_light: family.wall_light,
         };
         let h = &self.geometry.h(layout)[at..][..nu];
         let lines = Lines { rows: light, first: line0 + first, shift: [fu, fv], omega: family.omega };
@@ -416,7 +416,7 @@ impl Pass<'_> {
                 let mut single = |i: usize| {
                     let [x, y, z] = decode(n[i - first]);
                     let cos = family.omega[0] * x + family.omega[1] * y + family.omega[2] * z;
-                    let light = sides.radiance(i, h[i], (cos > 0.0) != family.way.strict);
+                    let light = sides.radiance(i, h[i], (cos > 0.0) != family.rule.strict);
                     let e = [&mut e0[i - first], &mut e1[i - first], &mut e2[i - first]];
                     e.into_iter().zip(light).for_each(|(e, light)| *e += cos.abs() * light);
                 };
@@ -443,7 +443,7 @@ impl Pass<'_> {
         for &i in rims.map_or(&[][..], |rims| rims.within(at / nu, 0, nu)) {
             let i = i as usize;
             let cos = cosine(family.omega, n[i - first]);
-            let lines = Around::new((i, nu), line0, [fu, fv], family.goes_on);
+            let lines = Around::new((i, nu), line0, [fu, fv], family.extrapolates);
             for (c, e) in [&mut e0[..], &mut e1[..], &mut e2[..]].into_iter().enumerate() {
                 e[i - first] += cos * lines.mean([light[0][c], light[1][c]], gaps);
             }

@@ -8,7 +8,7 @@ use super::half::{Half4, decode, encode};
 use super::lit_rows::{LitRows, transpose, untranspose};
 use super::normals;
 use super::pack::LANES;
-use super::planes::{Planes, Spare, transposed};
+use super::planes::{PlanePool, Planes, transposed};
 use crate::field::{Field, FieldRows, GradientRow};
 use crate::flattened::Side;
 use crate::mask::{lights_itself, may_light_itself};
@@ -163,8 +163,8 @@ impl<'a> Geometry<'a> {
     }
 
     /// The normals in y, z, x order.
-    pub(super) fn transposed_normals(&self, spare: &Spare) -> Vec<u32> {
-        let mut to = spare.numbers(self.places());
+    pub(super) fn transposed_normals(&self, pool: &PlanePool) -> Vec<u32> {
+        let mut to = pool.numbers(self.places());
         let [rows, turned] = &self.lit_rows;
         transpose([rows, turned], self.dims, &self.normals, &mut to);
         to
@@ -198,12 +198,12 @@ impl<'a> Geometry<'a> {
     }
 
     /// Light of the lit nodes from y, z, x order back to x, y, z; the others are black.
-    pub(super) fn untransposed(&self, planes: Planes, spare: &Spare) -> Planes {
+    pub(super) fn untransposed(&self, planes: Planes, pool: &PlanePool) -> Planes {
         let ([rows, turned], [_, ny, nz]) = (&self.lit_rows, self.dims);
         planes.map(|from| {
-            let mut to = spare.plane(from.len());
+            let mut to = pool.plane(from.len());
             untranspose([turned, rows], [ny, nz], &from, &mut to);
-            spare.keep([from]);
+            pool.keep([from]);
             to
         })
     }
@@ -394,21 +394,21 @@ mod tests {
         let places = geometry.places();
         // Dark nodes beside lit ones have places, and none at the other end of their row; some have one in one order.
         assert!(lit < places && places < lattice.len() / 2, "{lit} {places}");
-        let spare = Spare::default();
+        let pool = PlanePool::default();
         // What planes held before is forgotten.
-        spare.keep(std::array::from_fn::<_, 7, _>(|_| vec![3.0; places]));
+        pool.keep(std::array::from_fn::<_, 7, _>(|_| vec![3.0; places]));
         let mut plane = vec![0.0; places];
         for o in (0..lattice.len()).filter(|&o| geometry.lit(o)) {
             plane[rows.place_of(o).unwrap()] = 1.0 + o as f32;
         }
-        let mut to = spare.plane(places);
+        let mut to = pool.plane(places);
         transpose([rows, turned], dims, &plane, &mut to);
         for o in 0..lattice.len() {
             let [x, y, z] = lattice.ijk(o);
             let expected = if geometry.lit(o) { 1.0 + o as f32 } else { 0.0 };
             assert_eq!(turned.place(x * 11 + z, y).map_or(0.0, |place| to[place]), expected, "{x} {y} {z}");
         }
-        let got = geometry.untransposed(std::array::from_fn(|_| to.clone()), &spare);
+        let got = geometry.untransposed(std::array::from_fn(|_| to.clone()), &pool);
         got.iter().for_each(|got| assert_eq!(got, &plane));
     }
 }

@@ -18,11 +18,11 @@ const CHUNK: usize = 1 << 14;
 /// Planes to be used again: taking memory from the system and giving it back costs more than a pass over it, and memory
 /// that is read before it is written twice as much, with all threads waiting.
 #[derive(Default)]
-pub(super) struct Spare {
+pub(super) struct PlanePool {
     planes: Mutex<Vec<Vec<f32>>>,
 }
 
-impl Spare {
+impl PlanePool {
     /// Black planes of `n` nodes.
     pub(super) fn black(&self, n: usize) -> Planes {
         std::array::from_fn(|_| self.plane(n))
@@ -266,13 +266,13 @@ mod tests {
 
     #[test]
     fn memory_is_black_again() {
-        let spare = Spare::default();
-        let mut numbers = spare.numbers(70);
+        let pool = PlanePool::default();
+        let mut numbers = pool.numbers(70);
         numbers.fill(7);
-        spare.keep_numbers(numbers);
-        assert_eq!(spare.plane(70), vec![0.0; 70]);
+        pool.keep_numbers(numbers);
+        assert_eq!(pool.plane(70), vec![0.0; 70]);
         // Of another size it is of no use.
-        spare.keep([vec![3.0; 70]]);
-        assert_eq!(spare.plane(5), vec![0.0; 5]);
+        pool.keep([vec![3.0; 70]]);
+        assert_eq!(pool.plane(5), vec![0.0; 5]);
     }
 }

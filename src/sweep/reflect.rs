@@ -40,14 +40,14 @@ impl Default for Reflected {
 }
 
 /// Turns irradiance into radiance.
-pub(super) struct Mirror<'a> {
+pub(super) struct Reflector<'a> {
     scene: &'a Scene,
     geometry: &'a Geometry<'a>,
     slits: &'a Slits,
     isa: Isa,
 }
 
-impl<'a> Mirror<'a> {
+impl<'a> Reflector<'a> {
     pub(super) fn new(scene: &'a Scene, geometry: &'a Geometry<'a>, slits: &'a Slits, isa: Isa) -> Self {
         Self { scene, geometry, slits, isa }
     }

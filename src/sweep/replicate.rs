@@ -7,7 +7,7 @@
 //! off then is of second order: (1 − T₁)⁻¹ (T − T₁) (x₁ − x).
 
 use super::directions::{self, Shear};
-use super::faces::Touching;
+use super::faces::FaceWalls;
 use super::flats::Flats;
 use super::gather::{Bounce, Pass};
 use super::planes::{HalfPlanes, NodeLight, Planes};
@@ -89,12 +89,12 @@ impl Run<'_> {
             let share = 1.0 / state.done() as f32;
             flats.take(&state.flats, share);
             let light = (NodeLight::Half(&state.total.light), share);
-            self.mirror.reflect(flats, &[direct, light], Reflected::default(), None, SHARPENING)
+            self.reflector.reflect(flats, &[direct, light], Reflected::default(), None, SHARPENING)
         } else {
             flats.reflect_direct();
-            self.mirror.reflect(flats, &[direct], Reflected::default(), None, SHARPENING)
+            self.reflector.reflect(flats, &[direct], Reflected::default(), None, SHARPENING)
         };
-        let black = self.mirror.black();
+        let black = self.reflector.black();
         sums.take(&flats.light(black), black);
         Passes {
             light,
@@ -173,10 +173,10 @@ impl Run<'_> {
             scene: self.scene,
             geometry: self.geometry,
             standing: self.slits.standing(),
-            touching: Touching::new(self.scene, self.geometry, flats),
+            face_walls: FaceWalls::new(self.scene, self.geometry, flats),
             sides: self.sides,
             isa: self.isa,
-            spare: self.spare,
+            pool: self.pool,
             workspaces: Mutex::default(),
         };
         while now.bounce < s.max_bounces {
@@ -188,7 +188,7 @@ impl Run<'_> {
                     indirect = received;
                     break;
                 }
-                Some(received) => self.spare.keep(received.into_iter().flatten()),
+                Some(received) => self.pool.keep(received.into_iter().flatten()),
                 None => {
                     self.saved.save(0, || state.bytes(Some(&now), flats));
                     return None;
@@ -232,13 +232,13 @@ impl Run<'_> {
         } else {
             let received = self.bounce(pass, &now.light, (&few, false), flats, &mut ask)?;
             let nodes: Vec<_> = received.iter().map(|e| HalfPlanes::new(e, 1.0, None)).collect();
-            self.spare.keep(received.into_iter().flatten());
+            self.pool.keep(received.into_iter().flatten());
             Some((nodes, flats.indirect()))
         };
         // What goes on linearly may grow from bounce to bounce where light is rough, and what is nearest cannot: until
         // light has settled, that does.
-        let goes_on = kind != Kind::Coarse;
-        let received = self.bounce(pass, &now.light, (&lines, goes_on), flats, &mut ask)?;
+        let extrapolates = kind != Kind::Coarse;
+        let received = self.bounce(pass, &now.light, (&lines, extrapolates), flats, &mut ask)?;
         now.bounce = bounce;
         state.counts.families += total as u64;
         state.counts.gather_rays += state.counts.valid * total as u64;
@@ -247,7 +247,7 @@ impl Run<'_> {
         }
         let omega = now.settling.omega();
         let settling = if matches!(kind, Kind::Coarse | Kind::Level) {
-            Some((omega, flats.settle(omega, self.mirror.black())))
+            Some((omega, flats.settle(omega, self.reflector.black())))
         } else {
             now.late += usize::from(kind == Kind::Late);
             now.settling.since += 1;
@@ -267,17 +267,17 @@ impl Run<'_> {
         Some(received)
     }
 
-    /// Irradiance of each side's nodes by one bounce along all `lines`, beyond whose last ones it `goes_on` linearly or
-    /// not; the flats hold what they received. `None` if `ask` stopped it.
+    /// Irradiance of each side's nodes by one bounce along all `lines`, beyond whose last ones it `extrapolates`
+    /// linearly or not; the flats hold what they received. `None` if `ask` stopped it.
     fn bounce(
         &self,
         pass: &Pass,
         light: &Reflected,
-        (lines, goes_on): (&[Shear], bool),
+        (lines, extrapolates): (&[Shear], bool),
         flats: &mut Flats,
         ask: &mut dyn FnMut() -> bool,
     ) -> Option<Vec<Planes>> {
-        let bounce = Bounce { lines, goes_on, light, flats };
+        let bounce = Bounce { lines, extrapolates, light, flats };
         let mut incoming = flats.open();
         let sides = 0..self.sides.len();
         let received = sides.map(|n| pass.gather(&bounce, n, &mut incoming, ask)).collect::<Option<_>>()?;
@@ -304,14 +304,14 @@ impl Run<'_> {
             // Where light is rough, along few directions, sharpening may make each bounce brighter than the last.
             let sharpening = if now.settling.grows() { 0.0 } else { SHARPENING };
             let relaxed = Some((&now.light, omega));
-            let (reflected, mut sums) = self.mirror.reflect(flats, &light, memory, relaxed, sharpening);
-            sums.take(&on_flats, self.mirror.black());
+            let (reflected, mut sums) = self.reflector.reflect(flats, &light, memory, relaxed, sharpening);
+            sums.take(&on_flats, self.reflector.black());
             now.before = std::mem::replace(&mut now.light, reflected);
             now.settling.push(sums);
         } else {
             now.before = Reflected::default();
             let memory = std::mem::take(&mut now.light);
-            now.light = self.mirror.reflect(flats, &light, memory, None, SHARPENING).0;
+            now.light = self.reflector.reflect(flats, &light, memory, None, SHARPENING).0;
         }
     }
 }

@@ -11,6 +11,8 @@ use crate::isovalue_axis::IsovalueAxis;
 pub(super) struct Light<'a> {
     /// B of the nodes.
     pub b: &'a [Half4],
+    /// B of the other side; nothing if that is dark.
+    pub back: &'a [Half4],
     /// What stands at ends, as [`super::flats::Flats`] packs it, and its isovalues.
     pub flats: &'a [Half4],
     pub isovalues: usize,
@@ -37,7 +39,7 @@ impl Light<'_> {
 
 /// How to scan.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Way {
+pub(super) struct ScanRule {
     /// The next value must be greater, not only as great: the higher side.
     pub strict: bool,
     /// The sign h was read with.
@@ -51,15 +53,15 @@ impl Pack {
     ///
     /// Uphill the ray of the same line runs inside the solid. Whether downhill is +τ or −τ is decided by the samples
     /// beside it, as the receiver normal is. Writes slice k to `out` at k · width + start.
-    pub(super) fn scan(&mut self, way: Way, light: Light, out: &mut [Vec<f32>], place: (usize, usize)) {
-        self.link(way, true);
-        self.link(way, false);
-        self.look(way, light, out, place);
+    pub(super) fn scan(&mut self, rule: ScanRule, light: Light, out: &mut [Vec<f32>], place: (usize, usize)) {
+        self.link(rule, true);
+        self.link(rule, false);
+        self.look(rule, light, out, place);
     }
 
     /// Finds for every sample the next value ≥ its own towards +τ (`forward`) or −τ; with `strict` it must be greater.
     #[allow(clippy::cast_possible_truncation, reason = "places in a pack")]
-    fn link(&mut self, way: Way, forward: bool) {
+    fn link(&mut self, rule: ScanRule, forward: bool) {
         let default: [u32; LANES] = std::array::from_fn(|lane| self.last(lane, forward));
         let (mut at, mut top) = (default, [f32::INFINITY; LANES]);
         let d = usize::from(!forward);
@@ -73,7 +75,7 @@ impl Pack {
                     continue;
                 }
                 let (mut j, mut t) = (at[lane], top[lane]);
-                while t < value || (way.strict && t == value) {
+                while t < value || (rule.strict && t == value) {
                     t = self.h_next[d].as_flattened()[j as usize];
                     j = self.next[d].as_flattened()[j as usize];
                 }
@@ -111,7 +113,7 @@ impl Pack {
     }
 
     /// Reads the radiance that the samples' downhill rays meet.
-    fn look(&self, way: Way, light: Light, out: &mut [Vec<f32>], (width, start): (usize, usize)) {
+    fn look(&self, rule: ScanRule, light: Light, out: &mut [Vec<f32>], (width, start): (usize, usize)) {
         let rows = self.h.len();
         for &row in &self.awake {
             let row = row as usize;
@@ -126,7 +128,7 @@ impl Pack {
                     let forward = self.h[(row + 1).min(rows - 2)][lane] < self.h[(row - 1).max(1)][lane];
                     rgb = match self.first((row, lane), forward) {
                         Ok(node) => colour(light.b[node as usize]),
-                        Err(place) => light.end(place, way.sign * value),
+                        Err(place) => light.end(place, rule.sign * value),
                     };
                 }
                 for c in 0..3 {

@@ -24,7 +24,7 @@ use super::incoming::{Arrivals, Sink};
 use super::pack::{Pack, Plan};
 use super::receivers::Emitter;
 use super::reflect::{Job, Rows, reflect_row};
-use super::scan::{Light, Way};
+use super::scan::{Light, ScanRule};
 use super::segments::Segments;
 use super::settling::Sums;
 use crate::isa::{Isa, Kind};
@@ -82,7 +82,7 @@ impl Isa {
     dispatch!(read, Pack::read, (pack: &mut Pack, plan: &Plan, source: &Source, first: isize, q: isize) -> bool);
     dispatch!(end, Pack::end, (pack: &mut Pack, plan: &Plan, ends: &Ends, flats: &Flats, first: isize, q: isize));
     dispatch!(look_through_gaps, Pack::look_through_gaps, (
-        pack: &mut Pack, light: (Way, Light, &[Half4]), out: &mut [Vec<f32>], gaps: &mut [u16], place: (usize, usize)
+        pack: &mut Pack, rule: ScanRule, light: Light, out: &mut [Vec<f32>], gaps: &mut [u16], place: (usize, usize)
     ));
     dispatch!(cosines, sum_cosines, (omega: &[[f32; 3]], n: &[u32], sum: &mut [f32; COSINES]));
     dispatch!(accumulate, accumulate_row, (
@@ -126,18 +126,25 @@ impl Isa {
     }
 
     /// [`Pack::scan`].
-    pub(super) fn scan(self, pack: &mut Pack, way: Way, light: Light, out: &mut [Vec<f32>], place: (usize, usize)) {
+    pub(super) fn scan(
+        self,
+        pack: &mut Pack,
+        rule: ScanRule,
+        light: Light,
+        out: &mut [Vec<f32>],
+        place: (usize, usize),
+    ) {
         match self.kind() {
             _ if !(signed(light.b.len()) && signed(pack.ends() + light.flats.len())) => {
-                pack.scan(way, light, out, place)
+                pack.scan(rule, light, out, place)
             }
             // SAFETY: an `Isa` of this kind exists, so the machine has the features that `scan` enables.
             #[cfg(target_arch = "x86_64")]
-            Kind::Avx512 => unsafe { avx512::scan(pack, way, light, out, place) },
+            Kind::Avx512 => unsafe { avx512::scan(pack, rule, light, out, place) },
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
-            Kind::Avx2 => unsafe { avx2::scan(pack, way, light, out, place) },
-            _ => pack.scan(way, light, out, place),
+            Kind::Avx2 => unsafe { avx2::scan(pack, rule, light, out, place) },
+            _ => pack.scan(rule, light, out, place),
         }
     }
 }

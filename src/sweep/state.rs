@@ -7,7 +7,7 @@ use super::lit_rows::LitRows;
 use super::planes::{HalfPlanes, Planes, SignedPlanes};
 use super::reflect::Reflected;
 use super::settling::Settling;
-use super::totals::{Focus, Totals, stride};
+use super::totals::{Deblur, Totals, stride};
 use crate::flattened::Side;
 use crate::scene::Scene;
 use ::half::bf16;
@@ -63,9 +63,9 @@ impl State {
         &mut self,
         indirect: &[Planes],
         flats: &Flats,
-        (scene, rows, focus): (&Scene, &LitRows, &Focus<L>),
+        (scene, rows, deblur): (&Scene, &LitRows, &Deblur<L>),
     ) {
-        self.total.add(indirect, (scene, rows), focus);
+        self.total.add(indirect, (scene, rows), deblur);
         let radiance = || flats.textures.iter().map(|t| t.as_ref().map(|t| &t.radiance));
         if self.done() == 1 {
             self.flats = radiance().map(Option::<&Vec<f32>>::cloned).collect();

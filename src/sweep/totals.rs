@@ -20,17 +20,17 @@ pub(super) fn stride(nodes: usize) -> usize {
 
 /// What gathered light is without the blur of nodes that take four lines each: along axes on both sides of which nodes
 /// are lit, [`RECEIVING`] of its second differences is taken off.
-pub(super) struct Focus<L> {
+pub(super) struct Deblur<L> {
     /// Nodes along x, y and z.
     pub(super) dims: [usize; 3],
     /// Whether a node is lit.
     pub(super) lit: L,
 }
 
-impl<L: Fn(usize) -> bool> Focus<L> {
+impl<L: Fn(usize) -> bool> Deblur<L> {
     /// Of a lit node and what `light` tells of it and of others.
     #[inline]
-    fn focused<const N: usize>(&self, node: usize, light: impl Fn(usize) -> [f32; N]) -> [f32; N] {
+    fn deblurred<const N: usize>(&self, node: usize, light: impl Fn(usize) -> [f32; N]) -> [f32; N] {
         // The node itself is lit.
         let value = |n: usize| (n == node || (self.lit)(n)).then(|| light(n));
         sharpened(self.dims, node, RECEIVING, value).expect("the light of a node that is lit")
@@ -89,7 +89,7 @@ impl Totals {
         let before = 1.0 / (self.lit - 1) as f32;
         let lighting = std::mem::take(&mut self.lighting);
         let mean = |s: usize, i: usize| [0, 1, 2].map(|c| before * lighting[s][c][i]);
-        self.deviate((scene, rows), &new, self.lit, mean, None::<&Focus<fn(usize) -> bool>>);
+        self.deviate((scene, rows), &new, self.lit, mean, None::<&Deblur<fn(usize) -> bool>>);
         self.lighting = lighting;
         if self.lighting.is_empty() {
             self.lighting = new;
@@ -113,7 +113,7 @@ impl Totals {
         &mut self,
         new: &[Planes],
         (scene, rows): (&Scene, &LitRows),
-        focus: &Focus<L>,
+        deblur: &Deblur<L>,
     ) {
         self.done += 1;
         if new.is_empty() {
@@ -122,13 +122,13 @@ impl Totals {
         let before = 1.0 / (self.done - 1) as f32;
         let light = std::mem::take(&mut self.light);
         let mean = |s: usize, i: usize| light[s].all(i).map(|x| before * x);
-        self.deviate((scene, rows), new, self.done, mean, Some(focus));
+        self.deviate((scene, rows), new, self.done, mean, Some(deblur));
         let mut old = light.into_iter();
         self.light = new.iter().map(|new| HalfPlanes::new(new, 1.0, old.next())).collect();
     }
 
     /// Adds the deviations of the light of the replicate that is the `count`th of its kind, where `mean` (side, place)
-    /// is that of those before; in `focus`, if it will be.
+    /// is that of those before; deblurred, if it will be.
     #[allow(clippy::cast_possible_truncation, reason = "albedo")]
     fn deviate<L: Fn(usize) -> bool + Sync>(
         &mut self,
@@ -136,7 +136,7 @@ impl Totals {
         new: &[Planes],
         count: usize,
         mean: impl Fn(usize, usize) -> [f32; 3] + Sync,
-        focus: Option<&Focus<L>>,
+        deblur: Option<&Deblur<L>>,
     ) {
         if self.spread.is_empty() {
             return;
@@ -151,8 +151,8 @@ impl Totals {
             (0..3).map(|c| luminance[c] * light[c]).sum()
         };
         let all = |planes: &Planes, place: usize| [0, 1, 2].map(|c| planes[c][place]);
-        let at = |planes: &Planes, node: usize| match focus.filter(|focus| (focus.lit)(node)) {
-            Some(focus) => luminance(node, focus.focused(node, |node| all(planes, rows.place_of_lit(node)))),
+        let at = |planes: &Planes, node: usize| match deblur.filter(|deblur| (deblur.lit)(node)) {
+            Some(deblur) => luminance(node, deblur.deblurred(node, |node| all(planes, rows.place_of_lit(node)))),
             None => rows.place_of(node).map_or(0.0, |place| luminance(node, all(planes, place))),
         };
         let nodes = (0..self.nodes).step_by(stride(self.nodes));
@@ -172,22 +172,22 @@ impl Totals {
                 let (new, mean) = (all(new, place), mean(s, place));
                 luminance(node, [0, 1, 2].map(|c| new[c] - mean[c]))
             };
-            // Known beforehand where a node's is put in focus by those beside it.
-            let known = focus.map(|focus| {
+            // Known beforehand where a node's is deblurred by those beside it.
+            let known = deblur.map(|deblur| {
                 let mut known = vec![0f32; rows.len()];
                 rows.for_each_run(&mut known, |first, run| {
                     let start = rows.place_of_lit(first);
                     run.iter_mut().enumerate().for_each(|(i, d)| *d = deviation(first + i, start + i));
                 });
-                (focus, known)
+                (deblur, known)
             });
             rows.for_each_run(&mut spread[..rows.len()], |first, run| {
                 let start = rows.place_of_lit(first);
                 for (i, root) in run.iter_mut().enumerate() {
                     let node = first + i;
                     let d = match &known {
-                        Some((focus, known)) if (focus.lit)(node) => {
-                            focus.focused(node, |node| [known[rows.place_of_lit(node)]])[0]
+                        Some((deblur, known)) if (deblur.lit)(node) => {
+                            deblur.deblurred(node, |node| [known[rows.place_of_lit(node)]])[0]
                         }
                         Some((_, known)) => known[start + i],
                         None => deviation(node, start + i),
@@ -201,13 +201,13 @@ impl Totals {
         }
     }
 
-    /// What all replicates gave at the nodes that are lit: gathered light in focus, direct light as it is, since
+    /// What all replicates gave at the nodes that are lit: gathered light deblurred, direct light as it is, since
     /// borders of shadows would ring; `apart`: that on its own, too.
     #[allow(clippy::cast_possible_truncation, reason = "a factor of at most 1")]
     pub(super) fn finish<L: Fn(usize) -> bool + Sync>(
         self,
         rows: &LitRows,
-        focus: &Focus<L>,
+        deblur: &Deblur<L>,
         apart: bool,
     ) -> Vec<SweptSide> {
         let done = self.done;
@@ -218,17 +218,17 @@ impl Totals {
         let side = |(&side, direct): (&Side, HalfPlanes)| {
             let light = indirect.next();
             let own = |place: usize| [0, 1, 2].map(|c| direct.at(c, place));
-            let irradiance = all_nodes(self.nodes, rows, focus, |node, place| {
-                let gathered = |light: &HalfPlanes| focus.focused(node, |node| light.all(rows.place_of_lit(node)));
+            let irradiance = all_nodes(self.nodes, rows, deblur, |node, place| {
+                let gathered = |light: &HalfPlanes| deblur.deblurred(node, |node| light.all(rows.place_of_lit(node)));
                 let (direct, gathered) = (own(place), light.as_ref().map_or([0.0; 3], gathered));
                 std::array::from_fn(|c| direct[c] + scale * gathered[c].max(0.0))
             });
             // Of two replicates or more.
             let error = |roots: Vec<bf16>| -> Vec<f32> {
                 let factor = (together * scale / (done - 1) as f32).sqrt();
-                all_nodes(self.nodes, rows, focus, |_, place| factor * roots[place].to_f32())
+                all_nodes(self.nodes, rows, deblur, |_, place| factor * roots[place].to_f32())
             };
-            let direct = if apart { all_nodes(self.nodes, rows, focus, |_, place| own(place)) } else { Vec::new() };
+            let direct = if apart { all_nodes(self.nodes, rows, deblur, |_, place| own(place)) } else { Vec::new() };
             SweptSide { side, irradiance, direct, std_error: spread.next().map(error).unwrap_or_default() }
         };
         self.sides.iter().take(self.stored).zip(self.direct).map(side).collect()
@@ -239,16 +239,16 @@ impl Totals {
 fn all_nodes<T: Clone + Default + Send, L: Fn(usize) -> bool + Sync>(
     nodes: usize,
     rows: &LitRows,
-    focus: &Focus<L>,
+    deblur: &Deblur<L>,
     value: impl Fn(usize, usize) -> T + Sync,
 ) -> Vec<T> {
     let mut all = vec![T::default(); nodes];
-    let nx = focus.dims[0];
+    let nx = deblur.dims[0];
     all.par_chunks_exact_mut(nx).enumerate().with_min_len(64).for_each(|(row, all)| {
         let (first, run) = rows.run(row);
         for ((i, to), place) in all.iter_mut().enumerate().skip(first).zip(run) {
             let node = row * nx + i;
-            if (focus.lit)(node) {
+            if (deblur.lit)(node) {
                 *to = value(node, place);
             }
         }
@@ -294,13 +294,13 @@ mod tests {
     /// Light that curves loses its share of the curvature, along axes on both sides of which nodes are lit; light that
     /// rises evenly stays as it is, at ends, too.
     #[test]
-    fn focus_takes_off_what_four_lines_blur() {
+    fn deblurring_takes_off_what_four_lines_blur() {
         let dims = [5, 4, 2];
         let place = |node: usize| [node % 5, node / 5 % 4, node / 20].map(|x| x as f32);
         let dark = 2 + 5 * 3;
-        let focus = Focus { dims, lit: |node| node != dark };
+        let deblur = Deblur { dims, lit: |node| node != dark };
         for node in (0..40).filter(|node| *node != dark) {
-            let [even, curved] = focus.focused(node, |node| {
+            let [even, curved] = deblur.deblurred(node, |node| {
                 let [x, y, z] = place(node);
                 [1.0 + 2.0 * x - y + 3.0 * z, x * x - 4.0 * y * y + z * z]
             });

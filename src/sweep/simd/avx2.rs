@@ -7,7 +7,7 @@ use crate::sweep::clearance::Clearance;
 use crate::sweep::fans::{HIGHER, LOWER, SAMPLED, march_row};
 use crate::sweep::half::Half4;
 use crate::sweep::pack::{LANES, OUTSIDE, Pack};
-use crate::sweep::scan::{Light, Way};
+use crate::sweep::scan::{Light, ScanRule};
 use crate::sweep::segments::Segments;
 use std::arch::x86_64::*;
 
@@ -16,15 +16,15 @@ const HALF: usize = LANES / 2;
 
 /// [`Pack::scan`] with a line per lane.
 #[target_feature(enable = "avx2,f16c")]
-pub(super) fn scan(pack: &mut Pack, way: Way, light: Light, out: &mut [Vec<f32>], place: (usize, usize)) {
-    if way.strict {
+pub(super) fn scan(pack: &mut Pack, rule: ScanRule, light: Light, out: &mut [Vec<f32>], place: (usize, usize)) {
+    if rule.strict {
         link::<true, true>(pack);
         link::<true, false>(pack);
     } else {
         link::<false, true>(pack);
         link::<false, false>(pack);
     }
-    look(pack, way, light, out, place);
+    look(pack, rule, light, out, place);
 }
 
 /// Half of sixteen numbers.
@@ -314,7 +314,7 @@ fn ask(base: &[Half4], places: __m256i, mask: __m256) -> [u32; HALF] {
 
 /// [`Pack::look`]. Light comes from anywhere: what a row meets is found some rows before it is read.
 #[target_feature(enable = "avx2,f16c")]
-fn look(pack: &Pack, way: Way, light: Light, out: &mut [Vec<f32>], (width, start): (usize, usize)) {
+fn look(pack: &Pack, rule: ScanRule, light: Light, out: &mut [Vec<f32>], (width, start): (usize, usize)) {
     // Row 0 is none.
     let none = _mm256_setzero_ps();
     let none = Met { row: 0, hits: none, nodes: [0; HALF], ended: none, flats: [0; HALF], f: none };
@@ -334,7 +334,7 @@ fn look(pack: &Pack, way: Way, light: Light, out: &mut [Vec<f32>], (width, start
         if let Some(row) = pack.awake.get(n).map(|&row| row as usize).filter(|&row| row != 0 && row != pack.h.len() - 1)
         {
             for (half, met) in here.iter_mut().enumerate() {
-                meet(pack, way, light, (row, half), met);
+                meet(pack, rule, light, (row, half), met);
             }
         }
     }
@@ -355,7 +355,7 @@ fn place(axis: &IsovalueAxis, c: __m256) -> __m256 {
 #[target_feature(enable = "avx2,f16c")]
 #[inline]
 #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, reason = "places in a pack")]
-fn meet(pack: &Pack, way: Way, light: Light, (row, side): (usize, usize), met: &mut Met) {
+fn meet(pack: &Pack, rule: ScanRule, light: Light, (row, side): (usize, usize), met: &mut Met) {
     let (rows, n) = (pack.h.len(), light.isovalues);
     let ends = _mm256_set1_epi32(pack.ends() as i32);
     let (zero, half) = (_mm256_setzero_ps(), _mm256_set1_ps(0.5));
@@ -384,7 +384,7 @@ fn meet(pack: &Pack, way: Way, light: Light, (row, side): (usize, usize), met: &
         met.nodes = ask(light.b, nodes, hits);
     }
     if _mm256_movemask_ps(ended) != 0 {
-        let c = _mm256_mul_ps(h, _mm256_set1_ps(way.sign));
+        let c = _mm256_mul_ps(h, _mm256_set1_ps(rule.sign));
         let x = _mm256_sub_ps(_mm256_mul_ps(place(light.axis, c), _mm256_set1_ps(n as f32)), half);
         let x = _mm256_min_ps(_mm256_max_ps(x, zero), _mm256_set1_ps((n - 1) as f32));
         let i = _mm256_min_epi32(_mm256_cvttps_epi32(x), _mm256_set1_epi32(n as i32 - 2));

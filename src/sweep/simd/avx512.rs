@@ -5,21 +5,21 @@ use crate::sweep::clearance::Clearance;
 use crate::sweep::fans::{HIGHER, LOWER, SAMPLED};
 use crate::sweep::half::Half4;
 use crate::sweep::pack::{LANES, OUTSIDE, Pack};
-use crate::sweep::scan::{Light, Way};
+use crate::sweep::scan::{Light, ScanRule};
 use crate::sweep::segments::Segments;
 use std::arch::x86_64::*;
 
 /// [`Pack::scan`] with a line per lane.
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
-pub(super) fn scan(pack: &mut Pack, way: Way, light: Light, out: &mut [Vec<f32>], place: (usize, usize)) {
-    if way.strict {
+pub(super) fn scan(pack: &mut Pack, rule: ScanRule, light: Light, out: &mut [Vec<f32>], place: (usize, usize)) {
+    if rule.strict {
         link::<true, true>(pack);
         link::<true, false>(pack);
     } else {
         link::<false, true>(pack);
         link::<false, false>(pack);
     }
-    look(pack, way, light, out, place);
+    look(pack, rule, light, out, place);
 }
 
 /// [`super::march_row`].
@@ -259,7 +259,7 @@ fn ask(base: &[Half4], places: __m512i, mask: __mmask16) {
 /// [`Pack::look`]. Light comes from anywhere: what a row meets is found some rows before it is read.
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
 #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, reason = "places in a pack")]
-fn look(pack: &Pack, way: Way, light: Light, out: &mut [Vec<f32>], (width, start): (usize, usize)) {
+fn look(pack: &Pack, rule: ScanRule, light: Light, out: &mut [Vec<f32>], (width, start): (usize, usize)) {
     let word = |w: i16| {
         let mut order = [0i16; 32];
         for (i, o) in order.iter_mut().enumerate() {
@@ -274,7 +274,7 @@ fn look(pack: &Pack, way: Way, light: Light, out: &mut [Vec<f32>], (width, start
         let read_now: Option<Met> = ring[n % AHEAD].take();
         ring[n % AHEAD] = match pack.awake.get(n) {
             // Entry and exit points are no slices.
-            Some(&row) if row != 0 && row as usize != pack.h.len() - 1 => Some(meet(pack, way, light, row as usize)),
+            Some(&row) if row != 0 && row as usize != pack.h.len() - 1 => Some(meet(pack, rule, light, row as usize)),
             _ => None,
         };
         let Some(met) = read_now else { continue };
@@ -302,7 +302,7 @@ fn place(axis: &IsovalueAxis, c: __m512) -> __m512 {
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
 #[inline]
 #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, reason = "places in a pack")]
-fn meet(pack: &Pack, way: Way, light: Light, row: usize) -> Met {
+fn meet(pack: &Pack, rule: ScanRule, light: Light, row: usize) -> Met {
     let (rows, n) = (pack.h.len(), light.isovalues);
     let ends = _mm512_set1_epi32(pack.ends() as i32);
     let (zero, half) = (_mm512_setzero_ps(), _mm512_set1_ps(0.5));
@@ -339,7 +339,7 @@ fn meet(pack: &Pack, way: Way, light: Light, row: usize) -> Met {
         ask(light.b, met.nodes, hits);
     }
     if ended != 0 {
-        let c = _mm512_mul_ps(h, _mm512_set1_ps(way.sign));
+        let c = _mm512_mul_ps(h, _mm512_set1_ps(rule.sign));
         let x = _mm512_sub_ps(_mm512_mul_ps(place(light.axis, c), _mm512_set1_ps(n as f32)), half);
         let x = _mm512_min_ps(_mm512_max_ps(x, zero), _mm512_set1_ps((n - 1) as f32));
         let i = _mm512_min_epi32(_mm512_cvttps_epi32(x), _mm512_set1_epi32(n as i32 - 2));

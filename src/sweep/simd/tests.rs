@@ -49,17 +49,18 @@ fn random(seed: u64) -> Vec<Half4> {
 #[test]
 fn every_instruction_set_scans_to_the_same_bits() {
     for seed in 0..20 {
-        for way in 0..4 {
-            let way = Way { strict: way & 2 == 2, sign: if way & 1 == 1 { 1.0 } else { -1.0 }, capped: false };
+        for rule in 0..4 {
+            let rule = ScanRule { strict: rule & 2 == 2, sign: if rule & 1 == 1 { 1.0 } else { -1.0 }, capped: false };
             let scan = |isa: Isa| {
                 let mut out = vec![vec![0f32; 48 * LANES]; 3];
                 let axis = IsovalueAxis::around([0.5, 0.02, 0.9][seed as usize % 3]);
-                let light = Light { b: &random(9), flats: &random(10), isovalues: 4, axis: &axis, across: 0 };
-                isa.scan(&mut noise(seed), way, light, &mut out, (LANES, 0));
+                let light =
+                    Light { b: &random(9), back: &[], flats: &random(10), isovalues: 4, axis: &axis, across: 0 };
+                isa.scan(&mut noise(seed), rule, light, &mut out, (LANES, 0));
                 out.iter().flatten().map(|x| x.to_bits()).collect::<Vec<_>>()
             };
             for isa in Isa::found() {
-                assert_eq!(scan(Isa::PLAIN), scan(isa), "{way:?}, {isa:?}");
+                assert_eq!(scan(Isa::PLAIN), scan(isa), "{rule:?}, {isa:?}");
             }
         }
     }
@@ -172,8 +173,8 @@ fn scans_find_the_next_greater_value() {
     let mut out = vec![vec![0f32; 48 * LANES]; 3];
     let b = random(9);
     let axis = IsovalueAxis::EVEN;
-    let light = Light { b: &b, flats: &random(10), isovalues: 4, axis: &axis, across: 0 };
-    Isa::current().scan(&mut pack, Way { strict: false, sign: 1.0, capped: false }, light, &mut out, (LANES, 0));
+    let light = Light { b: &b, back: &[], flats: &random(10), isovalues: 4, axis: &axis, across: 0 };
+    Isa::current().scan(&mut pack, ScanRule { strict: false, sign: 1.0, capped: false }, light, &mut out, (LANES, 0));
     let mut found = [0; 2];
     let h = |row: usize, lane: usize| reference.h[row][lane];
     for lane in 0..LANES {

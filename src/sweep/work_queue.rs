@@ -5,7 +5,7 @@ use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Numbers still to be taken.
-pub(super) struct Runs {
+pub(super) struct WorkQueue {
     left: Vec<AtomicU64>,
 }
 
@@ -20,7 +20,7 @@ fn unpacked(run: u64) -> Range<u32> {
     (run >> 32) as u32..run as u32
 }
 
-impl Runs {
+impl WorkQueue {
     /// The numbers below `count` (less than 2³²), in as many runs as there are threads.
     #[allow(clippy::cast_possible_truncation, reason = "as promised")]
     pub(super) fn new(count: usize, threads: usize) -> Self {
@@ -65,24 +65,24 @@ mod tests {
 
     #[test]
     fn alone_a_thread_gets_its_own_run_first_and_all_in_the_end() {
-        let runs = Runs::new(10, 2);
-        let mut all: Vec<usize> = std::iter::from_fn(|| runs.next(1)).collect();
+        let queue = WorkQueue::new(10, 2);
+        let mut all: Vec<usize> = std::iter::from_fn(|| queue.next(1)).collect();
         assert_eq!(all[..5], [5, 6, 7, 8, 9]);
         all.sort_unstable();
         assert_eq!(all, (0..10).collect::<Vec<_>>());
-        assert_eq!(Runs::new(0, 3).next(2), None);
+        assert_eq!(WorkQueue::new(0, 3).next(2), None);
     }
 
     #[test]
     fn every_number_is_taken_once_however_long_each_takes() {
         for threads in [2, 3, 8] {
-            let runs = Runs::new(1000, threads);
+            let queue = WorkQueue::new(1000, threads);
             let taken = Mutex::new(Vec::new());
             std::thread::scope(|scope| {
                 for t in 0..threads {
-                    let (runs, taken) = (&runs, &taken);
+                    let (queue, taken) = (&queue, &taken);
                     scope.spawn(move || {
-                        while let Some(n) = runs.next(t) {
+                        while let Some(n) = queue.next(t) {
                             // The first numbers take longest.
                             if n < 20 {
                                 std::thread::sleep(Duration::from_millis(1));
