@@ -21,13 +21,13 @@ pub fn span((lo, hi): (f64, f64)) -> String {
     format!("{} … {}", Shortest(lo), Shortest(hi))
 }
 
-/// Six digits of a number.
+/// Six digits of a number; all of a whole one.
 pub fn brief(v: f64) -> Shortest {
     rounded(v, FEWEST)
 }
 
 /// Six digits of a number of the range lo … hi, or as many more as tell a thousandth of the range apart: an offset
-/// takes digits of its own.
+/// takes digits of its own. All of a whole one: identifiers and counts are not what they are nearly.
 pub fn brief_within(v: f64, [lo, hi]: [f64; 2]) -> Shortest {
     let place = |x: f64| x.abs().log10().floor();
     let needed = place(v) - place(1e-3 * (hi - lo)) + 1.0;
@@ -43,11 +43,16 @@ pub fn brief_span(range: [f64; 2]) -> String {
 
 /// Digits of a number that stands for itself.
 const FEWEST: f64 = 6.0;
+/// Below this all digits of a whole number are written out.
+const WHOLE: f64 = 1e15;
 /// Digits that tell every f64 from all others.
 const MOST: f64 = 17.0;
 
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "6 to 17")]
 fn rounded(v: f64, digits: f64) -> Shortest {
+    if v.fract() == 0.0 && v.abs() < WHOLE {
+        return Shortest(v);
+    }
     Shortest(format!("{v:.*e}", digits as usize - 1).parse().unwrap_or(v))
 }
 
@@ -79,6 +84,8 @@ mod tests {
             ([1e15, 1e15 + 0.125], "1000000000000000 … 1000000000000000.1"),
             ([-f64::MAX, f64::MAX], "-1.79769e308 … 1.79769e308"),
             ([1e8 + 1.0 / 3.0, 1e8 + 1.0 / 3.0], "100000000 … 100000000"),
+            ([123_456_789.0, 4_294_967_295.0], "123456789 … 4294967295"),
+            ([0.0, 1.234_567_891e18], "0 … 1.23457e18"),
         ] {
             assert_eq!(brief_span(range), text);
         }

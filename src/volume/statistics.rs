@@ -171,7 +171,9 @@ impl VolumeStatistics {
         line("samples", format!("{nx} × {ny} × {nz} = {}, type {}", self.samples, self.element_type));
         line("world", self.space.to_owned());
         line("spacing", list(&self.spacing));
-        line("origin", list(&self.origin));
+        // A place needs digits by what stands beside it, however far away the world's begins.
+        let step = self.spacing.into_iter().fold(f64::INFINITY, f64::min);
+        line("origin", self.origin.map(|x| brief_within(x, [0.0, step]).to_string()).join("  "));
         let aligned = (0..3).all(|a| (0..3).all(|c| a == c || self.axes[a][c] == 0.0) && self.axes[a][a] > 0.0);
         if !aligned {
             let rows: Vec<String> = self.axes.iter().map(|a| format!("({})", list(a))).collect();

@@ -104,6 +104,19 @@ fn nothing_untrue_is_said_where_nothing_is_suggested() {
     }
 }
 
+/// What stands in the data and where it stands, however many digits that has.
+#[test]
+fn numbers_are_not_rounded_into_others() {
+    let samples = (0..64).map(|o| if o < 40 { 123_456_789 } else { u32::MAX }).collect();
+    let mut volume = volume([4; 3], Samples::U32(samples));
+    let origin = DVec3::new(456_789.25, 4_567_891.5, -1_234.567_8);
+    volume.lattice = Lattice::aligned([4; 3], origin, DVec3::splat(12.5)).unwrap();
+    let text = VolumeStatistics::of(&volume).to_text();
+    for words in ["123456789 … 4294967295", "123456789, 62.5", "456789.25  4567891.5  -1234.57"] {
+        assert!(text.contains(words), "{words}: {text}");
+    }
+}
+
 #[test]
 fn the_sweep_of_a_smooth_field_is_nearly_all_of_it() {
     let s = VolumeStatistics::of(&Generator::Bumps.sample([51; 3]).unwrap());
