@@ -172,6 +172,24 @@ pub(crate) fn read_head(path: &Path, section: Section, n: u64) -> Result<Vec<u8>
     }
 }
 
+/// How many bytes there are from a section's start on, unpacked, skipped ones among them; `most` if there are more.
+///
+/// # Errors
+/// `Io` with the path; `Invalid` if a packed stream is damaged.
+pub(crate) fn count(path: &Path, section: Section, most: u64) -> Result<u64> {
+    let mut reader = open_section(path, section)?.take(most);
+    let mut counted = 0;
+    let mut buffer = vec![0; 1 << 16];
+    loop {
+        match reader.read(&mut buffer) {
+            Ok(0) => return Ok(counted),
+            Ok(n) => counted += n as u64,
+            Err(e) if e.kind() == std::io::ErrorKind::Interrupted => {}
+            Err(e) => return Err(broken(path, section, counted, most, e)),
+        }
+    }
+}
+
 /// Reads exactly the `promised` bytes of a section.
 ///
 /// Before it is known that they exist, at most twice the file's size + 64 MB are held: a plain section is compared
@@ -197,17 +215,7 @@ pub(crate) fn read_section(path: &Path, section: Section, promised: u64) -> Resu
         ));
     }
     if section.packing != Packing::Plain && total > trusted(length) {
-        let mut reader = open_section(path, section)?.take(total);
-        let mut counted = 0;
-        let mut buffer = vec![0; 1 << 16];
-        loop {
-            match reader.read(&mut buffer) {
-                Ok(0) => break,
-                Ok(n) => counted += n as u64,
-                Err(e) if e.kind() == std::io::ErrorKind::Interrupted => {}
-                Err(e) => return Err(broken(path, section, counted, total, e)),
-            }
-        }
+        let counted = count(path, section, total)?;
         if counted < total {
             return Err(short(path, section, counted, total));
         }
@@ -229,15 +237,56 @@ pub(crate) fn read_section(path: &Path, section: Section, promised: u64) -> Resu
     Ok(bytes)
 }
 
-/// Parses XML of so few nodes that they fit into what is trusted.
+/// Parses XML of so few nodes that they fit into what is trusted, with tags and namespaces that take no time to speak
+/// of: that grows with the square of a tag's attributes and of namespaces within each other.
 ///
 /// # Errors
-/// As [`roxmltree::Document::parse`]; too many nodes.
-pub(crate) fn xml(text: &str) -> Result<roxmltree::Document<'_>, roxmltree::Error> {
+/// A message: what [`roxmltree::Document::parse`] says, or what there is too much of.
+pub(crate) fn xml(text: &str) -> Result<roxmltree::Document<'_>, String> {
     /// Of about 80 bytes.
     const NODES: u32 = 1 << 18;
+    /// Bytes of a tag, and namespaces of a document.
+    const TAG: usize = 1 << 16;
+    const NAMESPACES: usize = 1 << 12;
+    if longest_tag(text) > TAG {
+        return Err(format!("a tag is longer than {TAG} bytes"));
+    }
+    if text.matches("xmlns").nth(NAMESPACES).is_some() {
+        return Err(format!("it declares more than {NAMESPACES} namespaces"));
+    }
     let options = roxmltree::ParsingOptions { nodes_limit: NODES, ..Default::default() };
-    roxmltree::Document::parse_with_options(text, options)
+    roxmltree::Document::parse_with_options(text, options).map_err(|e| e.to_string())
+}
+
+/// Bytes of the longest tag of a text, none in comments and plain sections.
+fn longest_tag(text: &str) -> usize {
+    let (mut rest, mut longest) = (text, 0);
+    while let Some(at) = rest.find('<') {
+        rest = &rest[at..];
+        let sections = [("<!--", "-->"), ("<![CDATA[", "]]>")];
+        let end = match sections.iter().find(|(begin, _)| rest.starts_with(begin)) {
+            Some((_, end)) => rest.find(end).unwrap_or(rest.len()),
+            None => {
+                // A `>` within a value ends nothing.
+                let mut quote = None;
+                let ends = |byte: u8| match quote {
+                    Some(open) => {
+                        quote = quote.filter(|_| byte != open);
+                        false
+                    }
+                    None => {
+                        quote = Some(byte).filter(|byte| matches!(byte, b'"' | b'\''));
+                        byte == b'>'
+                    }
+                };
+                let length = rest.bytes().position(ends).unwrap_or(rest.len());
+                longest = longest.max(length);
+                length
+            }
+        };
+        rest = &rest[end..];
+    }
+    longest
 }
 
 /// The error of a section that ends too early.
@@ -337,6 +386,21 @@ mod tests {
         assert_eq!(read_section(&path, section, 100 << 20).unwrap().len(), 100 << 20);
         let message = read_section(&path, section, 1 << 40).unwrap_err().to_string();
         assert!(message.contains("cannot hold"), "{message}");
+    }
+
+    #[test]
+    fn xml_takes_no_time_to_speak_of() {
+        let attributes: String = (0..20_000).map(|n| format!(" a{n}='1'")).collect();
+        assert!(xml(&format!("<a{attributes}/>")).unwrap_err().contains("longer than"));
+        assert!(xml(&format!("<a z='>'{attributes}/>")).unwrap_err().contains("longer than"));
+        let open: String = (0..5000).map(|n| format!("<b xmlns:a{n}='{n}'>")).collect();
+        assert!(xml(&(open + &"</b>".repeat(5000))).unwrap_err().contains("namespaces"));
+        let long = "x".repeat(1 << 17);
+        let whole = format!(
+            "<?xml version='1.0'?><a b='1'><!-- {long} > {long} < {long} --><![CDATA[{long} < {long}]]>{long}</a>"
+        );
+        assert!(xml(&whole).is_ok());
+        assert!(xml("<a>").is_err());
     }
 
     #[test]

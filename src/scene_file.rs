@@ -24,7 +24,7 @@ use crate::files;
 use crate::polygon::Polygon;
 use crate::scene::{Placement, Policy, Scene, check_edges, check_spacing, cornell_box, read_context, read_obj};
 use crate::volume::statistics::VolumeStatistics;
-use crate::volume::{Lattice, Volume};
+use crate::volume::{Lattice, Space, Volume};
 use clap::ArgAction;
 use glam::DVec3;
 use serde::Deserialize;
@@ -219,6 +219,8 @@ pub struct Loaded {
     pub volume: Volume,
     /// The other volumes, in the order of the scene's fields.
     pub companions: Vec<Volume>,
+    /// Each file's name and what its world's axes mean, those that only stand in the scene among them.
+    pub spaces: Vec<(String, Space)>,
     /// The scene.
     pub scene: Scene,
     /// The file's `[bake]` table.
@@ -362,7 +364,8 @@ pub fn load(input: &Path, options: &SceneOptions) -> Result<Loaded> {
     surface.check_albedo(sweep).map_err(in_scene("albedo", by_flag[0]))?;
     surface.check_emission().map_err(in_scene("emission", by_flag[1]))?;
     let scene = Scene::new(field, surface, boundary, polygons).map_err(in_scene("", true))?;
-    Ok(Loaded { volume, companions: Vec::new(), scene, bake: file.bake, source })
+    let spaces = vec![(volume.name.clone(), volume.space)];
+    Ok(Loaded { volume, companions: Vec::new(), spaces, scene, bake: file.bake, source })
 }
 
 /// Polygons of all context geometry.

@@ -27,7 +27,7 @@ use rayon::prelude::*;
 use std::path::Path;
 
 /// The extensions that [`Volume::open`] reads.
-pub const READ: &str = ".nii, .mrc, .map, .ccp4, .rec and .cube (these also as .gz), .nrrd, .nhdr, .mha, .mhd, .vti, .vtk, .npy, \
+pub const READ: &str = ".nii, .mrc, .map, .ccp4, .rec, .cube and .npy (these also as .gz), .nrrd, .nhdr, .mha, .mhd, .vti, .vtk, \
                         .tif, .tiff and .tif.zip";
 
 /// A regular lattice of `dims` samples, vertex-centred: sample (i, j, k) stands at `origin + axes · (i, j, k)`.
@@ -466,11 +466,11 @@ impl Volume {
             ("mha" | "mhd", "") => metaimage::read(path),
             ("mrc" | "map" | "ccp4" | "rec", "" | "gz") => mrc::read(path),
             ("cube" | "cub", "" | "gz") => cube::read(path),
-            ("vti", "") => Self::of_vti(path, vti::VtiFile::read(path)?, array),
+            ("vti", "") => Self::of_vti(path, vti::VtiFile::read_scalars(path, array)?, array),
             ("vtk", "") => legacy_vtk::read(path, array),
-            ("npy", "") => npy::read(path),
+            ("npy", "" | "gz") => npy::read(path),
             ("tif" | "tiff", "" | "zip") => tiff::read(path),
-            ("raw", "") => Err(Error::invalid(
+            ("raw", "" | "gz") => Err(Error::invalid(
                 path,
                 "has no header: give its layout with --raw-dims, --raw-type …, or as [volume.raw]",
             )),

@@ -3,7 +3,7 @@
 use super::{expect_extension, one_frame, outputs};
 use crate::error::{Error, Result};
 use crate::export::{bake_file, slices};
-use crate::progress::{Progress, say};
+use crate::progress::{Progress, say, unless_interrupted};
 use crate::scene_file::{Inputs, PlaceOptions, RawOptions, ReadOptions};
 use crate::volume::vti::{self, VtiFile, VtiWriter};
 use crate::volume::{Lattice, Samples, Space, npy, nrrd};
@@ -29,7 +29,7 @@ pub(super) struct Export {
     /// The array to write (default: radiance of a bake, the scalars of a volume)
     #[arg(long, value_name = "NAME")]
     array: Option<String>,
-    /// What the world's axes mean, for a .nrrd or .vti: lps, ras or las (default: as the volume's own file said);
+    /// What the world's axes mean, for a .nrrd or .vti: lps, ras, las or none (default: as the volume's own file said);
     /// nothing is turned
     #[arg(long, value_name = "SPACE")]
     space: Option<String>,
@@ -63,10 +63,11 @@ impl Export {
         }
         outputs([&*self.output], &Inputs::files([&*self.input]))?;
         let space = self.space.as_ref().map(|name| {
-            let unknown = || Error::Invalid(format!("--space {name}: give lps, ras or las"));
+            let unknown = || Error::Invalid(format!("--space {name}: give lps, ras, las or none"));
             Space::from_name(name).ok_or_else(unknown)
         });
         let mut array = self.load()?;
+        unless_interrupted()?;
         if let Some(space) = space {
             array.space = space?;
         }

@@ -11,6 +11,7 @@ use crate::bake::Bake;
 use crate::digits::span;
 use crate::error::{Error, Result};
 use crate::field::{Field, FieldRows, Sweep};
+use crate::files;
 use crate::flat::{self, FlatLight, Within};
 use crate::flattened::Side;
 use crate::illumination_grid::{GridSize, IlluminationGrid};
@@ -395,9 +396,15 @@ impl BakedVolume {
     /// # Errors
     /// `Io`; `Invalid` if the file is damaged.
     pub fn try_read(path: &Path) -> Result<Option<Self>> {
-        let file = VtiFile::read(path)?;
-        let Some(d) = Description::of(&file).map_err(|e| e.in_file(path))? else { return Ok(None) };
-        Self::from_parts(path, file, d).map(Some).map_err(|e| e.in_file(path))
+        let bytes = files::read(path)?;
+        // Of a volume that is none, however many arrays it has, no array is needed.
+        let parse = || match Description::of(&VtiFile::parse_fields(&bytes)?)? {
+            Some(description) => Ok(Some((VtiFile::parse(&bytes)?, description))),
+            None => Ok(None),
+        };
+        let Some((file, description)) = parse().map_err(|e: Error| e.in_file(path))? else { return Ok(None) };
+        drop(bytes);
+        Self::from_parts(path, file, description).map(Some).map_err(|e| e.in_file(path))
     }
 
     fn from_parts(path: &Path, file: VtiFile, d: Description) -> Result<Self> {

@@ -31,7 +31,7 @@ pub(super) fn completed(path: &Path, parts: &[(String, String)]) -> Result<Atomi
 /// `Io`; `Invalid` if it is none or names nothing.
 pub fn read(path: &Path) -> Result<Vec<PathBuf>> {
     let text = files::read_text(path)?;
-    let document = files::xml(&text).map_err(|e| Error::invalid(path, format!("is no well-formed XML: {e}")))?;
+    let document = files::xml(&text).map_err(|e| Error::invalid(path, format!("its XML is not read: {e}")))?;
     let folder = path.parent().unwrap_or(Path::new(""));
     let parts = document.descendants().filter(|n| n.has_tag_name("DataSet"));
     let files: Vec<PathBuf> = parts.filter_map(|n| Some(folder.join(n.attribute("file")?))).collect();

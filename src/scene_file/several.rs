@@ -212,7 +212,8 @@ pub(super) fn load(
             format!("{flag}: the scene has several volumes; set it in their [[volume]] tables"),
         ));
     }
-    let (mut volumes, mut members, mut standing, mut lattices) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    let (mut volumes, mut members, mut standing) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut lattices, mut spaces) = (Vec::new(), Vec::new());
     for (n, entry) in entries.iter().enumerate() {
         let named = |e: Error| {
             let name = if entry.name.is_empty() { format!("{}", n + 1) } else { format!("'{}'", entry.name) };
@@ -224,6 +225,7 @@ pub(super) fn load(
         };
         let volume = entry.volume(folder).map_err(named)?;
         lattices.push(volume.lattice.clone());
+        spaces.push((volume.name.clone(), volume.space));
         if let Some(isovalue) = entry.held {
             standing.extend(entry.standing(isovalue, &volume, file).map_err(named)?);
         } else {
@@ -242,7 +244,8 @@ pub(super) fn load(
     polygons.extend(standing);
     let scene =
         Scene::with_members(members, file.policy.unwrap_or_default(), polygons).map_err(|e| e.in_file(input))?;
-    Ok(Loaded { volume, companions: volumes.collect(), scene, bake: file.bake.clone(), source: Some(source) })
+    let (companions, bake) = (volumes.collect(), file.bake.clone());
+    Ok(Loaded { volume, companions, spaces, scene, bake, source: Some(source) })
 }
 
 /// A lattice along the axes of the first whose Ω holds those of all; the first itself if that does.

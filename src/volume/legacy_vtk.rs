@@ -7,15 +7,16 @@ use glam::DVec3;
 use std::path::Path;
 
 /// Reads the first one-component scalars of the point data (unsigned char ones may be called `COLOR_SCALARS`), or else
-/// the first one-component array of its `FIELD` data; of either the one called `array`, if a name is given.
+/// of the one-component arrays of its `FIELD` data the one called `value` or the only one; of either the one called
+/// `array`, if a name is given.
 ///
 /// `ASPECT_RATIO`, the keyword of version 1, means the same as `SPACING`; a missing spacing is 1. `long` has 64 bits.
 /// Cell data in front of the point data, where VTK's writer puts them, are passed over. Keywords and types may have any
 /// case, as in VTK.
 ///
 /// # Errors
-/// `Io`; `Invalid` for a broken header, or arrays cut short; `NotSupported` for other data sets and for cell data
-/// alone.
+/// `Io`; `Invalid` for a broken header, arrays cut short, or several that could be meant, with their names;
+/// `NotSupported` for other data sets and for cell data alone.
 pub fn read(path: &Path, array: Option<&str>) -> Result<Volume> {
     let bytes = files::read(path)?;
     let (lattice, samples) = parse(&bytes, array).map_err(|e| e.in_file(path))?;
@@ -35,7 +36,8 @@ fn invalid<T>(message: String) -> Result<T> {
 
 /// An array's samples are decoded only if they are the ones wanted.
 struct Array<'a> {
-    element: ElementType,
+    /// `None` for bits, which are no samples.
+    element: Option<ElementType>,
     values: &'a [u8],
     count: usize,
 }
@@ -66,11 +68,17 @@ impl<'a> Cursor<'a> {
 
     /// The values that begin here: exactly `count` words of text, or their bytes.
     fn array(&mut self, name: &str, kind: &str, count: usize) -> Result<Array<'a>> {
-        let element = element(kind)
-            .ok_or_else(|| Error::NotSupported(format!("array `{name}` has type `{kind}`, which is not read")))?;
+        let element = element(kind);
+        if element.is_none() && !kind.eq_ignore_ascii_case("bit") {
+            return Err(Error::NotSupported(format!("array `{name}` has type `{kind}`, which is not read")));
+        }
         let rest = &self.bytes[self.at..];
         let length = if self.binary {
-            count.checked_mul(element.size()).filter(|&n| n <= rest.len()).ok_or(rest.len() / element.size())
+            let size = element.map_or(1, ElementType::size);
+            let wanted = if element.is_some() { count.checked_mul(size) } else { Some(count.div_ceil(8)) };
+            // Eight bits a byte.
+            let found = if element.is_some() { rest.len() / size } else { rest.len().saturating_mul(8) };
+            wanted.filter(|&n| n <= rest.len()).ok_or(found)
         } else {
             text_length(rest, count)
         };
@@ -107,10 +115,11 @@ impl<'a> Cursor<'a> {
     }
 
     fn samples(&self, array: &Array) -> Result<Samples> {
+        let element = array.element.ok_or_else(|| Error::NotSupported("the array holds bits, no samples".into()))?;
         if self.binary {
-            return Ok(Samples::from_bytes(array.values, array.element, Endian::Big));
+            return Ok(Samples::from_bytes(array.values, element, Endian::Big));
         }
-        ascii::parse(array.values, array.element, array.count).map_err(Error::Invalid)
+        ascii::parse(array.values, element, array.count).map_err(Error::Invalid)
     }
 }
 
@@ -245,17 +254,17 @@ fn geometry(cursor: &mut Cursor) -> Result<(Lattice, Part)> {
     Ok((lattice, (section, tuples)))
 }
 
-/// The first scalars of the points, or else the first fitting array of their `FIELD`; those called `name`, if it is
-/// given.
+/// The first scalars of the points, or else the array of their `FIELD` that fits; those called `name`, if it is given.
 fn attributes(
     cursor: &mut Cursor,
     lattice: &Lattice,
     (mut section, mut tuples): Part,
     name: Option<&str>,
 ) -> Result<Samples> {
-    // VTK's writer puts %20 for a blank in a name.
-    let named = |word: &str| name.is_none_or(|name| name == word.replace("%20", " "));
-    let mut field: Option<Array> = None;
+    let named = |word: &str| name.is_none_or(|name| name == decoded(word));
+    // Names of arrays that are not meant, and whether they could be: bits cannot.
+    let mut others: Vec<(String, bool)> = Vec::new();
+    let mut fields: Vec<(String, Array)> = Vec::new();
     while let Some(words) = cursor.words() {
         let count = |n: usize| {
             tuples.checked_mul(n).ok_or_else(|| Error::Invalid(format!("{n} components do not fit the memory")))
@@ -274,9 +283,10 @@ fn attributes(
                     cursor.at = before;
                 }
                 let array = cursor.array(word(1)?, word(2)?, count(n)?)?;
-                if wanted(n) && named(word(1)?) {
+                if wanted(n) && named(word(1)?) && array.element.is_some() {
                     return cursor.samples(&array);
                 }
+                others.extend(wanted(n).then(|| (decoded(&words[1]), array.element.is_some())));
             }
             // A table of colours, 4 per entry.
             "LOOKUP_TABLE" => {
@@ -294,6 +304,7 @@ fn attributes(
                     };
                     return Ok(samples);
                 }
+                others.extend(wanted(n).then(|| (decoded(&words[1]), true)));
             }
             "VECTORS" | "NORMALS" => pass_over(3)?,
             "TENSORS" => pass_over(9)?,
@@ -307,8 +318,11 @@ fn attributes(
             "FIELD" => {
                 for _ in 0..components(&words, 2)? {
                     let Some((own, array, n)) = field_array(cursor)? else { continue };
-                    if wanted(n) && named(&own) && array.count == tuples && field.is_none() {
-                        field = Some(array);
+                    if wanted(n) && array.count == tuples {
+                        match array.element {
+                            Some(_) => fields.push((decoded(&own), array)),
+                            None => others.push((decoded(&own), false)),
+                        }
                     }
                 }
             }
@@ -321,13 +335,46 @@ fn attributes(
             _ => return invalid(format!("`{}`: no keyword of {}", words.join(" "), section.keyword())),
         }
     }
-    match field {
-        Some(array) => cursor.samples(&array),
-        None => match name {
-            Some(name) => invalid(format!("has no point data `{name}` of one component")),
-            None => Err(cells()),
-        },
+    let chosen = match name {
+        Some(name) => fields.iter().find(|(own, _)| own == name),
+        None => {
+            fields.iter().find(|(own, _)| own == "value").or(if let [only] = &fields[..] { Some(only) } else { None })
+        }
+    };
+    if let Some((_, array)) = chosen {
+        return cursor.samples(array);
     }
+    let meant = |(own, read): &&(String, bool)| !read && name.is_none_or(|name| name == own);
+    if let Some((own, _)) = others.iter().find(meant).filter(|_| name.is_some() || fields.is_empty()) {
+        return Err(Error::NotSupported(format!("array `{own}` holds bits, which are no samples")));
+    }
+    let read = others.iter().filter(|(_, read)| *read).map(|(own, _)| own).chain(fields.iter().map(|(own, _)| own));
+    let all: Vec<String> = read.map(|own| format!("`{own}`")).collect();
+    match name {
+        None if all.is_empty() => Err(cells()),
+        None => invalid(format!(
+            "cannot tell which point data to use: {}. Name one with --array, or as array in [volume]",
+            all.join(", ")
+        )),
+        Some(name) => {
+            let all = if all.is_empty() { "none".to_owned() } else { all.join(", ") };
+            invalid(format!("has no point data `{name}` of one component; there are: {all}"))
+        }
+    }
+}
+
+/// A name as it was before VTK wrote `%XX` for bytes that are no letters.
+fn decoded(name: &str) -> String {
+    let mut parts = name.split('%');
+    let mut bytes = parts.next().unwrap_or_default().as_bytes().to_vec();
+    for part in parts {
+        let code = part.get(..2).filter(|hex| hex.bytes().all(|b| b.is_ascii_hexdigit()));
+        match code.and_then(|hex| u8::from_str_radix(hex, 16).ok()) {
+            Some(code) => bytes.extend([&[code], &part.as_bytes()[2..]].concat()),
+            None => bytes.extend([b"%", part.as_bytes()].concat()),
+        }
+    }
+    String::from_utf8_lossy(&bytes).into_owned()
 }
 
 fn cells() -> Error {
@@ -367,174 +414,4 @@ fn skip_field(cursor: &mut Cursor, words: &[String]) -> Result<()> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    const HEAD: &str = "# vtk DataFile Version 3.0\ntitle\nASCII\nDATASET STRUCTURED_POINTS\nDIMENSIONS 3 2 2\n\
-                        SPACING 0.5 1 2\nORIGIN 1 2 3\nPOINT_DATA 12\n";
-    const NUMBERS: &str = "0 1 2 3 4 5\n6 7 8 9 10 11\n";
-
-    fn ok(bytes: &[u8], element: ElementType) {
-        let (lattice, samples) = parse(bytes, None).unwrap();
-        assert_eq!(lattice.to_world(DVec3::ONE), DVec3::new(1.5, 3.0, 5.0));
-        assert_eq!(samples.element_type(), element);
-        assert!((0..12).all(|i| samples.get(i) == i as f64));
-    }
-
-    #[test]
-    fn text_and_big_endian_bytes() {
-        ok(format!("{HEAD}SCALARS s int\nLOOKUP_TABLE default\n{NUMBERS}").as_bytes(), ElementType::I32);
-        ok(format!("{HEAD}SCALARS s float 1\n{NUMBERS}").as_bytes(), ElementType::F32);
-        let old = HEAD.replace("SPACING", "ASPECT_RATIO").replace("3.0", "1.0");
-        ok(format!("{old}SCALARS s double\nLOOKUP_TABLE default\n{NUMBERS}").as_bytes(), ElementType::F64);
-        for (kind, element) in [
-            ("unsigned_char", ElementType::U8),
-            ("short", ElementType::I16),
-            ("unsigned_short", ElementType::U16),
-            ("unsigned_int", ElementType::U32),
-            ("vtktypeint64", ElementType::I64),
-            ("float", ElementType::F32),
-            ("double", ElementType::F64),
-        ] {
-            let data: Vec<u8> = (0..12u8)
-                .flat_map(|i| match element {
-                    ElementType::F32 => f32::from(i).to_be_bytes().to_vec(),
-                    ElementType::F64 => f64::from(i).to_be_bytes().to_vec(),
-                    _ => [&[0; 7][..element.size() - 1], &[i]].concat(),
-                })
-                .collect();
-            let head = HEAD.replace("ASCII", "BINARY");
-            let scalars = format!("{head}SCALARS s {kind}\nLOOKUP_TABLE default\n");
-            ok(&[scalars.as_bytes(), &data, b"\n"].concat(), element);
-            // Behind vectors whose bytes look like lines.
-            let behind =
-                format!("{head}VECTORS v short\n{}\nSCALARS s {kind} 1\nLOOKUP_TABLE default\n", "\n\n".repeat(36));
-            ok(&[behind.as_bytes(), &data, b"\n"].concat(), element);
-            let field = format!("{head}FIELD FieldData 2\nv 3 12 short\n{}\nh 1 12 {kind}\n", "ab".repeat(36));
-            ok(&[field.as_bytes(), &data, b"\nMETADATA\nINFORMATION 0\n\n"].concat(), element);
-        }
-    }
-
-    /// As VTK writes them: a line each, or a length and the bytes.
-    #[test]
-    fn strings_in_a_field_are_passed_over() {
-        let field = "FIELD FieldData 2\nname 1 3 string\n";
-        let behind = format!("h 1 12 short\n{NUMBERS}");
-        ok(format!("{HEAD}{field}a%20b\n\n7\n{behind}").as_bytes(), ElementType::I16);
-        let head = HEAD.replace("ASCII", "BINARY");
-        let long = [&[0x80 | 1, 44][..], &[b'\n'; 300]].concat();
-        let huge = [&[0x40, 1, 0, 0][..], &[b'x'; 1 << 16]].concat();
-        let strings = [&[0xc0 | 2][..], b"ab", &long, &huge].concat();
-        let numbers: Vec<u8> = (0..12).flat_map(|i: i16| i.to_be_bytes()).collect();
-        let bytes = [format!("{head}{field}").as_bytes(), &strings, b"\nh 1 12 short\n", &numbers].concat();
-        ok(&bytes, ElementType::I16);
-        let start = head.len() + field.len();
-        for cut in [start, start + 1, start + 4, start + 200, start + 400] {
-            assert!(
-                matches!(parse(&bytes[..cut], None), Err(Error::Invalid(e)) if e.contains("strings promised")),
-                "{cut}"
-            );
-        }
-        // 2⁶² bytes.
-        let endless = [&bytes[..start], &[0x3f; 8]].concat();
-        assert!(parse(&endless, None).is_err());
-    }
-
-    #[test]
-    fn unsigned_char_scalars_as_vtk_writes_them() {
-        let head = HEAD.replace("ASCII", "BINARY");
-        let bytes: Vec<u8> = (0..12).collect();
-        ok(&[format!("{head}COLOR_SCALARS s 1\n").as_bytes(), &bytes, b"\n"].concat(), ElementType::U8);
-        let text: String = (0..12).map(|i| format!("{:.6} ", f64::from(i) / 255.0)).collect();
-        ok(format!("{HEAD}COLOR_SCALARS s 1\n{text}\n").as_bytes(), ElementType::U8);
-    }
-
-    #[test]
-    fn arrays_in_front_are_passed_over() {
-        let nine = "1 0 0 0 1 0 0 0 1\n".repeat(12);
-        let three = "1 0 0\n".repeat(12);
-        let two = "1 0\n".repeat(12);
-        let text = format!(
-            "{HEAD}NORMALS n float\n{three}TENSORS t float\n{nine}TEXTURE_COORDINATES c 2 float\n{two}COLOR_SCALARS rgb 3\n\
-             {three}LOOKUP_TABLE mine 2\n0 0 0 1\n1 1 1 1\nSCALARS v float 2\nLOOKUP_TABLE default\n{two}METADATA\n\
-             INFORMATION 0\n\nSCALARS s short\nLOOKUP_TABLE default\n{NUMBERS}"
-        );
-        ok(text.as_bytes(), ElementType::I16);
-    }
-
-    /// VTK's writer puts what belongs to cells in front of what belongs to points.
-    #[test]
-    fn cell_data_in_front_is_passed_over() {
-        let kinds = [
-            ("SCALARS c short 1\nLOOKUP_TABLE default\n", 2, 2),
-            ("SCALARS c double 2\n", 4, 8),
-            ("COLOR_SCALARS c 3\n", 6, 1),
-            ("LOOKUP_TABLE c 5\n", 20, 1),
-            ("VECTORS c float\n", 6, 4),
-            ("NORMALS c double\n", 6, 8),
-            ("TENSORS c float\n", 18, 4),
-            ("TENSORS6 c float\n", 12, 4),
-            ("TEXTURE_COORDINATES c 3 float\n", 6, 4),
-            ("GLOBAL_IDS c vtkIdType\n", 2, 4),
-            ("PEDIGREE_IDS c int\n", 2, 4),
-            ("EDGE_FLAGS c unsigned_char\n", 2, 1),
-            ("FIELD FieldData 1\nc 1 12 short\n", 12, 2),
-        ];
-        let samples: Vec<u8> = (0..12i16).flat_map(i16::to_be_bytes).collect();
-        for binary in [false, true] {
-            let head = if binary { HEAD.replace("ASCII", "BINARY") } else { HEAD.to_string() };
-            let (head, points) = (
-                head.replace("POINT_DATA 12", "CELL_DATA 2"),
-                "POINT_DATA 12\nSCALARS s short\nLOOKUP_TABLE default\n",
-            );
-            let mut all = Vec::new();
-            let end: Vec<u8> = [points.as_bytes(), if binary { &samples } else { NUMBERS.as_bytes() }, b"\n"].concat();
-            for (line, count, size) in kinds {
-                // Bytes that look like lines.
-                let values = if binary { "\n".repeat(count * size) } else { "1 ".repeat(count) };
-                let one = format!("{line}{values}\nMETADATA\nINFORMATION 0\n\n");
-                ok(&[head.as_bytes(), one.as_bytes(), &end].concat(), ElementType::I16);
-                all.extend(one.into_bytes());
-            }
-            ok(&[head.as_bytes(), &all, &end].concat(), ElementType::I16);
-        }
-    }
-
-    #[test]
-    fn keywords_are_the_same_in_any_case() {
-        let bytes: Vec<u8> = (0..12i16).flat_map(i16::to_be_bytes).collect();
-        for change in [str::to_ascii_lowercase, str::to_ascii_uppercase] {
-            let (magic, rest) = HEAD.split_once('\n').unwrap();
-            let head = format!("{magic}\n{}", change(rest));
-            let in_bytes = format!("{magic}\n{}", change(&rest.replace("ASCII", "BINARY")));
-            let scalars = change("SCALARS s short 1\nLOOKUP_TABLE default\n");
-            ok(format!("{head}{scalars}{NUMBERS}").as_bytes(), ElementType::I16);
-            ok(&[in_bytes.as_bytes(), scalars.as_bytes(), &bytes].concat(), ElementType::I16);
-            let notes = change("FIELD f 2\na 3 1 float\n1 2 3\nMETADATA\nINFORMATION 0\n\nb 1 12 short\n");
-            ok(format!("{head}{notes}{NUMBERS}").as_bytes(), ElementType::I16);
-        }
-    }
-
-    #[test]
-    fn broken_files_are_refused() {
-        let refused = |text: String, words: &str| {
-            let message = parse(text.as_bytes(), None).unwrap_err().to_string();
-            assert!(message.contains(words), "{words}: {message}");
-        };
-        let good = format!("{HEAD}SCALARS s int\nLOOKUP_TABLE default\n{NUMBERS}");
-        refused(good.replace(" 11\n", "\n"), "11 found");
-        refused(good.replace("ASCII", "BINARY"), "cut short");
-        refused(good.replace("int", "bit"), "`bit`");
-        refused(good.replace(" 11\n", " x\n"), "`x`");
-        refused(good.replace("POINT_DATA 12", "POINT_DATA 13"), "13");
-        refused(format!("{HEAD}SCALARS s int\n0 1\n").replace("POINT_DATA 12", "CELL_DATA 2"), "cell data");
-        refused(good.replace("POINT_DATA", "CELL_DATA"), "CELL_DATA 12 does not fit");
-        refused(good.replace("3 2 2", "12 1 1"), "flatland");
-        refused(good.replace("3 2 2", "9999999 9999999 9999999"), "too large");
-        refused(good.replace("STRUCTURED_POINTS", "POLYDATA"), "POLYDATA");
-        refused(good.replace("# vtk", "# vkt"), "no legacy VTK");
-        refused(good.replace("SPACING 0.5 1", "SPACING 0.5"), "3 numbers");
-        refused(HEAD.into(), "no point data");
-        refused(good.replace("SCALARS s int", "VECTORS v int"), "cut short");
-    }
-}
+mod tests;

@@ -8,10 +8,17 @@ use crate::files::{self, Packing, Section};
 use crate::volume::header::{Header, Line};
 use crate::volume::{ElementType, Endian, Lattice, Samples, Volume, ascii};
 use glam::{DMat3, DVec3};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// The key that ends the header.
 const DATA_FILE: &str = "ElementDataFile";
+
+/// The file that a header names for its samples.
+pub(crate) fn data_file(path: &Path) -> Option<PathBuf> {
+    let header = Fields::read(path).ok()?;
+    let name = header.get(DATA_FILE).filter(|name| !name.eq_ignore_ascii_case("LOCAL"))?;
+    header.beside(DATA_FILE, name).ok()
+}
 
 /// The fields of a MetaImage header.
 struct Fields<'a>(Header<'a>);
@@ -145,27 +152,21 @@ impl<'a> Fields<'a> {
 
     fn samples(&self, count: usize, element: ElementType) -> Result<Samples> {
         let name = self.need(DATA_FILE)?;
-        let (path, start) = match name {
+        // Where they begin if nothing else is said.
+        let (path, behind) = match name {
             "LOCAL" | "Local" | "local" => (self.path.to_path_buf(), self.length),
             _ => (self.beside(DATA_FILE, name)?, 0),
         };
         let promised = (count as u64).saturating_mul(element.size() as u64);
-        let packing = if self.flag(&["CompressedData"])? {
-            // MetaIO writes zlib and reads gzip as well.
-            match files::gzip_or_plain(&path, start)? {
-                Packing::Plain => Packing::Zlib,
-                gzip => gzip,
-            }
-        } else {
-            Packing::Plain
-        };
+        let compressed = self.flag(&["CompressedData"])?;
         let skip: i64 = self.numbers("HeaderSize", 1)?.map_or(0, |v| v[0]);
         let start = match u64::try_from(skip) {
-            // Bytes in front of the samples, of a detached file only.
-            Ok(bytes) if start == 0 => bytes,
-            Ok(_) => start,
+            Ok(0) => behind,
+            // Counted from where the file begins, whichever it is.
+            Ok(bytes) if bytes >= behind => bytes,
+            Ok(_) => return Err(self.wrong("HeaderSize", &format!("the header alone has {behind} bytes"))),
             // −1: the samples are the end of the file.
-            Err(_) if skip == -1 && packing == Packing::Plain => {
+            Err(_) if skip == -1 && !compressed => {
                 let stored = files::length(&path)?;
                 stored.checked_sub(promised).ok_or_else(|| {
                     Error::invalid(&path, format!("{promised} bytes of samples promised, {stored} found"))
@@ -175,6 +176,15 @@ impl<'a> Fields<'a> {
                 let wanted = "it must not be negative (−1 is for samples that are not compressed)";
                 return Err(self.wrong("HeaderSize", wanted));
             }
+        };
+        let packing = if compressed {
+            // MetaIO writes zlib and reads gzip as well.
+            match files::gzip_or_plain(&path, start)? {
+                Packing::Plain => Packing::Zlib,
+                gzip => gzip,
+            }
+        } else {
+            Packing::Plain
         };
         if self.get("BinaryData").is_some() && !self.flag(&["BinaryData"])? {
             let text = files::read(&path)?;

@@ -1,4 +1,4 @@
-//! NumPy arrays (`.npy`). \[NPY\]
+//! NumPy arrays (`.npy`, also gzipped). \[NPY\]
 //!
 //! x runs fastest in memory, whichever way the array is indexed: a C-ordered array has the shape (nz, ny, nx) and is
 //! indexed `a[z, y, x]` (as scikit-image, tifffile, SimpleITK and napari do), a Fortran-ordered one has the shape
@@ -6,7 +6,7 @@
 //! 1, origin 0.
 
 use crate::error::{Error, Result};
-use crate::files::{self, Packing, Section};
+use crate::files::{self, Section};
 use crate::volume::vti::SamplesRef;
 use crate::volume::{ElementType, Endian, Lattice, Samples, Volume};
 use glam::DVec3;
@@ -28,11 +28,12 @@ struct Header {
 /// u8), and floats of 16 (stored as f32), 32 and 64 bits, in either byte order.
 ///
 /// # Errors
-/// `Io`; `Invalid` for a broken header or too few bytes (known before they are allocated); `NotSupported` for other
-/// shapes and types.
+/// `Io`; `Invalid` for a broken header, too few bytes (known before they are allocated) or a damaged gzip stream;
+/// `NotSupported` for other shapes and types.
 pub fn read(path: &Path) -> Result<Volume> {
-    let plain = |start, skip| Section { start, packing: Packing::Plain, skip };
-    let head = files::read_head(path, plain(0, 0), 12)?;
+    let packing = files::gzip_or_plain(path, 0)?;
+    let behind = |skip| Section { start: 0, packing, skip };
+    let head = files::read_head(path, behind(0), 12)?;
     let wrong = |message: &str| Error::invalid(path, message);
     if !head.starts_with(b"\x93NUMPY") || head.len() < 12 {
         return Err(wrong("does not begin like a NumPy array; it is no .npy file"));
@@ -43,7 +44,7 @@ pub fn read(path: &Path) -> Result<Volume> {
         2 | 3 => (u64::from(u32::from_le_bytes([head[8], head[9], head[10], head[11]])), 12),
         version => return Err(Error::not_supported(path, format!("version {version} of .npy; 1 to 3 are read"))),
     };
-    let text = files::read_head(path, plain(from, 0), length.min(1 << 20))?;
+    let text = files::read_head(path, behind(from), length.min(1 << 20))?;
     let text = String::from_utf8_lossy(&text);
     let header = parse_header(&text).map_err(|e| e.in_file(path))?;
     // Axes of length 1 mean nothing; of what is left, the fastest is x.
@@ -66,7 +67,7 @@ pub fn read(path: &Path) -> Result<Volume> {
     })?;
     let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::ONE).map_err(|e| e.in_file(path))?;
     let promised = (lattice.len() as u64).saturating_mul(header.element.size() as u64);
-    let bytes = files::read_section(path, plain(from + length, 0), promised)?;
+    let bytes = files::read_section(path, behind(from + length), promised)?;
     let samples = match Samples::from_vec(bytes, header.element, header.endian) {
         Samples::U16(v) if header.half => {
             Samples::F32(v.into_iter().map(|b| half::f16::from_bits(b).to_f32()).collect())
@@ -249,6 +250,16 @@ mod tests {
         let v = read(&path).unwrap();
         assert_eq!((v.lattice.clone(), v.samples()), (lattice.clone(), &values));
         assert!(write(&path, &lattice, 3, (&values).into()).is_err());
+    }
+
+    #[test]
+    fn a_packed_array_is_the_same_array() {
+        let bytes = npy(1, &dict("<u2", "False", "(2, 2, 2)"), &(0..16).collect::<Vec<u8>>());
+        let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::default());
+        encoder.write_all(&bytes).unwrap();
+        let packed = encoder.finish().unwrap();
+        assert_eq!(open(&packed).unwrap().samples(), open(&bytes).unwrap().samples());
+        assert!(open(&packed[..packed.len() - 8]).unwrap_err().to_string().contains("damaged"));
     }
 
     #[test]

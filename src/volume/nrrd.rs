@@ -11,14 +11,16 @@ use crate::volume::vti::SamplesRef;
 use crate::volume::{ElementType, Endian, Lattice, Samples, Space, Volume, ascii};
 use flate2::{Compression, write::GzEncoder};
 use glam::{DMat3, DVec3};
+use std::collections::HashSet;
 use std::io::{BufRead, BufReader, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Reads a 3D scalar volume (or a 4D one with an axis of a single sample). Samples keep the file's type.
 ///
-/// Encodings raw, gzip and ascii; versions NRRD0001 to NRRD0005. Without `space directions`, `spacings` and `axis mins`
-/// (or `axis maxs`) place the lattice; a missing spacing is 1. By their `kinds` axes are of space (`domain`, `space`,
-/// `time`, or unknown: `???`, `none`) or hold the components of vectors, colours or lists.
+/// Encodings raw, gzip and ascii; versions NRRD0001 to NRRD0005. Without `space directions`, `spacings` and the `space
+/// origin`, or `axis mins` or `axis maxs`, place the lattice; a missing spacing is 1, and samples of which nothing is
+/// said stand in the middle of cells, as the format's own library has it. By their `kinds` axes are of space (`domain`,
+/// `space`, `time`, or unknown: `???`, `none`) or hold the components of vectors, colours or lists.
 ///
 /// # Errors
 /// `Io`; `Invalid` for a broken header, too few bytes (known before they are allocated) or a damaged stream;
@@ -32,8 +34,16 @@ pub fn read(path: &Path) -> Result<Volume> {
     let lattice = header.lattice(dims, keep)?;
     let element = header.element()?;
     let samples = header.samples(lattice.len(), element)?;
-    let space = header.get("space").and_then(Space::from_name).unwrap_or_default();
+    // Who gives a dimension instead of a name means none.
+    let named = header.get("space").or(header.get("spacedimension"));
+    let space = named.map_or(Space::default(), |name| Space::from_name(name).unwrap_or(Space::Unnamed));
     Ok(Volume { space, ..Volume::new(path.display().to_string(), lattice, samples)? })
+}
+
+/// The file that a header names for its samples.
+pub(crate) fn data_file(path: &Path) -> Option<PathBuf> {
+    let header = Fields::read(path).ok()?;
+    header.beside("data file", header.get("datafile")?).ok()
 }
 
 /// Reads a field of two axes (others must hold a single sample); `None` if the file holds a volume. The steps along the
@@ -101,11 +111,14 @@ pub fn write(
         n => (4, format!("{n} "), "none ", "vector domain domain domain"),
     };
     let origin = vector(lattice.origin());
+    let world = match space {
+        Space::Unnamed => "space dimension: 3".to_owned(),
+        space => format!("space: {}", space.name()),
+    };
     let mut head = format!(
-        "NRRD0005\n# written by isolume\ntype: {kind}\ndimension: {dimension}\nspace: {}\n\
+        "NRRD0005\n# written by isolume\ntype: {kind}\ndimension: {dimension}\n{world}\n\
          sizes: {sizes}{nx} {ny} {nz}\nspace directions: {none}{x} {y} {z}\nkinds: {kinds}\nendian: little\n\
-         encoding: gzip\nspace origin: {origin}\n",
-        space.name()
+         encoding: gzip\nspace origin: {origin}\n"
     );
     for (key, value) in notes {
         let value = value.replace('\\', "\\\\").replace('\n', "\\n");
@@ -118,6 +131,11 @@ pub fn write(
         values.write_le(&mut packed)?;
         packed.finish().map(drop)
     })
+}
+
+/// A vector of three numbers.
+fn in_world(vector: Option<&Option<Vec<f64>>>) -> Option<DVec3> {
+    vector?.clone()?.try_into().ok().map(DVec3::from_array)
 }
 
 /// The fields of an NRRD header: lower case, without blanks, since "data file" and "datafile" are the same field.
@@ -134,7 +152,7 @@ impl<'a> std::ops::Deref for Fields<'a> {
 impl<'a> Fields<'a> {
     /// Reads the lines up to the first empty one; a detached header may end without it.
     fn read(path: &'a Path) -> Result<Self> {
-        let (mut begun, mut listed) = (false, false);
+        let (mut begun, mut listed, mut seen) = (false, false, HashSet::new());
         let no_nrrd = || Error::invalid(path, "does not begin with NRRD0001 … NRRD0005, so it is no NRRD file");
         let header = Header::read(path, |number, text| {
             if number == 1 {
@@ -155,8 +173,12 @@ impl<'a> Fields<'a> {
             match text.split_once(':').filter(|(_, v)| !v.starts_with('=')) {
                 _ if text.starts_with('#') => Ok(Line::Nothing),
                 Some((key, value)) => {
+                    let written = key;
                     let (key, value) = (key.replace(' ', "").to_ascii_lowercase(), value.trim().to_string());
                     listed = key.starts_with("datafile") && value.starts_with("LIST");
+                    if !seen.insert(key.clone()) {
+                        return Err(Error::invalid(path, format!("line {number}: field `{written}` is there twice")));
+                    }
                     Ok(Line::Field(key, value))
                 }
                 None if text.contains(":=") => Ok(Line::Nothing),
@@ -245,18 +267,12 @@ impl<'a> Fields<'a> {
     fn lattice(&self, dims: [usize; 3], keep: [usize; 3]) -> Result<Lattice> {
         if self.get("spacedirections").is_some() {
             let vectors = self.vectors("spacedirections")?;
-            let world =
-                |v: Option<&Option<Vec<f64>>>| -> Option<DVec3> { v?.clone()?.try_into().ok().map(DVec3::from_array) };
             let column = |a: usize| {
-                world(vectors.get(keep[a]))
+                in_world(vectors.get(keep[a]))
                     .ok_or_else(|| self.wrong("spacedirections", "every axis of the volume needs its vector `(x,y,z)`"))
             };
             let axes = DMat3::from_cols(column(0)?, column(1)?, column(2)?);
-            let origin = match self.get("spaceorigin") {
-                Some(_) => world(self.vectors("spaceorigin")?.first())
-                    .ok_or_else(|| self.wrong("spaceorigin", "it must be one vector `(x,y,z)`"))?,
-                None => DVec3::ZERO,
-            };
+            let origin = self.space_origin()?.unwrap_or_default();
             return Lattice::new(dims, origin, axes).map_err(|e| e.in_file(self.path));
         }
         let per_axis = |key: &str| -> Result<[f64; 3]> {
@@ -267,10 +283,11 @@ impl<'a> Fields<'a> {
         let (spacings, mins, maxs) = (per_axis("spacings")?, per_axis("axismins")?, per_axis("axismaxs")?);
         let centers: Vec<&str> =
             self.get("centerings").or(self.get("centers")).unwrap_or("").split_whitespace().collect();
-        let (mut step, mut origin) = (DVec3::ONE, DVec3::ZERO);
+        let stands = self.space_origin()?;
+        let (mut step, mut origin) = (DVec3::ONE, stands.unwrap_or_default());
         for a in 0..3 {
-            // Cell-centred samples stand half a step inside the axis' ends; node-centred ones, the default, on them.
-            let cell = centers.get(keep[a]).is_some_and(|c| c.eq_ignore_ascii_case("cell"));
+            // Cell-centred samples stand half a step inside the axis' ends, node-centred ones on them.
+            let cell = !centers.get(keep[a]).is_some_and(|c| c.eq_ignore_ascii_case("node"));
             let steps = if cell { dims[a] as f64 } else { dims[a].saturating_sub(1) as f64 };
             if !spacings[a].is_nan() {
                 step[a] = spacings[a];
@@ -278,13 +295,24 @@ impl<'a> Fields<'a> {
                 step[a] = (maxs[a] - mins[a]) / steps;
             }
             let inset = if cell { 0.5 * step[a] } else { 0.0 };
-            if !mins[a].is_nan() {
+            if stands.is_some() {
+                // The first sample itself.
+            } else if !mins[a].is_nan() {
                 origin[a] = mins[a] + inset;
             } else if !maxs[a].is_nan() {
                 origin[a] = maxs[a] - inset - step[a] * dims[a].saturating_sub(1) as f64;
             }
         }
         Lattice::aligned(dims, origin, step).map_err(|e| e.in_file(self.path))
+    }
+
+    /// Where the first sample stands, if that is said.
+    fn space_origin(&self) -> Result<Option<DVec3>> {
+        if self.get("spaceorigin").is_none() {
+            return Ok(None);
+        }
+        let origin = in_world(self.vectors("spaceorigin")?.first());
+        origin.map(Some).ok_or_else(|| self.wrong("spaceorigin", "it must be one vector `(x,y,z)`"))
     }
 
     fn element(&self) -> Result<ElementType> {

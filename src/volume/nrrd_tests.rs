@@ -118,7 +118,13 @@ fn the_world_is_the_files_own() {
 
     let spaced = format!("NRRD0001\n{U8}spacings: 0.5 2 NaN\naxis mins: -1 10 NaN\n{raw}");
     let l = read_one(&spaced, &TWELVE).unwrap().lattice;
-    assert_eq!((l.origin(), l.spacing()), (DVec3::new(-1.0, 10.0, 0.0), DVec3::new(0.5, 2.0, 1.0)));
+    assert_eq!((l.origin(), l.spacing()), (DVec3::new(-0.75, 11.0, 0.0), DVec3::new(0.5, 2.0, 1.0)));
+    // As pynrrd writes what it is given.
+    let stands = format!("NRRD0004\n{U8}space: LPS\nspacings: 1 1 2\nspace origin: (10,20,30)\n{raw}");
+    let l = read_one(&stands, &TWELVE).unwrap().lattice;
+    assert_eq!((l.origin(), l.spacing()), (DVec3::new(10.0, 20.0, 30.0), DVec3::new(1.0, 1.0, 2.0)));
+    let twice = read_one(&format!("NRRD0004\n{U8}sizes: 2 3 2\n{raw}"), &TWELVE).unwrap_err().to_string();
+    assert!(twice.contains("line 5: field `sizes` is there twice"), "{twice}");
 
     let ends = format!("NRRD0001\n{U8}axis mins: 0 0 0\naxis maxs: 3 3 3\ncenterings: cell node node\n{raw}");
     let l = read_one(&ends, &TWELVE).unwrap().lattice;
@@ -221,7 +227,11 @@ fn what_is_written_is_read() {
     let lattice = Lattice::new([3, 2, 2], DVec3::new(1e6, -0.1, 1e-9), axes).unwrap();
     let samples = Samples::F32((0..12).map(|i| i as f32 / 7.0).collect());
     let mut volume = Volume::new(path.display().to_string(), lattice, samples).unwrap();
-    volume.space = Space::RightAnteriorSuperior;
-    write(&path, &volume.lattice, volume.space, 1, volume.samples().into(), &[("note", "a\\b\nc")]).unwrap();
-    assert_eq!(read(&path).unwrap(), volume);
+    for space in [Space::RightAnteriorSuperior, Space::Unnamed] {
+        volume.space = space;
+        write(&path, &volume.lattice, space, 1, volume.samples().into(), &[("note", "a\\b\nc")]).unwrap();
+        assert_eq!(read(&path).unwrap(), volume);
+    }
+    let other = read_one(&format!("NRRD0004\n{U8}space: 3D-right-handed\nencoding: raw\n\n"), &TWELVE).unwrap();
+    assert_eq!(other.space, Space::Unnamed);
 }

@@ -1,4 +1,4 @@
-//! Samples without a header: dimensions, type, byte order and placement come from the user.
+//! Samples without a header, also gzipped (`….gz`): dimensions, type, byte order and placement come from the user.
 
 use crate::error::{Error, Result};
 use crate::files::{self, Packing, Section};
@@ -29,17 +29,28 @@ impl RawLayout {
         Self { dims, element, endian: Endian::Little, header_bytes: 0, spacing: DVec3::ONE, origin: DVec3::ZERO }
     }
 
-    /// Reads a file, whose length must be exactly what the layout says.
+    /// Reads a file, whose length must be exactly what the layout says; of a gzipped one, named `.gz`, the length of
+    /// what is packed.
     ///
     /// # Errors
-    /// `Io`; `Invalid` if the length differs or the lattice is degenerate.
+    /// `Io`; `Invalid` if the length differs, a gzip stream is damaged or the lattice is degenerate.
     pub fn read(&self, path: &Path) -> Result<Volume> {
         let lattice = Lattice::aligned(self.dims, self.origin, self.spacing).map_err(|e| e.in_file(path))?;
         let bytes = (lattice.len() as u64).saturating_mul(self.element.size() as u64);
         let [nx, ny, nz] = self.dims;
-        let (found, wanted) = (files::length(path)?, bytes.saturating_add(self.header_bytes));
-        let headed = path.extension().map(|e| format!(".{}", e.to_string_lossy().to_ascii_lowercase()));
-        if let Some(e) = headed.filter(|e| found != wanted && READ.split([',', ' ']).any(|known| known == e)) {
+        let wanted = bytes.saturating_add(self.header_bytes);
+        let extension = path.extension().map(|e| format!(".{}", e.to_string_lossy().to_ascii_lowercase()));
+        let packing = if extension.as_deref() == Some(".gz") { files::gzip_or_plain(path, 0)? } else { Packing::Plain };
+        let section = match packing {
+            Packing::Plain => Section { start: self.header_bytes, packing, skip: 0 },
+            _ => Section { start: 0, packing, skip: self.header_bytes },
+        };
+        // One more than wanted is too many, however many there are.
+        let found = match packing {
+            Packing::Plain => files::length(path)?,
+            _ => files::count(path, section, wanted.saturating_add(1))?,
+        };
+        if let Some(e) = extension.filter(|e| found != wanted && READ.split([',', ' ']).any(|known| known == e)) {
             return Err(Error::invalid(
                 path,
                 format!(
@@ -48,17 +59,21 @@ impl RawLayout {
             ));
         }
         if found != wanted {
+            let unpacked = match packing {
+                Packing::Plain => "",
+                _ if found > wanted => " or more, unpacked",
+                _ => ", unpacked",
+            };
             return Err(Error::invalid(
                 path,
                 format!(
-                    "has {found} bytes, but {} header bytes and {nx}×{ny}×{nz} samples of type {} are {wanted}; \
+                    "has {found} bytes{unpacked}, but {} header bytes and {nx}×{ny}×{nz} samples of type {} are {wanted}; \
                      check the dimensions and the type",
                     self.header_bytes,
                     self.element.name()
                 ),
             ));
         }
-        let section = Section { start: self.header_bytes, packing: Packing::Plain, skip: 0 };
         let samples = Samples::from_vec(files::read_section(path, section, bytes)?, self.element, self.endian);
         Volume::new(path.display().to_string(), lattice, samples)
     }
@@ -67,6 +82,7 @@ impl RawLayout {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::io::Write;
 
     #[test]
     fn the_length_must_match() {
@@ -89,5 +105,31 @@ mod tests {
         assert!(matches!(layout.read(&path), Err(Error::Invalid(_))));
         layout.dims = [1, 4, 3];
         assert!(layout.read(&path).unwrap_err().to_string().contains("a.raw"));
+    }
+
+    #[test]
+    fn packed_the_length_must_match_too() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.raw.gz");
+        let bytes: Vec<u8> = (0..25).collect();
+        let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::default());
+        encoder.write_all(&bytes).unwrap();
+        let packed = encoder.finish().unwrap();
+        std::fs::write(&path, &packed).unwrap();
+        let mut layout = RawLayout::new([3, 2, 4], ElementType::U8);
+        layout.header_bytes = 1;
+        assert_eq!(layout.read(&path).unwrap().samples(), &Samples::U8(bytes[1..].to_vec()));
+        for (dims, found) in [([3, 2, 3], "20 bytes or more, unpacked"), ([3, 2, 5], "25 bytes, unpacked")] {
+            let message = RawLayout { dims, ..layout.clone() }.read(&path).unwrap_err().to_string();
+            assert!(message.contains(found), "{message}");
+        }
+        // Under another name these are samples.
+        let plain = folder.path().join("a.raw");
+        std::fs::write(&plain, &packed).unwrap();
+        let mut layout = RawLayout::new([2, 2, 2], ElementType::U8);
+        layout.header_bytes = packed.len() as u64 - 8;
+        assert_eq!(layout.read(&plain).unwrap().samples(), &Samples::U8(packed[packed.len() - 8..].to_vec()));
+        std::fs::write(&path, &packed[..packed.len() - 9]).unwrap();
+        assert!(layout.read(&path).unwrap_err().to_string().contains("damaged"));
     }
 }

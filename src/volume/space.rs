@@ -11,15 +11,18 @@ pub enum Space {
     RightAnteriorSuperior,
     /// Left, anterior, superior.
     LeftAnteriorSuperior,
+    /// None of a patient's: a scanner's, or just a right-handed one.
+    Unnamed,
 }
 
 impl Space {
-    /// NRRD's name.
+    /// NRRD's name, which [`Space::Unnamed`] has not.
     pub fn name(self) -> &'static str {
         match self {
             Space::LeftPosteriorSuperior => "left-posterior-superior",
             Space::RightAnteriorSuperior => "right-anterior-superior",
             Space::LeftAnteriorSuperior => "left-anterior-superior",
+            Space::Unnamed => "no patient's",
         }
     }
 
@@ -29,6 +32,7 @@ impl Space {
             "left-posterior-superior" | "lps" => Some(Space::LeftPosteriorSuperior),
             "right-anterior-superior" | "ras" => Some(Space::RightAnteriorSuperior),
             "left-anterior-superior" | "las" => Some(Space::LeftAnteriorSuperior),
+            "no patient's" | "none" => Some(Space::Unnamed),
             _ => None,
         }
     }

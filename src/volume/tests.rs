@@ -47,6 +47,7 @@ fn files_are_told_apart_by_their_extension() {
         "f.vti",
         "f.vtk",
         "f.npy",
+        "f.npy.gz",
         "f.tif",
         "f.tiff",
         "f.tif.zip",

@@ -142,7 +142,8 @@ fn decode<R: Read + Seek>(mut reader: R, path: &Path) -> Result<Volume> {
     let order = decoder.byte_order();
     let mut page = 0;
     let mut pages = read_pages(decoder, length, &mut page).map_err(|refusal| refusal.of(path, page))?;
-    place.check(pages.count).map_err(|message| Error::not_supported(path, message))?;
+    let samples = u64::from(pages.size.0) * u64::from(pages.size.1);
+    place.check(pages.count, samples).map_err(|message| Error::not_supported(path, message))?;
     let (element, (width, height)) = (pages.element, pages.size);
     let mut endian = if cfg!(target_endian = "big") { Endian::Big } else { Endian::Little };
     // ImageJ writes stacks beyond 4 GB as one page with all samples behind it.
@@ -174,11 +175,8 @@ fn decode<R: Read + Seek>(mut reader: R, path: &Path) -> Result<Volume> {
         });
     }
     let lattice = Lattice::aligned(dims, DVec3::ZERO, place.spacing).map_err(|e| e.in_file(path))?;
-    let samples = match Samples::from_vec(pages.bytes, element, endian) {
-        // Less 32768: the highest bit turned.
-        Samples::U16(v) if place.signed => Samples::I16(v.into_iter().map(|u| (u ^ 0x8000).cast_signed()).collect()),
-        samples => samples,
-    };
+    let samples = place.calibrated(Samples::from_vec(pages.bytes, element, endian));
+    let samples = samples.map_err(|message| Error::not_supported(path, message))?;
     Volume::new(path.display().to_string(), lattice, samples)
 }
 

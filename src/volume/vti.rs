@@ -17,6 +17,7 @@ use crate::volume::{ElementType, Lattice, Samples, Space, ascii};
 use codec::Encoding;
 use glam::{DMat3, DVec3};
 use roxmltree::Node;
+use std::cell::Cell;
 use std::path::Path;
 
 /// Name of the field string that holds the [`Space`], as isolume writes it.
@@ -48,6 +49,15 @@ pub struct VtiFile {
     pub active_scalars: Option<String>,
 }
 
+/// Which point data are read.
+#[derive(Clone, Copy)]
+enum Wanted<'a> {
+    All,
+    None,
+    /// The scalars of that name, or those to render: [`VtiFile::into_scalars`].
+    Scalars(Option<&'a str>),
+}
+
 impl VtiFile {
     /// Reads a file of one piece: ascii, inline base64, appended raw or base64; plain or zlib; either byte order.
     ///
@@ -56,6 +66,14 @@ impl VtiFile {
     /// there, not with the promise); `NotSupported` for several pieces, other compressors and other data sets.
     pub fn read(path: &Path) -> Result<Self> {
         Self::parse(&files::read(path)?).map_err(|e| e.in_file(path))
+    }
+
+    /// [`VtiFile::read`] of one point array only, that of [`VtiFile::into_scalars`], however many there are.
+    ///
+    /// # Errors
+    /// As [`VtiFile::read`] and [`VtiFile::into_scalars`].
+    pub fn read_scalars(path: &Path, array: Option<&str>) -> Result<Self> {
+        Self::parse_some(&files::read(path)?, Wanted::Scalars(array)).map_err(|e| e.in_file(path))
     }
 
     /// The scalars to render: those called `array`, if a name is given; else the active ones, else an array named
@@ -73,7 +91,7 @@ impl VtiFile {
     /// # Errors
     /// As [`VtiFile::into_scalars`].
     pub fn scalars(&self, array: Option<&str>) -> Result<(&str, Vec<&str>)> {
-        let chosen = chosen(&self.point_data, array, self.active_scalars.as_deref())?;
+        let chosen = chosen(&names(&self.point_data), array, self.active_scalars.as_deref())?;
         let all = self.point_data.iter().filter(|a| a.components == 1).map(|a| &*a.name);
         Ok((&self.point_data[chosen].name, all.collect()))
     }
@@ -89,12 +107,24 @@ impl VtiFile {
     /// # Errors
     /// As [`VtiFile::read`], without the file's name.
     pub fn parse(bytes: &[u8]) -> Result<Self> {
+        Self::parse_some(bytes, Wanted::All)
+    }
+
+    /// [`VtiFile::parse`] without point data.
+    ///
+    /// # Errors
+    /// As [`VtiFile::parse`].
+    pub(crate) fn parse_fields(bytes: &[u8]) -> Result<Self> {
+        Self::parse_some(bytes, Wanted::None)
+    }
+
+    fn parse_some(bytes: &[u8], wanted: Wanted) -> Result<Self> {
         let place = |p: Placement| {
             let lattice = Lattice::new(p.dims, p.origin, p.axes)?;
             let points = lattice.len();
             Ok((lattice, points))
         };
-        let (lattice, arrays) = Arrays::parse(bytes, place)?;
+        let (lattice, arrays) = Arrays::parse(bytes, wanted, place)?;
         let Arrays { point_data, field_data, field_strings, active_scalars } = arrays;
         Ok(Self { lattice, point_data, field_data, field_strings, active_scalars })
     }
@@ -116,7 +146,7 @@ pub fn read_plane(path: &Path) -> Result<Option<Plane>> {
         None => Ok((None, 0)),
     };
     let read = || -> Result<Option<Plane>> {
-        let (place, arrays) = Arrays::parse(&files::read(path)?, flat)?;
+        let (place, arrays) = Arrays::parse(&files::read(path)?, Wanted::Scalars(None), flat)?;
         let Some((dims, spacing)) = place else { return Ok(None) };
         Ok(Some(Plane { dims, spacing, samples: scalars(arrays.point_data, None, arrays.active_scalars.as_deref())? }))
     };
@@ -125,14 +155,19 @@ pub fn read_plane(path: &Path) -> Result<Option<Plane>> {
 
 /// The scalars to render, see [`VtiFile::into_scalars`].
 fn scalars(mut point_data: Vec<VtiArray>, array: Option<&str>, active: Option<&str>) -> Result<Samples> {
-    let chosen = chosen(&point_data, array, active)?;
+    let chosen = chosen(&names(&point_data), array, active)?;
     Ok(point_data.swap_remove(chosen).samples)
 }
 
-/// Which array these are.
-fn chosen(point_data: &[VtiArray], array: Option<&str>, active: Option<&str>) -> Result<usize> {
-    let mut scalars = (0..point_data.len()).filter(|&n| point_data[n].components == 1);
-    let named = |name: &str| scalars.clone().find(|&n| point_data[n].name == name);
+/// What arrays are called, and their components.
+fn names(point_data: &[VtiArray]) -> Vec<(&str, usize)> {
+    point_data.iter().map(|a| (&*a.name, a.components)).collect()
+}
+
+/// Which of the arrays of such names and components these are.
+fn chosen(point_data: &[(&str, usize)], array: Option<&str>, active: Option<&str>) -> Result<usize> {
+    let mut scalars = (0..point_data.len()).filter(|&n| point_data[n].1 == 1);
+    let named = |name: &str| scalars.clone().find(|&n| point_data[n].0 == name);
     let found = match array {
         Some(array) => named(array),
         None => active.and_then(named).or_else(|| named("value")).or_else(|| {
@@ -142,7 +177,7 @@ fn chosen(point_data: &[VtiArray], array: Option<&str>, active: Option<&str>) ->
     };
     found.ok_or_else(|| {
         let list: Vec<String> =
-            point_data.iter().map(|a| format!("`{}` ({} components)", a.name, a.components)).collect();
+            point_data.iter().map(|(name, components)| format!("`{name}` ({components} components)")).collect();
         let list = if list.is_empty() { "there are none".to_string() } else { list.join(", ") };
         Error::Invalid(match array {
             Some(array) => format!("has no point data `{array}` of 1 component; there are: {list}"),
@@ -172,9 +207,13 @@ struct Arrays {
 impl Arrays {
     /// Reads the bytes of a file. `place` makes what it needs of the placement and says how many points there are; of
     /// none, the arrays are left unread.
-    fn parse<T>(bytes: &[u8], place: impl FnOnce(Placement) -> Result<(T, usize)>) -> Result<(T, Self)> {
+    fn parse<T>(
+        bytes: &[u8],
+        wanted: Wanted,
+        place: impl FnOnce(Placement) -> Result<(T, usize)>,
+    ) -> Result<(T, Self)> {
         let (text, appended) = split_appended(bytes)?;
-        let document = files::xml(&text).map_err(|e| Error::Invalid(format!("is no well-formed XML: {e}")))?;
+        let document = files::xml(&text).map_err(|e| Error::Invalid(format!("its XML is not read: {e}")))?;
         let root = document.root_element();
         if root.tag_name().name() != "VTKFile" || root.attribute("type") != Some("ImageData") {
             return Err(Error::NotSupported(format!(
@@ -183,7 +222,7 @@ impl Arrays {
                 root.attribute("type").unwrap_or("")
             )));
         }
-        let reader = Reader { encoding: Encoding::of(root)?, appended };
+        let reader = Reader { encoding: Encoding::of(root)?, appended, length: bytes.len(), taken: Cell::new(0) };
         let image = child(root, "ImageData")?;
         let mut pieces = image.children().filter(|n| n.has_tag_name("Piece"));
         let piece = pieces.next().ok_or_else(|| Error::Invalid("has no <Piece>".into()))?;
@@ -207,7 +246,13 @@ impl Arrays {
         if let Some(points) = piece.children().find(|n| n.has_tag_name("PointData")) {
             file.active_scalars = points.attribute("Scalars").filter(|s| !s.is_empty()).map(str::to_string);
             let mut fault = None;
-            for node in points.children().filter(|n| n.has_tag_name("DataArray")) {
+            let mut nodes: Vec<Node> = points.children().filter(|n| n.has_tag_name("DataArray")).collect();
+            match wanted {
+                Wanted::All => {}
+                Wanted::None => nodes.clear(),
+                Wanted::Scalars(array) => nodes = vec![chosen_node(&nodes, array, file.active_scalars.as_deref())?],
+            }
+            for node in nodes {
                 match reader.array(node, count) {
                     Ok(array) => file.point_data.push(array),
                     // Of a type that is not read: unless nothing else is there or it is the one meant, let it be.
@@ -228,9 +273,9 @@ impl Arrays {
         }
         let fields = root.descendants().filter(|n| n.has_tag_name("FieldData")).flat_map(|n| n.children());
         for node in fields.filter(|n| n.has_tag_name("DataArray") || n.has_tag_name("Array")) {
-            let tuples = node.attribute("NumberOfTuples").and_then(|t| t.trim().parse().ok()).ok_or_else(|| {
-                Error::Invalid(format!("field array `{}` has no number in NumberOfTuples", name(node)))
-            })?;
+            // What does not say how much it holds is another program's.
+            let tuples = node.attribute("NumberOfTuples").and_then(|t| t.trim().parse().ok());
+            let Some(tuples) = tuples else { continue };
             if node.attribute("type") == Some("String") {
                 let texts = reader.strings(node, tuples)?;
                 file.field_strings.extend(texts.into_iter().map(|t| (name(node).to_string(), t)));
@@ -275,6 +320,12 @@ fn name<'a>(node: Node<'a, '_>) -> &'a str {
     node.attribute("Name").unwrap_or("")
 }
 
+/// What stands in an element, behind comments.
+fn text<'a>(node: Node<'a, '_>) -> &'a str {
+    let mut texts = node.children().filter(|child| child.is_text()).filter_map(|child| child.text());
+    texts.find(|text| !text.trim().is_empty()).unwrap_or("")
+}
+
 /// The numbers of an attribute.
 fn numbers<T: std::str::FromStr, const N: usize>(node: Node, key: &str) -> Result<[T; N]> {
     let text = node.attribute(key).unwrap_or("");
@@ -311,40 +362,67 @@ struct Reader<'a> {
     encoding: Encoding,
     /// The bytes behind the `_`.
     appended: &'a [u8],
+    /// Bytes of the file, and how many of them the arrays so far have taken.
+    length: usize,
+    taken: Cell<usize>,
+}
+
+/// The error of an array.
+fn fault(node: Node, message: &str) -> Error {
+    Error::Invalid(format!("array `{}`: {message}", name(node)))
+}
+
+fn components(node: Node) -> Result<usize> {
+    let Some(n) = node.attribute("NumberOfComponents") else { return Ok(1) };
+    n.trim().parse().map_err(|_| fault(node, &format!("NumberOfComponents is `{n}`")))
+}
+
+/// An array's type, of those that are read.
+fn element(node: Node) -> Result<ElementType> {
+    Ok(match node.attribute("type").unwrap_or("") {
+        "Int8" => ElementType::I8,
+        "UInt8" => ElementType::U8,
+        "Int16" => ElementType::I16,
+        "UInt16" => ElementType::U16,
+        "Int32" => ElementType::I32,
+        "UInt32" => ElementType::U32,
+        "Int64" => ElementType::I64,
+        "UInt64" => ElementType::U64,
+        "Float32" => ElementType::F32,
+        "Float64" => ElementType::F64,
+        other => {
+            return Err(Error::NotSupported(format!(
+                "array `{}` has type `{other}`; Int8 … UInt64, Float32 and Float64 are read",
+                name(node)
+            )));
+        }
+    })
+}
+
+/// The one of point data that [`VtiFile::into_scalars`] means. Arrays of types that are not read do not count, unless
+/// they are meant by their name or there are no others.
+fn chosen_node<'a, 'i>(nodes: &[Node<'a, 'i>], array: Option<&str>, active: Option<&str>) -> Result<Node<'a, 'i>> {
+    let read: Vec<Node> = nodes.iter().copied().filter(|node| element(*node).is_ok()).collect();
+    let meant = nodes.iter().find(|node| array.or(active) == Some(name(**node)));
+    if let Some(node) = meant.or_else(|| nodes.first().filter(|_| read.is_empty())) {
+        element(*node)?;
+    }
+    let names: Vec<(&str, usize)> =
+        read.iter().map(|node| Ok((name(*node), components(*node)?))).collect::<Result<_>>()?;
+    Ok(read[chosen(&names, array, active)?])
 }
 
 impl Reader<'_> {
     /// A numeric array of so many tuples.
     fn array(&self, node: Node, tuples: usize) -> Result<VtiArray> {
-        let fault = |message: String| Error::Invalid(format!("array `{}`: {message}", name(node)));
-        let components: usize = match node.attribute("NumberOfComponents") {
-            Some(n) => n.trim().parse().map_err(|_| fault(format!("NumberOfComponents is `{n}`")))?,
-            None => 1,
-        };
-        let element = match node.attribute("type").unwrap_or("") {
-            "Int8" => ElementType::I8,
-            "UInt8" => ElementType::U8,
-            "Int16" => ElementType::I16,
-            "UInt16" => ElementType::U16,
-            "Int32" => ElementType::I32,
-            "UInt32" => ElementType::U32,
-            "Int64" => ElementType::I64,
-            "UInt64" => ElementType::U64,
-            "Float32" => ElementType::F32,
-            "Float64" => ElementType::F64,
-            other => {
-                return Err(Error::NotSupported(format!(
-                    "array `{}` has type `{other}`; Int8 … UInt64, Float32 and Float64 are read",
-                    name(node)
-                )));
-            }
-        };
+        let fault = |message: String| fault(node, &message);
+        let (components, element) = (components(node)?, element(node)?);
         let count = tuples.checked_mul(components).filter(|n| n.checked_mul(element.size()).is_some());
         let count = count.ok_or_else(|| fault(format!("{tuples} tuples of {components} do not fit the memory")))?;
         let samples = match self.bytes(node).map_err(fault)? {
             Stored::Text(text) => ascii::parse(text.as_bytes(), element, count).map_err(fault)?,
             Stored::Packed(packed) => {
-                let bytes = self.encoding.unpack(packed, Some(count * element.size())).map_err(fault)?;
+                let bytes = self.unpack(packed, Some(count * element.size())).map_err(fault)?;
                 Samples::from_vec(bytes, element, self.encoding.endian)
             }
         };
@@ -361,7 +439,7 @@ impl Reader<'_> {
                 .map(|w| w.parse::<i16>().ok().filter(|c| (-128..256).contains(c)).map(|c| c as u8))
                 .collect::<Option<_>>()
                 .ok_or_else(|| fault("its text is no list of character codes".into()))?,
-            Stored::Packed(packed) => self.encoding.unpack(packed, None).map_err(fault)?,
+            Stored::Packed(packed) => self.unpack(packed, None).map_err(fault)?,
         };
         let mut texts: Vec<String> =
             codes.split(|&c| c == 0).map(|s| String::from_utf8_lossy(s).into_owned()).collect();
@@ -373,11 +451,24 @@ impl Reader<'_> {
         Ok(texts)
     }
 
+    /// An array's bytes. Arrays that share those of the file would grow without end.
+    fn unpack(&self, packed: codec::Packed, promised: Option<usize>) -> Result<Vec<u8>, String> {
+        let (bytes, taken) = self.encoding.unpack(packed, promised)?;
+        self.taken.set(self.taken.get().saturating_add(taken));
+        if self.taken.get() > self.length {
+            let (taken, length) = (self.taken.get(), self.length);
+            return Err(format!(
+                "takes, with those before it, {taken} bytes of a file of {length}; arrays that share theirs are not read"
+            ));
+        }
+        Ok(bytes)
+    }
+
     /// Where an array's values stand.
     fn bytes<'a>(&'a self, node: Node<'a, '_>) -> Result<Stored<'a>, String> {
         match node.attribute("format").unwrap_or("ascii") {
-            "ascii" => Ok(Stored::Text(node.text().unwrap_or(""))),
-            "binary" => Ok(Stored::Packed(codec::Packed::Base64(node.text().unwrap_or("").as_bytes()))),
+            "ascii" => Ok(Stored::Text(text(node))),
+            "binary" => Ok(Stored::Packed(codec::Packed::Base64(text(node).as_bytes()))),
             "appended" => {
                 let offset = node.attribute("offset").unwrap_or("");
                 let at = offset.trim().parse::<usize>().ok().filter(|&at| at < self.appended.len());

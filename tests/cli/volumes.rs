@@ -441,7 +441,10 @@ fn what_does_not_fit_together_is_warned_of() {
     assert!(far.contains("times the volume's size away") && far.contains("on one side of the sweep"), "{far}");
     let entry =
         |name: &str, file: &str| format!("[[volume]]\nname = \"{name}\"\nfile = \"{file}\"\nisovalues = [5, 15]\n");
-    fs::write(dir.join("both.toml"), entry("a", "v.vti") + &entry("b", "ras.vti")).unwrap();
-    let both = text(&ok(dir, &[&["bake", "both.toml", "-o", "o.vtm"], &QUICK[..]].concat()).stderr);
-    assert!(both.contains("left-posterior-superior") && both.contains("right-anterior-superior"), "{both}");
+    let held = entry("b", "ras.vti").replace("isovalues = [5, 15]", "held = 10");
+    for (second, output) in [(entry("b", "ras.vti"), "o.vtm"), (held, "o.vti")] {
+        fs::write(dir.join("both.toml"), entry("a", "v.vti") + &second).unwrap();
+        let both = text(&ok(dir, &[&["bake", "both.toml", "-o", output], &QUICK[..]].concat()).stderr);
+        assert!(both.contains("left-posterior-superior") && both.contains("right-anterior-superior"), "{both}");
+    }
 }

@@ -65,7 +65,7 @@ impl Plan {
     /// # Errors
     /// As [`warnings`].
     pub(super) fn warn(&self, said: &mut BTreeSet<String>, frame: bool) -> Result<()> {
-        for warning in warnings(self.scene(), &self.loaded.volumes(), &self.options, &self.settings, frame)? {
+        for warning in warnings(&self.loaded, &self.options, &self.settings, frame)? {
             if said.insert(warning.clone()) {
                 say!("warning: {warning}");
             }

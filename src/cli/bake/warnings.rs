@@ -8,24 +8,25 @@ use crate::flattened::Side;
 use crate::illumination_grid::GridSize;
 use crate::polygon::Polygon;
 use crate::scene::{Scene, Surface};
+use crate::scene_file::Loaded;
 use crate::sweep::{lit_mostly_within, lit_within_solids};
-use crate::volume::{Lattice, Volume};
+use crate::volume::{Lattice, Space, Volume};
 use glam::DVec3;
 
-/// What a user may not expect of the bake of `scene`, which may be one `frame` of many, that `options` ask for and
-/// `settings` describe.
+/// What a user may not expect of the bake of what is `loaded`, which may be one `frame` of many, that `options` ask for
+/// and `settings` describe.
 ///
 /// # Errors
 /// As [`left_out`].
 pub(super) fn warnings(
-    scene: &Scene,
-    volumes: &[&Volume],
+    loaded: &Loaded,
     options: &BakeOptions,
     settings: &BakeSettings,
     frame: bool,
 ) -> Result<Vec<String>> {
+    let (scene, volumes) = (&loaded.scene, loaded.volumes());
     let mut lines = options.idle(settings);
-    for volume in volumes {
+    for volume in &volumes {
         let rounded = volume.rounded();
         if rounded > 0 {
             lines.push(format!(
@@ -77,9 +78,9 @@ pub(super) fn warnings(
     if options.grid.is_none() {
         lines.extend(long_voxels(scene));
     }
-    lines.extend(spaces(volumes));
+    lines.extend(spaces(&loaded.spaces));
     // The sweep of a series is that of all its frames.
-    let alone = scene.members().into_iter().zip(volumes).filter(|_| !frame);
+    let alone = scene.members().into_iter().zip(&volumes).filter(|_| !frame);
     lines.extend(alone.filter_map(|(m, volume)| beyond(m.field.sweep(), volume)));
     lines.extend(scene.members().iter().filter_map(|m| single_colour(&m.surface)));
     lines.extend(scene.members().iter().find_map(|m| resampled(m.field.lattice(), settings.grid)));
@@ -88,16 +89,15 @@ pub(super) fn warnings(
 }
 
 /// Of volumes whose worlds differ.
-fn spaces(volumes: &[&Volume]) -> Option<String> {
-    let (first, others) = volumes.split_first()?;
-    let other = others.iter().find(|v| v.space != first.space)?;
+fn spaces(spaces: &[(String, Space)]) -> Option<String> {
+    let ((first, space), others) = spaces.split_first()?;
+    let (other, another) = others.iter().find(|(_, another)| another != space)?;
     Some(format!(
-        "{} has its world {}, {} {} (which is meant where a file says nothing): they stand where their numbers are; if \
-         both show the same, turn the axes of one",
-        first.name,
-        first.space.name(),
-        other.name,
-        other.space.name()
+        "{first} has its world {}, {other} {} (where a file says nothing, {} is meant): they stand where their numbers \
+         are; if both show the same, turn the axes of one",
+        space.name(),
+        another.name(),
+        Space::default().name()
     ))
 }
 

@@ -1,8 +1,10 @@
-//! What a stack's texts say of it: ImageJ's lines, OME's XML.
+//! What a stack's texts say of it: ImageJ's lines, OME's XML, tifffile's JSON.
 
 use super::ome;
 use crate::files;
+use crate::volume::Samples;
 use glam::DVec3;
+use rayon::prelude::*;
 use std::io::{Read, Seek};
 use tiff::decoder::Decoder;
 use tiff::decoder::ifd::Value;
@@ -21,9 +23,15 @@ pub(super) struct Place {
     frames: usize,
     /// What OME says against the order of the pages.
     disorder: Option<String>,
-    /// Whether 16-bit samples stand for themselves − 32768.
-    pub(super) signed: bool,
+    /// The extents of tifffile's array, slowest first.
+    shape: Option<Vec<u64>>,
+    /// What ImageJ takes integers of 8 and 16 bits for: a number and a multiple of theirs, or another function of its
+    /// own.
+    calibration: Result<[f64; 2], String>,
 }
+
+/// Samples that stand for themselves.
+const IDENTITY: [f64; 2] = [0.0, 1.0];
 
 impl Place {
     /// From the first page's tags; texts that are missing or not understood leave the defaults.
@@ -36,9 +44,11 @@ impl Place {
             channels: 1,
             frames: 1,
             disorder: None,
-            signed: false,
+            shape: None,
+            calibration: Ok(IDENTITY),
         };
         let text = decoder.get_tag(Tag::ImageDescription).and_then(Value::into_string).unwrap_or_default();
+        let text = text.trim_start_matches('\u{feff}').trim_start();
         if let Some(lines) = text.strip_prefix("ImageJ=") {
             let steps = [Tag::XResolution, Tag::YResolution].map(|tag| match decoder.get_tag(tag) {
                 // Samples per unit.
@@ -46,8 +56,13 @@ impl Place {
                 _ => 1.0,
             });
             place.imagej(lines, steps);
-        } else if text.contains("<OME") {
-            place.ome(&text)?;
+        } else if text.starts_with('<') && ["<OME", ":OME"].iter().any(|tag| text.contains(tag)) {
+            place.ome(text)?;
+        } else if text.starts_with('{')
+            && let Ok(json) = serde_json::from_str::<serde_json::Value>(text.trim_end_matches('\0'))
+        {
+            place.shape =
+                json["shape"].as_array().and_then(|shape| shape.iter().map(serde_json::Value::as_u64).collect());
         }
         Ok(place)
     }
@@ -59,13 +74,45 @@ impl Place {
         // ImageJ writes a negative step for a stack that was made from the far end.
         self.spacing = DVec3::new(x, y, z.unwrap_or(1.0).abs());
         (self.images, self.channels, self.frames) = (count("images"), count("channels"), count("frames"));
-        // So ImageJ keeps signed ones: unsigned, with a straight line (function 0) that turns them back.
         let number = |key: &str| value(key).and_then(|v| v.trim().parse::<f64>().ok());
-        self.signed = [("cf", 0.0), ("c0", -32768.0), ("c1", 1.0)].iter().all(|&(key, v)| number(key) == Some(v));
+        self.calibration = match value("cf").map(str::trim) {
+            None | Some("20") => Ok(IDENTITY),
+            // A straight line; so it keeps signed samples, too.
+            Some("0") => {
+                let line = number("c0").zip(number("c1")).map(|(c0, c1)| [c0, c1]);
+                Ok(line.filter(|line| line.iter().all(|c| c.is_finite()) && line[1] != 0.0).unwrap_or(IDENTITY))
+            }
+            Some(function) => Err(function.to_owned()),
+        };
+    }
+
+    /// What ImageJ shows of samples. The error is a message without the file's name.
+    pub(super) fn calibrated(&self, samples: Samples) -> Result<Samples, String> {
+        match (samples, &self.calibration) {
+            (samples @ (Samples::U8(_) | Samples::U16(_)), Ok(line)) => Ok(match (samples, line) {
+                (samples, &IDENTITY) => samples,
+                // Less 32768: the highest bit turned.
+                (Samples::U16(v), [-32768.0, 1.0]) => {
+                    Samples::I16(v.into_iter().map(|u| (u ^ 0x8000).cast_signed()).collect())
+                }
+                (samples, [c0, c1]) => {
+                    Samples::F64((0..samples.len()).into_par_iter().map(|i| c0 + c1 * samples.get(i)).collect())
+                }
+            }),
+            (Samples::U8(_) | Samples::U16(_), Err(function)) => Err(format!(
+                "ImageJ calibrates its samples by function {function}, which is no straight line; save it as a 32-bit \
+                 stack there, which holds calibrated values"
+            )),
+            (samples, _) => Ok(samples),
+        }
     }
 
     fn ome(&mut self, text: &str) -> Result<(), String> {
-        let Ok(document) = files::xml(text.trim_end_matches('\0')) else { return Ok(()) };
+        let document =
+            files::xml(text.trim_end_matches('\0')).map_err(|e| format!("OME's text is not readable: {e}"))?;
+        if document.root_element().tag_name().name() != "OME" {
+            return Ok(());
+        }
         let Some(pixels) = document.descendants().find(|n| n.tag_name().name() == "Pixels") else { return Ok(()) };
         let count = |key: &str| pixels.attribute(key).and_then(|v| v.parse().ok()).unwrap_or(1);
         self.spacing = ome::spacing(pixels)?;
@@ -75,14 +122,32 @@ impl Place {
         Ok(())
     }
 
-    /// Whether so many pages are a volume by these texts. The error is a message without the file's name.
-    pub(super) fn check(&self, pages: usize) -> Result<(), String> {
-        let Self { channels, frames, slices, ref disorder, .. } = *self;
+    /// Whether so many pages of so many samples are a volume by these texts. The error is a message without the file's
+    /// name.
+    pub(super) fn check(&self, pages: usize, samples: u64) -> Result<(), String> {
+        let Self { images, channels, frames, slices, ref disorder, .. } = *self;
         if channels > 1 || frames > 1 {
             return Err(format!("holds {channels} channels and {frames} times; save one of them as a stack"));
         }
         if let Some(disorder) = disorder {
             return Err(disorder.clone());
+        }
+        if pages > 1 && images > 1 && pages != images {
+            return Err(format!(
+                "ImageJ's text tells of {images} images, but there are {pages} pages; it is cut short, or no stack"
+            ));
+        }
+        if let Some(shape) = &self.shape {
+            let told = shape.iter().fold(1, |n: u64, &extent| n.saturating_mul(extent));
+            let axes = shape.iter().filter(|n| **n > 1).count();
+            // Pages that were written one by one tell of themselves.
+            let page = axes <= 2 && told == samples;
+            if !page && (axes > 3 || told != samples.saturating_mul(pages as u64)) {
+                return Err(format!(
+                    "its text tells of an array of shape {shape:?}, and there are {pages} pages: one volume of three axes \
+                     is read; save one of them as a stack"
+                ));
+            }
         }
         match slices {
             Some(slices) if slices != pages => Err(format!(

@@ -229,8 +229,64 @@ fn imagej_keeps_signed_samples_unsigned() {
     let text = "ImageJ=1.53f\nimages=2\nslices=2\ncf=0\nc0=-32768.0\nc1=1.0\n";
     let of = |text: &str| open(&stack::<colortype::Gray16>(2, text, |i| 5000 * i as u16)).unwrap();
     assert!((0..12).all(|i| of(text).value(i) == 5000.0 * i as f64 - 32768.0));
-    for other in [text.replace("c1=1.0", "c1=2.0"), text.replace("cf=0\n", "")] {
+    assert_eq!(of(text).samples().element_type(), ElementType::I16);
+    for other in ["cf=20\n", "", "cf=0\nc0=0.0\nc1=1.0\n"] {
+        let other = text.replace("cf=0\nc0=-32768.0\nc1=1.0\n", other);
         assert_eq!(of(&other).samples().element_type(), ElementType::U16, "{other}");
+    }
+}
+
+/// Any straight line, of integers of 8 and 16 bits; no other function.
+#[test]
+fn imagej_calibrates_samples() {
+    let text = "ImageJ=1.53f\nimages=2\nslices=2\ncf=0\nc0=-1024.0\nc1=0.5\n";
+    let short = open(&stack::<colortype::Gray16>(2, text, |i| 5000 * i as u16)).unwrap();
+    let byte = open(&stack::<colortype::Gray8>(2, text, |i| i as u8)).unwrap();
+    let float = open(&stack::<colortype::Gray32Float>(2, text, |i| i as f32)).unwrap();
+    for i in 0..12 {
+        let n = i as f64;
+        assert_eq!([short.value(i), byte.value(i), float.value(i)], [2500.0 * n - 1024.0, 0.5 * n - 1024.0, n]);
+    }
+    let curve = text.replace("cf=0", "cf=3");
+    let refused = open(&stack::<colortype::Gray8>(2, &curve, |i| i as u8)).unwrap_err().to_string();
+    assert!(refused.contains("a.tif") && refused.contains("function 3"), "{refused}");
+    assert!(open(&stack::<colortype::Gray32Float>(2, &curve, |i| i as f32)).is_ok());
+}
+
+/// tifffile's text tells the shape of the array: pages of several axes are no stack.
+#[test]
+fn tifffile_says_of_what_shape_it_is() {
+    let of = |pages: usize, text: &str| open(&stack::<colortype::Gray8>(pages, text, |i| i as u8));
+    for shape in ["[4, 2, 3]", "[1, 4, 2, 3]", "[4, 2, 3, 1]"] {
+        assert_eq!(of(4, &format!("{{\"shape\": {shape}}}")).unwrap().lattice.dims(), [3, 2, 4], "{shape}");
+    }
+    // Pages that were written one by one.
+    assert_eq!(of(4, "{\"shape\": [2, 3]}").unwrap().lattice.dims(), [3, 2, 4]);
+    // Channels or times, two arrays in one file, one page with others behind it.
+    for (pages, shape) in
+        [(4, "[2, 2, 2, 3], \"axes\": \"TZYX\""), (4, "[2, 2, 3]"), (2, "[4, 2, 3], \"truncated\": true")]
+    {
+        let message = of(pages, &format!("{{\"shape\": {shape}}}")).unwrap_err().to_string();
+        assert!(message.contains("a.tif") && message.contains("of shape ["), "{message}");
+    }
+    assert!(of(2, "{\"other\": 1}").is_ok());
+}
+
+#[test]
+fn texts_that_do_not_fit_are_refused() {
+    let of = |text: &str| open(&stack::<colortype::Gray8>(2, text, |i| i as u8)).map_err(|e| e.to_string());
+    assert!(of("ImageJ=1.53f\nimages=3\nslices=3\n").unwrap_err().contains("3 images, but there are 2 pages"));
+    let named = "<ome:OME xmlns:ome='o'><ome:Image><ome:Pixels SizeC='2' SizeZ='1'/></ome:Image></ome:OME>";
+    assert!(of(named).unwrap_err().contains("2 channels"));
+    assert!(of(&named.replace("</ome:Image>", "")).unwrap_err().contains("not readable"));
+    // Behind a byte-order mark, which the encoder does not write.
+    let mut marked = stack::<colortype::Gray8>(2, &format!("~~~{named}"), |i| i as u8);
+    let at = marked.windows(3).position(|w| w == b"~~~").unwrap();
+    marked[at..at + 3].copy_from_slice("\u{feff}".as_bytes());
+    assert!(open(&marked).unwrap_err().to_string().contains("2 channels"));
+    // No business of OME's.
+    for text in ["<note>made for the OME</note>", "<b>SOMETHING & more", "<sample 12> HOME position"] {
+        assert!(of(text).is_ok(), "{text}");
     }
 }
 

@@ -60,23 +60,23 @@ impl Encoding {
         Ok(Self { endian, word, zlib })
     }
 
-    /// Unpacks an array, which must have exactly `promised` bytes if that is known.
-    pub(super) fn unpack(&self, packed: Packed, promised: Option<usize>) -> Result<Vec<u8>, String> {
+    /// Unpacks an array, which must have exactly `promised` bytes if that is known; and how many bytes it takes packed.
+    pub(super) fn unpack(&self, packed: Packed, promised: Option<usize>) -> Result<(Vec<u8>, usize), String> {
         if self.zlib {
             return self.unpack_blocks(packed, promised);
         }
         let length = self.words(&packed.take(self.word)?)[0];
         check(length, promised)?;
         let end = length.checked_add(self.word).ok_or("its length header is not a length")?;
-        Ok(packed.take(end)?[self.word..].to_vec())
+        Ok((packed.take(end)?[self.word..].to_vec(), end))
     }
 
     /// The header `[blocks, block size, size of a smaller last block or 0, compressed sizes …]`, then the blocks.
-    fn unpack_blocks(&self, packed: Packed, promised: Option<usize>) -> Result<Vec<u8>, String> {
+    fn unpack_blocks(&self, packed: Packed, promised: Option<usize>) -> Result<(Vec<u8>, usize), String> {
         let blocks = self.words(&packed.take(self.word)?)[0];
         if blocks == 0 {
             check(0, promised)?;
-            return Ok(vec![]);
+            return Ok((vec![], self.word));
         }
         let head = blocks.checked_add(3).and_then(|n| n.checked_mul(self.word)).ok_or("its block count is absurd")?;
         let words = self.words(&packed.take(head)?);
@@ -125,7 +125,7 @@ impl Encoding {
                 .collect();
             unpacked?.iter().for_each(|raw| out.extend_from_slice(raw));
         }
-        Ok(out)
+        Ok((out, stored))
     }
 
     /// Header numbers.

@@ -60,7 +60,7 @@ fn reads_what_vtk_writes() {
       <DataArray type="Float64" Name="t" NumberOfTuples="1" format="ascii"> 2.5 </DataArray>
     </FieldData>
     <Piece Extent="1 2 0 1 3 4"><PointData Scalars="h">
-      <DataArray type="Float32" Name="h" format="ascii"> 0 1 2 3 4 5
+      <DataArray type="Float32" Name="h" format="ascii"> <!-- by hand --> 0 1 2 3 4 5
         6 7 </DataArray></PointData></Piece></ImageData></VTKFile>"#;
     let appended = VTK_INLINE[..start].to_string()
         + r#"<FieldData>
@@ -245,6 +245,40 @@ fn short_and_lying_files_are_refused() {
         }
     }
     assert!(VtiFile::parse(&raw[..end]).is_ok(), "all samples are there");
+}
+
+/// However many arrays there are, a volume is one of them.
+#[test]
+fn only_the_scalars_are_unpacked() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.vti");
+    let array = |name: &str, offset: usize| {
+        ARRAY.replace("\"h\"", &format!("\"{name}\"")).replace("\"0\"", &format!("\"{offset}\""))
+    };
+    let read = |arrays: &str, name: Option<&str>| {
+        let data = appended("raw", &[&16u32.to_le_bytes()[..], &[7; 16]].concat());
+        std::fs::write(&path, file("", arrays, &data)).unwrap();
+        VtiFile::read_scalars(&path, name).and_then(|file| file.into_scalars(name)).map(|(_, samples)| samples.get(0))
+    };
+    let bits = "<DataArray type=\"Bit\" Name=\"bits\" format=\"ascii\">1 0</DataArray>";
+    let arrays = array("value", 0) + &array("damaged", 900) + bits;
+    assert_eq!(read(&arrays, None).unwrap(), f64::from(0x0707));
+    assert_eq!(read(&arrays, Some("value")).unwrap(), f64::from(0x0707));
+    assert!(read(&arrays, Some("damaged")).unwrap_err().to_string().contains("offset \"900\""));
+    assert!(matches!(read(&arrays, Some("bits")), Err(Error::NotSupported(_))));
+    assert!(matches!(read(&bits.repeat(2), None), Err(Error::NotSupported(_))));
+    assert!(read(&(array("a", 0) + &array("b", 0)), None).unwrap_err().to_string().contains("cannot tell"));
+    assert!(VtiFile::read(&path).is_ok());
+}
+
+/// Arrays of the same bytes would take a thousand times as much memory as their file.
+#[test]
+fn arrays_that_share_their_bytes_are_refused() {
+    let data = appended("raw", &[&4096u32.to_le_bytes()[..], &[7; 4096]].concat());
+    let array = "<DataArray type=\"Float64\" Name=\"a\" NumberOfComponents=\"64\" format=\"appended\" offset=\"0\"/>";
+    assert!(VtiFile::parse(&file("", array, &data)).is_ok());
+    let message = VtiFile::parse(&file("", &array.repeat(2), &data)).unwrap_err().to_string();
+    assert!(message.contains("arrays that share theirs"), "{message}");
 }
 
 #[test]
