@@ -12,8 +12,8 @@ mod time;
 
 pub use memory::MemoryEstimate;
 pub use preset::Preset;
-pub(crate) use settings::common_size;
 pub use settings::{BakeOptions, BakeSettings, Engine, Interpolation, MOST_BANDS, StrategyName};
+pub(crate) use settings::{common_size, whole_number};
 pub use time::TimeEstimate;
 
 use crate::checkpoint::{Checkpoint, Saved};

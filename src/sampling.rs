@@ -18,8 +18,11 @@ pub enum Strategy {
     Planes(usize),
 }
 
-/// Batches of 2²⁰ points that a uniform search for samples on the sweep may take: 4·10⁹ points.
-const MAX_BATCHES: usize = 4096;
+/// Points that a uniform search for samples on the sweep may try.
+const MOST: usize = 1 << 32;
+
+/// Points that one may try which takes no time to speak of.
+const AT_HAND: usize = 1 << 20;
 
 /// `count` positions in the local frame. The level set through each is the one it samples; positions whose isovalue
 /// lies outside the sweep are left out, so the result may be shorter for level sets at the sweep's ends, and for planes
@@ -29,7 +32,7 @@ const MAX_BATCHES: usize = 4096;
 /// # Errors
 /// From extracting level sets.
 pub fn positions(field: &Field, strategy: &Strategy, count: u64, seed: u64) -> Result<Vec<Vec3>> {
-    positions_in(field, strategy, count, seed, MAX_BATCHES)
+    positions_in(field, strategy, count, seed, MOST)
 }
 
 /// As [`positions`], but what is not found at once is left out.
@@ -37,7 +40,26 @@ pub fn positions(field: &Field, strategy: &Strategy, count: u64, seed: u64) -> R
 /// # Errors
 /// From extracting level sets.
 pub fn positions_at_hand(field: &Field, strategy: &Strategy, count: u64, seed: u64) -> Result<Vec<Vec3>> {
-    positions_in(field, strategy, count, seed, 1)
+    positions_in(field, strategy, count, seed, AT_HAND)
+}
+
+/// `count` positions in the local frame for each of `strata` equal parts of the sweep, uniform over the part of Ω whose
+/// isovalues it holds, in the lattice's order; fewer where not as many are at hand.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within the strata")]
+pub fn positions_by_isovalue(field: &Field, strata: u8, count: u64, seed: u64) -> Vec<Vec<Vec3>> {
+    let stratum = |h: f64| ((h * f64::from(strata)) as u8).min(strata - 1);
+    let cells = cells_on_sweep(field);
+    let spans: Vec<[u8; 2]> = cells.par_iter().map(|&cell| range(field, cell).map(|h| stratum(f64::from(h)))).collect();
+    let of = |n: u8| {
+        let passed = cells.par_iter().zip(&spans).filter(|(_, span)| (span[0]..=span[1]).contains(&n));
+        let own: Vec<usize> = passed.map(|(cell, _)| *cell).collect();
+        let within = |p: &Vec3| {
+            let h = field.value(p.as_dvec3());
+            (0.0..=1.0).contains(&h) && stratum(h) == n
+        };
+        positions_in_cells(field, &own, within, (count, AT_HAND), (seed, u64::from(n) + 1))
+    };
+    (0..strata).map(of).collect()
 }
 
 #[allow(clippy::cast_possible_truncation, reason = "positions are f32, indices below 2³²")]
@@ -50,24 +72,7 @@ fn positions_in(field: &Field, strategy: &Strategy, count: u64, seed: u64, most:
         far * DVec3::new(x, y, set.coordinate(i as u32, 2))
     };
     match strategy {
-        Strategy::Uniform => {
-            let cells = cells_on_sweep(field);
-            let [nx, ny, _] = field.lattice().cells();
-            if cells.is_empty() {
-                return Ok(Vec::new());
-            }
-            let in_cell = |i: usize| {
-                let set = Sobol::set(seed, Stage::Sample, (i >> 32) as u64);
-                let cell = cells[(set.coordinate(i as u32, 3) * cells.len() as f64) as usize];
-                let corner = DVec3::new((cell % nx) as f64, (cell / nx % ny) as f64, (cell / (nx * ny)) as f64);
-                let [x, y] = set.point2(i as u32, 0);
-                (corner + DVec3::new(x, y, set.coordinate(i as u32, 2))).as_vec3()
-            };
-            let mut found = in_batches(count, most, |i| Some(in_cell(i)).filter(on_sweep));
-            // Neighbours one after another: their rays read the same memory.
-            found.par_sort_by_key(|p| [p.z as u32, p.y as u32, p.x as u32]);
-            Ok(found)
-        }
+        Strategy::Uniform => Ok(positions_in_cells(field, &cells_on_sweep(field), on_sweep, (count, most), (seed, 0))),
         Strategy::Planes(planes) => Ok(in_batches(count, most, |i| {
             // Across (1,1,1) in units of Ω, all planes alike: their projection onto z = 0 scales all areas alike.
             let p = uniform(i) / far;
@@ -80,24 +85,58 @@ fn positions_in(field: &Field, strategy: &Strategy, count: u64, seed: u64, most:
     }
 }
 
+/// The first `count` of `most` positions even over `cells` of which `wanted` is true, in the lattice's order; by the
+/// numbers of `set`, of all sets of a seed.
+#[allow(clippy::cast_possible_truncation, reason = "positions are f32, indices below 2³²")]
+fn positions_in_cells(
+    field: &Field,
+    cells: &[usize],
+    wanted: impl Fn(&Vec3) -> bool + Sync,
+    (count, most): (u64, usize),
+    (seed, set): (u64, u64),
+) -> Vec<Vec3> {
+    if cells.is_empty() {
+        return Vec::new();
+    }
+    let [nx, ny, _] = field.lattice().cells();
+    let in_cell = |i: usize| {
+        let set = Sobol::set(seed, Stage::Sample, set << 32 | (i >> 32) as u64);
+        let cell = cells[(set.coordinate(i as u32, 3) * cells.len() as f64) as usize];
+        let corner = DVec3::new((cell % nx) as f64, (cell / nx % ny) as f64, (cell / (nx * ny)) as f64);
+        let [x, y] = set.point2(i as u32, 0);
+        (corner + DVec3::new(x, y, set.coordinate(i as u32, 2))).as_vec3()
+    };
+    let mut found = in_batches(count, most, |i| Some(in_cell(i)).filter(&wanted));
+    // Neighbours one after another: their rays read the same memory.
+    found.par_sort_by_key(|p| [p.z as u32, p.y as u32, p.x as u32]);
+    found
+}
+
 /// Numbers of the cells that level sets of the sweep pass.
 fn cells_on_sweep(field: &Field) -> Vec<usize> {
     let [nx, ny, nz] = field.lattice().cells();
     let passed = |&cell: &usize| {
-        let corners = field.corners([cell % nx, cell / nx % ny, cell / (nx * ny)]);
-        let [lo, hi] = [corners.into_iter().reduce(f32::min), corners.into_iter().reduce(f32::max)];
-        lo.is_some_and(|lo| lo <= 1.0) && hi.is_some_and(|hi| hi >= 0.0)
+        let [lo, hi] = range(field, cell);
+        lo <= 1.0 && hi >= 0.0
     };
     (0..nx * ny * nz).into_par_iter().filter(passed).collect()
 }
 
-/// The first `count` points that `point` gives for 0, 1, 2 …, tried in batches until there are enough, `most` of them.
+/// Least and greatest h of a cell, units of the sweep.
+fn range(field: &Field, cell: usize) -> [f32; 2] {
+    let [nx, ny, _] = field.lattice().cells();
+    let corners = field.corners([cell % nx, cell / nx % ny, cell / (nx * ny)]);
+    corners.into_iter().fold([f32::INFINITY, f32::NEG_INFINITY], |[lo, hi], h| [lo.min(h), hi.max(h)])
+}
+
+/// The first `count` points that `point` gives for 0, 1, 2 …, tried in batches until there are enough or `most` were
+/// tried.
 #[allow(clippy::cast_possible_truncation, reason = "counts of what fits memory")]
 fn in_batches(count: u64, most: usize, point: impl Fn(usize) -> Option<Vec3> + Sync) -> Vec<Vec3> {
-    const BATCH: usize = 1 << 20;
+    let batch = (2 * count.min(1 << 20) as usize).clamp(1 << 12, 1 << 20);
     let mut found: Vec<Vec3> = Vec::new();
-    for batch in 0..most {
-        found.par_extend((batch * BATCH..(batch + 1) * BATCH).into_par_iter().filter_map(&point));
+    for first in (0..most).step_by(batch) {
+        found.par_extend((first..(first + batch).min(most)).into_par_iter().filter_map(&point));
         if found.len() as u64 >= count {
             found.truncate(count as usize);
             break;

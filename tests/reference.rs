@@ -2,14 +2,13 @@
 //! that `compare` makes of it.
 
 use glam::DVec3;
-use isolume::accuracy::{InterpolationFloor, ReferenceMesh, compare};
+use isolume::accuracy::{ReferenceMesh, compare};
 use isolume::brdf::reflected;
 use isolume::direct::{Receiver, luminance};
 use isolume::embree::{Device, GraphTracer, SurfaceTracer};
 use isolume::export::ply::PlyMesh;
 use isolume::field::{Field, Sweep};
 use isolume::flattened::{Departure, FlattenedRay, Side, Target};
-use isolume::illumination_grid::GridSize;
 use isolume::polygon::Polygon;
 use isolume::progress::Progress;
 use isolume::reference::{Integrator, PathTracer, ReferenceSettings, path_picture, reference, subset};
@@ -22,6 +21,9 @@ use isolume::tracer::Tracer;
 use isolume::volume::generate::Generator;
 use isolume::volume::{Lattice, Samples, Volume};
 use isolume::warp;
+
+#[path = "reference/floor.rs"]
+mod floor;
 
 fn device() -> Device {
     Device::new(1).unwrap()
@@ -477,19 +479,37 @@ fn two_references_cancel_their_noise() {
     assert!((one.noise_floor - 100.0 * root3 * 0.05).abs() < 1e-9);
 }
 
+/// The variance that a reference tells is that of its radiance over seeds.
 #[test]
-fn the_interpolation_floor_falls_with_the_grid() {
-    let (scene, device) = (bumps(41), device());
+fn references_scatter_as_they_tell() {
+    const SEEDS: u64 = 24;
+    let (scene, device) = (bumps(17), device());
     let c = scene.field.sweep().isovalue(47.0);
-    let tracer = GraphTracer::new(&device, &scene).unwrap();
+    let tracer = SurfaceTracer::new(&device, &scene, c, 1).unwrap();
     let mesh = SurfaceMesh::extract(&scene, c, 1).unwrap();
-    let floor = |factor| {
-        let grid = GridSize::Factors([factor; 3]);
-        let floor = InterpolationFloor { scene: &scene, tracer: &tracer, mesh: &mesh, grid };
-        floor.direct(c, 1024, Some(300)).unwrap().percent_rms
-    };
-    let (coarse, fine) = (floor(1), floor(3));
-    assert!(fine < 0.7 * coarse && coarse < 5.0 && fine > 0.0, "{coarse} {fine}");
+    for (integrator, samples, batches) in [(Integrator::Path, 16, 8), (Integrator::Photon, 16, 4)] {
+        let made: Vec<_> = (0..SEEDS)
+            .map(|seed| {
+                let settings = ReferenceSettings {
+                    integrator,
+                    samples,
+                    batches,
+                    photons: 1 << 14,
+                    vertices: Some(120),
+                    seed,
+                    ..Default::default()
+                };
+                reference(&scene, &tracer, &mesh, c, &settings, &|_| true).unwrap()
+            })
+            .collect();
+        let n = SEEDS as f64;
+        let told: f64 = made.iter().flat_map(|r| &r.variance).map(|v| v.element_sum()).sum::<f64>() / n;
+        let mean = |v: usize| made.iter().map(|r| r.radiance[v]).sum::<DVec3>() / n;
+        let squares = |v: usize| made.iter().map(|r| (r.radiance[v] - mean(v)).length_squared()).sum::<f64>();
+        let found: f64 = (0..mesh.local.len()).map(squares).sum::<f64>() / (n - 1.0);
+        println!("{integrator:?}: scatter over what is told {:.3}", found / told);
+        assert!((0.8..1.25).contains(&(found / told)), "{integrator:?}: {found} told {told}");
+    }
 }
 
 #[test]

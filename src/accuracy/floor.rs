@@ -1,8 +1,8 @@
 //! The interpolation floor: what a lattice can hold at all, whatever fills it.
 
-use super::{Accuracy, ReferenceMesh, compare, display, percent};
+use super::{ReferenceMesh, display, percent};
 use crate::brdf::reflected;
-use crate::direct::{Receiver, direct_irradiance};
+use crate::direct::Receiver;
 use crate::error::{Error, Result};
 use crate::illumination_grid::GridSize;
 use crate::mask::stand_ins;
@@ -28,44 +28,31 @@ pub struct InterpolationFloor<'a, T> {
 }
 
 impl<T: Tracer> InterpolationFloor<'_, T> {
-    /// Direct light, against exact direct light at (a fixed subset of) the vertices of the isosurface, which is that of
-    /// `isovalue` (units of the sweep). "Exact" is the closed form times the visible share of `shadow_rays`
-    /// low-discrepancy points.
+    /// Direct light at the grid's points against direct light at (a fixed subset of) the vertices of the isosurface,
+    /// which is that of `isovalue` (units of the sweep), `shadow_rays` each; percent RMS. Two independent sets of rays
+    /// on both sides make it free of their noise, as in [`InterpolationFloor::total`].
     ///
     /// # Errors
     /// `Invalid` if the grid has too many points or no vertex has a normal.
-    pub fn direct(&self, isovalue: f32, shadow_rays: u32, vertices: Option<usize>) -> Result<Accuracy> {
+    pub fn direct(&self, isovalue: f32, shadow_rays: u32, vertices: Option<usize>) -> Result<f64> {
         let Self { scene, tracer, mesh, .. } = *self;
-        let direct = |r: &Receiver, index: u64| {
-            let e = direct_irradiance(scene, tracer, r, shadow_rays, Stage::Direct.key(0, index)).mean;
+        let chosen = subset(mesh.local.len(), vertices);
+        let direct = |seed: u64, r: &Receiver, index: u64| {
+            let e = PathTracer::new(scene, tracer).direct(r, shadow_rays, Stage::Direct.key(seed, index));
             reflected(scene.surface.albedo.at(f64::from(r.isovalue)), e)
         };
-        let chosen = subset(mesh.local.len(), vertices);
-        let interpolated = self.through_grid(&chosen, &direct)?;
-        let n = mesh.local.len();
-        let (mut texture, mut radiance, mut sampled) = (vec![DVec3::ZERO; n], vec![DVec3::ZERO; n], vec![false; n]);
-        let exact: Vec<Option<DVec3>> = chosen
-            .par_iter()
-            .map(|&v| {
-                Some(direct(
-                    &Receiver::on_level_set(scene, mesh.local[v], isovalue, scene.surface.outside)?,
-                    !(v as u64),
-                ))
-            })
-            .collect();
-        for ((&v, exact), through) in chosen.iter().zip(exact).zip(interpolated) {
-            if let (Some(exact), Some(through)) = (exact, through) {
-                (texture[v], radiance[v], sampled[v]) = (through, exact, true);
-            }
-        }
-        let reference = ReferenceMesh {
-            positions: mesh.positions.clone(),
-            triangles: mesh.triangles.clone(),
-            variance: vec![DVec3::ZERO; n],
-            radiance,
-            sampled,
-        };
-        Ok(compare(&texture, &[reference], scene.exposure())?.0)
+        let both = [1_000_001, 1_000_002].map(|seed| {
+            let through = self.through_grid(&chosen, &|r, index| direct(seed, r, index))?;
+            let exact = chosen.par_iter().map(|&v| {
+                let receiver = Receiver::on_level_set(scene, mesh.local[v], isovalue, scene.surface.outside)?;
+                // Indices beyond those of any grid's points.
+                Some(direct(seed, &receiver, 1 << 40 | v as u64))
+            });
+            let exact: Vec<Option<DVec3>> = exact.collect();
+            Ok(through.into_iter().zip(exact).map(|(through, exact)| through.zip(exact)).collect())
+        });
+        let [first, second] = both;
+        self.without_noise(first?, second?)
     }
 
     /// All light: path-traced radiance at the grid's points (`paths` each), against two independent references on the
@@ -73,7 +60,7 @@ impl<T: Tracer> InterpolationFloor<'_, T> {
     /// noise of both sides. 0 where that is negative.
     ///
     /// # Errors
-    /// `Invalid` if the grid has too many points.
+    /// `Invalid` if the grid has too many points or no vertex is sampled.
     pub fn total(&self, references: &[ReferenceMesh], paths: u32, vertices: usize) -> Result<f64> {
         let Self { scene, tracer, mesh, .. } = *self;
         let [a, b] = references else {
@@ -88,16 +75,27 @@ impl<T: Tracer> InterpolationFloor<'_, T> {
             };
             self.through_grid(&chosen, &value)
         };
-        let (first, second) = (texture(1_000_001)?, texture(1_000_002)?);
-        let exposure = scene.exposure();
-        let (mut sum, mut count) = (0.0, 0.0);
-        for ((&v, t), u) in chosen.iter().zip(first).zip(second) {
-            let (Some(t), Some(u)) = (t, u) else { continue };
-            let d = |t: DVec3, r: &ReferenceMesh| display(t, exposure) - display(r.radiance[v], exposure);
-            sum += d(t, a).dot(d(u, b));
-            count += 1.0;
+        let against = |seed: u64, reference: &ReferenceMesh| -> Result<Vec<_>> {
+            let through = texture(seed)?;
+            Ok(chosen.iter().zip(through).map(|(&v, t)| Some((t?, reference.radiance[v]))).collect())
+        };
+        self.without_noise(against(1_000_001, a)?, against(1_000_002, b)?)
+    }
+
+    /// Percent RMS by pairs of light through the grid and exact light at the same vertices, two of each that know
+    /// nothing of each other.
+    ///
+    /// # Errors
+    /// `Invalid` if there are none.
+    fn without_noise(&self, first: Vec<Option<(DVec3, DVec3)>>, second: Vec<Option<(DVec3, DVec3)>>) -> Result<f64> {
+        let exposure = self.scene.exposure();
+        let off = |(t, r): (DVec3, DVec3)| display(t, exposure) - display(r, exposure);
+        let products = first.into_iter().zip(second).filter_map(|(a, b)| Some(off(a?).dot(off(b?))));
+        let (sum, count) = products.fold((0.0, 0usize), |(sum, count), product| (sum + product, count + 1));
+        if count == 0 {
+            return Err(Error::Invalid("no vertex has light, of its own and through the grid".into()));
         }
-        Ok(percent(sum / f64::max(count, 1.0)))
+        Ok(percent(sum / count as f64))
     }
 
     /// Radiance at the vertices `chosen` as the grid gives it if its points hold `value(receiver, index)`. Only points

@@ -10,11 +10,11 @@ use crate::mask::{Mask, local_position};
 use crate::progress::Tick;
 use crate::reference::PathTracer;
 use crate::rng::{Rng, Stage};
-use crate::sampling::{Strategy, positions};
+use crate::sampling::positions_by_isovalue;
 use crate::scene::Scene;
 use crate::tracer::Tracer;
 use crate::volume::Lattice;
-use glam::DVec3;
+use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use serde::Serialize;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -90,10 +90,10 @@ pub struct Survey {
 const PARTS: usize = 5;
 
 /// Isovalues that get as many points each.
-const STRATA: usize = 40;
+const STRATA: u8 = 40;
 
 /// Points to choose from for each that is chosen.
-const CANDIDATES: usize = 32;
+const CANDIDATES: u64 = 64;
 
 /// Compares `grid` (over `lattice`, of the outside) with paths through `scene`, of whose field it is: at points on
 /// isosurfaces what is `shown` there, given index coordinates of `lattice` and the point's number; at the grid's own
@@ -112,7 +112,7 @@ pub fn survey<T: Tracer>(
     settings: &SurveySettings,
     tick: Tick,
 ) -> Result<Survey> {
-    let chosen = places(&scene.field, settings)?;
+    let chosen = places(&scene.field, settings);
     if chosen.is_empty() {
         return Err(Error::Invalid("no isosurface of its sweep was found; bake a sweep that has some".into()));
     }
@@ -231,34 +231,32 @@ fn mean_square(all: &[Deviation]) -> (f64, [f64; 2]) {
 
 /// Points on isosurfaces of the sweep, local: as many for each isovalue, over each isosurface evenly by its area. Of
 /// points even in the volume, whose measure is dV = dA dc / |∇h|, those with a greater |∇h| are chosen more often.
-fn places(field: &Field, settings: &SurveySettings) -> Result<Vec<DVec3>> {
-    let count = (CANDIDATES * settings.points).max(1 << 16) as u64;
-    let candidates = positions(field, &Strategy::Uniform, count, seed(settings, 3))?;
-    let found: Vec<(f64, usize)> = candidates
-        .par_iter()
-        .map(|p| {
-            let (h, gradient) = field.value_and_gradient(p.as_dvec3());
-            #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within the strata")]
-            let stratum = ((h * STRATA as f64) as usize).min(STRATA - 1);
-            (gradient.length(), stratum)
-        })
-        .collect();
-    let mut area = [0.0; STRATA];
-    found.iter().filter(|f| f.0.is_finite()).for_each(|&(g, s)| area[s] += g);
-    let strata = area.iter().filter(|a| **a > 0.0).count() as f64;
+fn places(field: &Field, settings: &SurveySettings) -> Vec<DVec3> {
+    // Of each isovalue as many to choose from, however little of Ω it takes: few would be chosen over and over.
+    let count = (CANDIDATES * settings.points as u64).div_ceil(u64::from(STRATA)).max(1 << 11);
+    let weighed = |p: &Vec3| {
+        let p = p.as_dvec3();
+        (p, field.value_and_gradient(p).1.length())
+    };
+    let strata = positions_by_isovalue(field, STRATA, count, seed(settings, 3)).into_iter().map(|candidates| {
+        let weighed: Vec<(DVec3, f64)> = candidates.par_iter().map(weighed).filter(|(_, g)| g.is_finite()).collect();
+        let area: f64 = weighed.iter().map(|(_, g)| g).sum();
+        (weighed, area)
+    });
+    let strata: Vec<(Vec<(DVec3, f64)>, f64)> = strata.filter(|(_, area)| *area > 0.0).collect();
     // Every 1 / points of the running sum of weights, which end at 1.
     let mut chosen = Vec::with_capacity(settings.points);
     let offset = stream(settings, u64::MAX).unit();
     let mut sum = 0.0;
-    for (&(g, s), p) in found.iter().zip(&candidates) {
-        if g.is_finite() && area[s] > 0.0 {
-            sum += g / (area[s] * strata) * settings.points as f64;
+    for (candidates, area) in &strata {
+        for (p, g) in candidates {
+            sum += g / (area * strata.len() as f64) * settings.points as f64;
             while chosen.len() < settings.points && chosen.len() as f64 + offset < sum {
-                chosen.push(p.as_dvec3());
+                chosen.push(*p);
             }
         }
     }
-    Ok(chosen)
+    chosen
 }
 
 /// A point of the grid around index coordinates `p` that holds light of its own level set, as likely as interpolation
@@ -360,6 +358,25 @@ mod tests {
             let expected = 100.0 * square([1.0 - part.isovalues[1], 1.0 - part.isovalues[0]]).sqrt();
             assert!((part.percent_rms / expected - 1.0).abs() < 0.06, "{part:?} {expected}");
             assert!(part.points.abs_diff(1200) < 60, "{part:?}");
+        }
+    }
+
+    /// A ball in the middle of a faint background, whose brightest fortieth takes 3 points of 10⁵ that are even in the
+    /// volume: its isovalues have as many points as others, and not always the same.
+    #[test]
+    fn small_isosurfaces_have_points_of_their_own() {
+        let field = scene(|x| (-12.0 * x.length_squared()).exp(), [0.01, 1.0]).field;
+        let chosen = places(&field, &SurveySettings { points: 2000, paths: 1, seed: 1 });
+        let mut strata = vec![Vec::new(); usize::from(STRATA)];
+        for p in chosen {
+            let n = (f64::from(STRATA) * field.value(p)) as usize;
+            strata[n.min(usize::from(STRATA) - 1)].push(p.to_array());
+        }
+        for (n, mut points) in strata.into_iter().enumerate() {
+            assert!(points.len().abs_diff(50) < 2, "{n}: {}", points.len());
+            points.sort_by(|a, b| a.partial_cmp(b).unwrap());
+            points.dedup();
+            assert!(points.len() > 45, "{n}: {} different ones", points.len());
         }
     }
 

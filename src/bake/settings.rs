@@ -90,7 +90,7 @@ pub struct BakeOptions {
     #[arg(long, value_name = "N")]
     pub light_points: Option<usize>,
     /// Photons to emit (by preset 524288 / 4194304 / 16777216)
-    #[arg(long, value_name = "N", value_parser = count)]
+    #[arg(long, value_name = "N", value_parser = whole_number)]
     pub photons: Option<u64>,
     /// Reflections after which a photon is cut off (default: 65535, left to Russian roulette)
     #[arg(long, value_name = "N")]
@@ -107,7 +107,7 @@ pub struct BakeOptions {
     #[arg(long, value_name = "TAU")]
     pub tau: Option<f64>,
     /// Scattered radiance samples per side (default: one at each grid point)
-    #[arg(long, value_name = "N", value_parser = count)]
+    #[arg(long, value_name = "N", value_parser = whole_number)]
     pub samples: Option<u64>,
     /// Where samples are placed (default: nodes, or uniform if --samples is given)
     #[arg(long)]
@@ -528,7 +528,7 @@ impl BakeSettings {
 
 /// A number that may be written as `1e6`.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a whole number below 2⁵³")]
-fn count(text: &str) -> std::result::Result<u64, std::num::ParseIntError> {
+pub(crate) fn whole_number(text: &str) -> std::result::Result<u64, std::num::ParseIntError> {
     let short = text.parse::<f64>().ok().filter(|n| n.fract() == 0.0 && (0.0..9e15).contains(n));
     text.parse().or_else(|e| short.map(|n| n as u64).ok_or(e))
 }

@@ -2,6 +2,7 @@
 
 use super::extract::{Opened, open_scene};
 use super::{device, expect_extension, outputs};
+use crate::bake::whole_number;
 use crate::embree::{Device, GraphTracer, SurfaceTracer};
 use crate::error::{Error, Result};
 use crate::export::picture::Picture;
@@ -50,7 +51,7 @@ pub(super) struct ReferenceArgs {
     #[arg(long, default_value_t = 16, value_name = "N")]
     batches: u32,
     /// With --integrator photon: photons over all batches (default: 16777216)
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = whole_number)]
     photons: Option<u64>,
     /// With --integrator photon: photons per irradiance estimate (default: 64)
     #[arg(long, value_name = "K")]

@@ -16,6 +16,8 @@ pub struct Origin {
     pub isovalue: Option<f64>,
     /// Digest of material and box at that isovalue, as [`light`].
     pub light: Option<String>,
+    /// Seed of its random numbers.
+    pub seed: Option<u64>,
     /// Whether the light is a bake's.
     pub of_bake: bool,
 }
@@ -44,7 +46,8 @@ impl Origin {
         let value = |key: &str| words().find_map(|w| w.strip_prefix(key)?.strip_prefix('='));
         let isovalue = value("isovalue").and_then(|v| v.parse().ok()).filter(|c: &f64| c.is_finite());
         let of_bake = comments.iter().any(|c| c.starts_with(OF_BAKE));
-        Self { isovalue, light: value("light").map(str::to_owned), of_bake }
+        let seed = value("seed").and_then(|v| v.parse().ok());
+        Self { isovalue, light: value("light").map(str::to_owned), seed, of_bake }
     }
 }
 

@@ -91,7 +91,7 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
         let floor = |grid| InterpolationFloor { scene, tracer: &tracer, mesh: &mesh, grid };
         let mut floors = Vec::new();
         for grid in [1, 2, 3].map(|n| GridSize::Factors([n; 3])) {
-            floors.push(floor(grid).direct(unit, shadow, Some(vertices))?.percent_rms);
+            floors.push(floor(grid).direct(unit, shadow, Some(vertices))?);
         }
         let paths = if study.quick { 64 } else { 256 };
         let grid = base.grid.unwrap_or(GridSize::OWN);

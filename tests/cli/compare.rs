@@ -134,6 +134,14 @@ fn another_material_or_box_is_warned_of() {
     assert!(comments[1].starts_with("isolume reference isovalue=47.0 seed=1 samples=4 integrator=path light="));
     let output = isolume(dir, &["compare", "lit.vti", "b.vti"]);
     assert_eq!(output.status.code(), Some(2), "a volume is no reference");
+    // The same numbers through another tracer.
+    let again = |name: &str, more: &[&str]| {
+        reference(dir, "b.vti", name, &[&RANGE[..], &["--isovalue", "47"], more].concat());
+    };
+    again("more.ply", &["--trilinear"]);
+    refused(dir, &["compare", "lit.vti", "r.ply", "more.ply"], &["both references are of seed 1"]);
+    again("two.ply", &["--seed", "2"]);
+    ok(dir, &["compare", "lit.vti", "r.ply", "two.ply"]);
 }
 
 fn survey(dir: &Path, file: &str, more: &[&str]) -> serde_json::Value {
@@ -149,7 +157,7 @@ fn all_isosurfaces_are_compared_with_paths() {
     ok(dir, &["generate", "bumps", "--size", "31", "-o", "b.vti", "-q"]);
     ok(dir, &[&["bake", "b.vti", "-o", "lit.vti", "--preset", "preview", "-q"], &RANGE[..]].concat());
     let number = |s: &serde_json::Value, name: &str| s[name].as_f64().unwrap();
-    let few = ["--points", "1500", "--paths", "64"];
+    let few = ["--points", "6000", "--paths", "16"];
     let found = survey(dir, "lit.vti", &few);
     assert_eq!(found, survey(dir, "lit.vti", &[&few[..], &["--threads", "1"]].concat()));
     let other = survey(dir, "lit.vti", &[&few[..], &["--seed", "2"]].concat());
@@ -169,7 +177,7 @@ fn all_isosurfaces_are_compared_with_paths() {
     let tracer = GraphTracer::new(&device, &scene).unwrap();
     let mut grid = baked.sides[0].1.clone();
     grid.radiance.as_flattened_mut().iter_mut().for_each(|x| *x *= 0.9);
-    let settings = SurveySettings { points: 1500, paths: 64, seed: 1 };
+    let settings = SurveySettings { points: 6000, paths: 16, seed: 1 };
     let shown = |p, _| grid.interpolate(baked.lattice(), p);
     let dim = isolume::accuracy::survey(
         &scene,

@@ -62,9 +62,9 @@ fn options_without_effect_are_named() {
 #[test]
 fn counts_may_have_exponents() {
     for (text, n) in [("12", 12), ("1e6", 1_000_000), ("2.5e3", 2500), ("0", 0), ("18446744073709551615", u64::MAX)] {
-        assert_eq!(count(text), Ok(n), "{text}");
+        assert_eq!(whole_number(text), Ok(n), "{text}");
     }
     for text in ["", "1.5", "-1", "-1e3", "1e16", "nan", "inf", "1e"] {
-        assert!(count(text).is_err(), "{text}");
+        assert!(whole_number(text).is_err(), "{text}");
     }
 }
