@@ -36,7 +36,12 @@ impl AtomicFile {
     pub fn create(path: impl AsRef<Path>) -> Result<Self> {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let path = path.as_ref();
-        let old = fs::metadata(path).ok();
+        let old = match fs::metadata(path) {
+            Ok(found) => Some(found),
+            Err(e) if matches!(e.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => None,
+            // Such as a name that is too long, of which a temporary one says nothing.
+            Err(e) => return Err(Error::io(path, e)),
+        };
         match &old {
             Some(found) if !found.is_file() => {
                 let what = if found.is_dir() { "a folder" } else { "no regular file" };
@@ -179,7 +184,7 @@ fn resolved(path: &Path) -> io::Result<PathBuf> {
 }
 
 /// What `path` names, or would if it were there: through symbolic links that lead to nothing yet.
-fn followed(path: &Path) -> io::Result<PathBuf> {
+pub(crate) fn followed(path: &Path) -> io::Result<PathBuf> {
     let mut named = path.to_path_buf();
     for _ in 0..MOST_LINKS {
         match fs::read_link(&named) {
@@ -322,6 +327,8 @@ mod tests {
             file.commit().unwrap();
             assert_eq!(fs::read(&path).unwrap(), b"new");
         }
+        // One more, and what is known at the end must be known at the beginning.
+        assert!(matches!(AtomicFile::create(folder.path().join("n".repeat(256))), Err(Error::Io { .. })));
     }
 
     #[cfg(unix)]

@@ -16,11 +16,12 @@ mod signals;
 mod study;
 mod view;
 
+use crate::atomic;
 use crate::embree::Device;
 use crate::error::{Error, Result};
 use crate::export::bake_file::BakeSummary;
 use crate::isa::Isa;
-use crate::progress::{Progress, say};
+use crate::progress::{Progress, say, unless_interrupted};
 use crate::scene_file::{self, Inputs, ReadOptions};
 use crate::series::is_pattern;
 use crate::volume::Volume;
@@ -172,9 +173,12 @@ impl Cli {
     /// # Errors
     /// Whatever the verb meets; [`Error::exit_code`] says how the process should end.
     pub fn run(self) -> Result<()> {
-        if let Some(threads) = self.threads {
+        // rayon would take any number from its variable.
+        let variable = || std::env::var("RAYON_NUM_THREADS").ok()?.parse().ok().filter(|n| *n > MOST_THREADS);
+        if let Some(threads) = self.threads.or_else(variable) {
             if !(1..=MOST_THREADS).contains(&threads) {
-                return Err(Error::Invalid(format!("--threads {threads}: 1 to {MOST_THREADS}")));
+                let name = if self.threads.is_some() { "--threads" } else { "RAYON_NUM_THREADS" };
+                return Err(Error::Invalid(format!("{name} {threads}: 1 to {MOST_THREADS}")));
             }
             rayon::ThreadPoolBuilder::new()
                 .num_threads(threads)
@@ -186,15 +190,17 @@ impl Cli {
         }
         signals::heed();
         let progress = if self.quiet { Progress::Quiet } else { Progress::Shown };
+        // Of what takes no time to speak of: what came meanwhile is to end a shell's loop, too.
+        let brief = |done: Result<()>| done.and_then(|()| unless_interrupted());
         match self.verb {
-            Verb::Info(v) => v.run(),
-            Verb::Init(v) => v.run(progress),
-            Verb::Generate(v) => v.run(progress),
+            Verb::Info(v) => brief(v.run()),
+            Verb::Init(v) => brief(v.run(progress)),
+            Verb::Generate(v) => brief(v.run(progress)),
             Verb::Bake(v) => v.run(progress),
             Verb::Render(v) => v.run(progress),
-            Verb::View(v) => v.run(progress),
+            Verb::View(v) => brief(v.run(progress)),
             Verb::Extract(v) => v.run(progress),
-            Verb::Export(v) => v.run(progress),
+            Verb::Export(v) => brief(v.run(progress)),
             Verb::Reference(v) => v.run(progress),
             Verb::Compare(v) => v.run(progress),
             Verb::Flatland(v) => v.run(progress),
@@ -206,9 +212,10 @@ impl Cli {
     }
 }
 
-/// Fails now if `path` could not be written later.
+/// Fails now if `path` could not be written later; what was left of it by processes that were killed goes.
 fn writable(path: &Path) -> Result<()> {
-    crate::atomic::AtomicFile::create(path).map(drop)
+    atomic::remove_orphans(path);
+    atomic::AtomicFile::create(path).map(drop)
 }
 
 /// Fails now if one of `outputs` could not be written later, is another of them, or would take the place of one of

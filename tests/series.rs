@@ -170,6 +170,7 @@ fn scenes_name_series_and_share_a_sweep() {
         words.iter().for_each(|w| assert!(text.contains(w), "{w}: {text}"));
     };
     refused(&["bake", "s.toml", "--time", "3", "-o", "x.vti"], &["time 3", "from 0.5 to 2"]);
+    refused(&["bake", "s.toml", "-o", "x\n.vti"], &["which names the frames"]);
     refused(&["bake", "s.toml", "-o", "x.vtm"], &["x.vtm", "ends in .vti"]);
     refused(&["bake", "a.nrrd", "--time", "3", "-o", "x.vti"], &["single volume"]);
     refused(&["bake", "c_%d.nrrd", "-o", "x.vti"], &["c_%d.nrrd", "two or more"]);

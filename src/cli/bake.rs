@@ -4,7 +4,6 @@ mod plan;
 mod warnings;
 
 use super::{expect_extension, outputs};
-use crate::atomic;
 use crate::bake::{BakeOptions, BakeReport, Engine, bake_fields, digest, job};
 use crate::checkpoint::{Checkpoint, Held};
 use crate::error::{Error, Result};
@@ -92,6 +91,15 @@ impl Bake {
         };
         // Frames are of one volume.
         expect_extension(&self.output, &["vti"])?;
+        let name = self.output.file_name().unwrap_or_default();
+        // What no XML holds.
+        let foreign = |c: char| c < ' ' || matches!(c, '\u{fffe}' | '\u{ffff}');
+        if name.to_str().is_none_or(|name| name.contains(foreign)) {
+            return Err(Error::Invalid(format!(
+                "{:?} holds what the .pvd, which names the frames, cannot: use Unicode without line breaks",
+                self.output
+            )));
+        }
         let frames: Vec<Self> = (0..series.times().len()).map(|n| self.frame(n)).collect();
         let collection = self.output.with_extension("pvd");
         outputs(frames.iter().flat_map(Self::outputs).chain([collection]), &inputs)?;
@@ -288,11 +296,6 @@ impl Bake {
             ));
         }
         self.take_up(&checkpoint, progress)?;
-        if self.resume {
-            // A bake that was killed while it wrote leaves what may be large.
-            let written = self.field_files(plan.scene()).into_iter().chain([self.output.clone()]);
-            written.for_each(|path| atomic::remove_orphans(&path));
-        }
         Ok(Begun::At(checkpoint))
     }
 

@@ -2,7 +2,7 @@
 
 use super::{expect_extension, writable};
 use crate::error::{Error, Result};
-use crate::progress::{Progress, say};
+use crate::progress::{Progress, say, unless_interrupted};
 use crate::series::suffixed;
 use crate::volume::Volume;
 use crate::volume::generate::fluid::{self, Fluid};
@@ -96,6 +96,7 @@ impl Generate {
         }
         writable(&self.output)?;
         let volume = generator.sample([self.size.unwrap_or(Generator::DIMS[0]); 3])?;
+        unless_interrupted()?;
         volume.write(&self.output)?;
         if progress.is_shown() {
             say!("{}: {} of {} samples", self.output.display(), generator.name(), volume.samples().len());

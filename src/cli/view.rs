@@ -3,7 +3,7 @@
 use super::{expect_extension, outputs};
 use crate::error::Result;
 use crate::export::bake_file::BakedVolume;
-use crate::progress::{Progress, say};
+use crate::progress::{Progress, say, unless_interrupted};
 use crate::scene_file::Inputs;
 use crate::view;
 use std::path::PathBuf;
@@ -33,6 +33,7 @@ impl View {
         expect_extension(&self.output, &["html", "htm"])?;
         outputs([&*self.output], &Inputs::files([&*self.file]))?;
         let baked = BakedVolume::read(&self.file)?;
+        unless_interrupted()?;
         if view::leaves_out(&baked.scene) {
             say!(
                 "warning: context geometry is left out: {} polygons, and a page draws {}",

@@ -1,8 +1,10 @@
 //! The files that a scene is read from: nothing that is made of them may take their place.
 
 use super::{SceneOptions, VolumeSource, Volumes, parse};
+use crate::atomic::followed;
 use crate::error::{Error, Result};
 use crate::series;
+use crate::volume::{metaimage, nrrd};
 use std::path::{Path, PathBuf};
 
 /// Files that are read, and patterns of files.
@@ -32,12 +34,25 @@ impl Inputs {
         let flag = options.surroundings.kind.as_ref().map(PathBuf::from);
         inputs.files.extend(flag.or_else(|| file.surroundings.kind.as_ref().map(|kind| folder.join(kind))));
         inputs.files.extend(file.context.iter().map(|c| folder.join(&c.file)));
-        Ok(inputs)
+        Ok(inputs.with_data_files())
     }
 
     /// These files, as they are.
     pub fn files<'p>(files: impl IntoIterator<Item = &'p Path>) -> Self {
-        Self { files: files.into_iter().map(Path::to_path_buf).collect(), patterns: Vec::new() }
+        Self { files: files.into_iter().map(Path::to_path_buf).collect(), patterns: Vec::new() }.with_data_files()
+    }
+
+    /// And the samples of those that are only headers.
+    fn with_data_files(mut self) -> Self {
+        let frames = self.patterns.iter().flat_map(|pattern| {
+            let folder = pattern.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+            let found = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+            found.filter(|file| series::number(pattern, file).is_some())
+        });
+        let headers = self.files.iter().cloned().chain(frames);
+        let samples: Vec<PathBuf> = headers.filter_map(|file| data_file(&file)).collect();
+        self.files.extend(samples);
+        self
     }
 
     /// A volume's file, or the pattern of a series.
@@ -75,14 +90,24 @@ impl Inputs {
     }
 }
 
+/// The file that holds the samples of `path`, if that is a header that names one.
+fn data_file(path: &Path) -> Option<PathBuf> {
+    match path.extension()?.to_str()?.to_ascii_lowercase().as_str() {
+        "nhdr" | "nrrd" => nrrd::data_file(path),
+        "mhd" | "mha" => metaimage::data_file(path),
+        _ => None,
+    }
+}
+
 /// Whether two paths name one file.
 pub(crate) fn same(a: &Path, b: &Path) -> bool {
     identity(a).is_some_and(|a| identity(b).is_some_and(|b| a == b))
 }
 
-/// What a path names, links followed; `None` if its folder is not there.
+/// What a path names, links followed, those that lead to nothing yet among them; `None` if its folder is not there.
 fn identity(path: &Path) -> Option<PathBuf> {
     std::fs::canonicalize(path).ok().or_else(|| {
+        let path = followed(path).ok()?;
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
         Some(std::fs::canonicalize(folder).ok()?.join(path.file_name()?))
     })
@@ -143,5 +168,25 @@ mod tests {
         std::os::unix::fs::symlink(at("a.vti"), at("link.vti")).unwrap();
         assert!(Inputs::files([&*at("a.vti")]).spare(&at("link.vti")).is_err());
         assert!(Inputs::files([&*at("link.vti")]).spare(&at("a.vti")).is_err());
+        // Where nothing is yet, too.
+        std::os::unix::fs::symlink("b.vti", at("ahead.vti")).unwrap();
+        assert!(same(&at("ahead.vti"), &at("b.vti")) && !same(&at("ahead.vti"), &at("c.vti")));
+    }
+
+    #[test]
+    fn samples_behind_a_header_are_an_input() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        std::fs::write(at("a.nhdr"), "NRRD0004\ndata file: a.npy\n").unwrap();
+        std::fs::write(at("b.mhd"), "NDims = 3\nElementDataFile = b.npy\n").unwrap();
+        std::fs::write(at("c.mha"), "NDims = 3\nElementDataFile = LOCAL\n").unwrap();
+        std::fs::write(at("scene.toml"), "[volume]\nfile = \"a.nhdr\"\n").unwrap();
+        let spared = |input: &str, output: &str| Inputs::files([&*at(input)]).spare(&at(output)).is_ok();
+        assert!(!spared("a.nhdr", "a.npy") && spared("a.nhdr", "b.npy"));
+        assert!(!spared("b.mhd", "b.npy") && spared("c.mha", "LOCAL"));
+        let of = |input: &str| Inputs::of(&at(input), &SceneOptions::default()).unwrap();
+        assert!(of("scene.toml").spare(&at("a.npy")).is_err());
+        std::fs::write(at("f_7.nhdr"), "NRRD0004\ndata file: seventh.npy\n").unwrap();
+        assert!(of("f_%d.nhdr").spare(&at("seventh.npy")).is_err() && of("f_%d.nhdr").spare(&at("a.npy")).is_ok());
     }
 }

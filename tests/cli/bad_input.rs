@@ -110,6 +110,14 @@ fn bad_input_is_one_clear_line_and_leaves_nothing() {
 
     // More than any machine has.
     refused(dir, &["info", "ramp.nrrd", "--threads", "99999999"], &["--threads", "1024"]);
+    let many = std::process::Command::new(env!("CARGO_BIN_EXE_isolume"))
+        .args(["info", "ramp.nrrd"])
+        .current_dir(dir)
+        .env("RAYON_NUM_THREADS", "5000")
+        .output();
+    let many = many.unwrap();
+    let message = text(&many.stderr);
+    assert!(many.status.code() == Some(2) && message.contains("RAYON_NUM_THREADS 5000: 1 to 1024"), "{message}");
     let huge = with(&["--grid", "100000,100000,100000", "-q"]);
     refused(dir, &huge, &["GB", "this machine has", "--grid"]);
     let dry = text(&ok(dir, &[&huge[..], &["--dry-run"]].concat()).stderr);

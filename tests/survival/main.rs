@@ -237,6 +237,36 @@ fn what_nohup_started_outlives_its_terminal() {
     assert!(dir.join("out.vti").exists());
 }
 
+/// Of a loop of brief commands one signal is the end: a shell goes on with the next one if they say that all is well.
+#[test]
+fn brief_commands_say_that_they_were_interrupted() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let mut generate = Command::new(PROGRAM);
+    generate.current_dir(dir).args(["generate", "bumps", "--size", "320", "-o", "big.nrrd", "-q"]);
+    assert!(generate.status().unwrap().success());
+    fs::write(dir.join("out.vti"), "precious").unwrap();
+    // A temporary file of a process that was killed: of this boot and namespace, and of no process that lives.
+    let boot = fs::read_to_string("/proc/sys/kernel/random/boot_id");
+    let space = fs::read_link("/proc/self/ns/pid");
+    let orphan = boot.ok().zip(space.ok()).map(|(boot, space)| {
+        let digits: String = space.to_string_lossy().chars().filter(char::is_ascii_digit).collect();
+        let boot = boot.trim().rsplit('-').next().unwrap_or_default().to_owned();
+        dir.join(format!(".out.vti.{boot}{digits}-4294967-0.tmp"))
+    });
+    orphan.iter().for_each(|path| fs::write(path, "left").unwrap());
+    for args in [&["export", "big.nrrd", "-o", "out.vti"][..], &["info", "big.nrrd"]] {
+        let mut command = Command::new(PROGRAM);
+        let child = command.current_dir(dir).args(args).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+        std::thread::sleep(Duration::from_millis(200));
+        assert!(Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap().success());
+        let (output, text) = finish(child);
+        assert_eq!(output.status.code(), Some(130), "{args:?}: {text}");
+    }
+    assert_eq!(fs::read(dir.join("out.vti")).unwrap(), b"precious");
+    assert!(orphan.iter().all(|path| !path.exists()), "left over: {orphan:?}");
+}
+
 /// Runs a bake that may write files of so many blocks of 512 bytes: a full disk, as far as a process can tell.
 fn with_small_files(dir: &Path, blocks: u32, more: &[&str]) -> (Output, String) {
     let script = format!("ulimit -f {blocks}; exec \"$0\" \"$@\"");
