@@ -8,6 +8,7 @@ use crate::export::bake_file::BakedVolume;
 use crate::files;
 use crate::flat::{self, FlatLight, FlatTexture, Within};
 use crate::flattened::Side;
+use crate::isovalue_axis::IsovalueAxis;
 use crate::mask::Mask;
 use crate::polygon::Polygon;
 use crate::render::Camera;
@@ -21,7 +22,7 @@ use serde_json::{Value, json};
 use std::io::Write;
 use std::path::Path;
 
-/// Bins of the histogram under the slider, over the sweep.
+/// Bins of the histogram under the slider, over the sweep's axis.
 const BINS: usize = 256;
 
 /// The most points that a page may hold: what browsers and graphics memory bear (8 bytes each on the card).
@@ -84,7 +85,8 @@ impl Payload {
 
         let mut bytes = Vec::new();
         let samples = scene.field.samples();
-        let codes: Vec<u16> = samples.par_iter().map(|&s| codec::encode(s)).collect();
+        let axis = IsovalueAxis::of([samples]);
+        let codes: Vec<u16> = samples.par_iter().map(|&s| codec::encode(&axis, s)).collect();
         codec::append_codes(&mut bytes, &codes);
         drop(codes);
         let luminaires = luminaires(baked, &frame);
@@ -129,7 +131,8 @@ impl Payload {
                 "steps": normal_steps(scene),
             },
             "flats": flats,
-            "histogram": histogram(samples),
+            "axis": axis,
+            "histogram": histogram(&axis, samples),
             "length": bytes.len(),
         });
         Ok(Self { description, bytes })
@@ -240,12 +243,12 @@ fn normal_steps(scene: &Scene) -> [f64; 3] {
     (scene.lattice().far() / scene.field.normals_from().lattice().far()).to_array()
 }
 
-/// Samples per bin of the sweep.
+/// Samples per bin of the sweep's axis.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "in [0, BINS]")]
-fn histogram(samples: &[f32]) -> Vec<u64> {
+fn histogram(axis: &IsovalueAxis, samples: &[f32]) -> Vec<u64> {
     let mut bins = vec![0; BINS];
     for &s in samples.iter().filter(|s| (0.0..=1.0).contains(*s)) {
-        bins[((s * BINS as f32) as usize).min(BINS - 1)] += 1;
+        bins[((axis.place(s) * BINS as f32) as usize).min(BINS - 1)] += 1;
     }
     bins
 }

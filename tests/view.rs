@@ -14,6 +14,7 @@ use folder::Folder;
 use glam::{DMat3, DVec3};
 use isolume::export::bake_file::BakedVolume;
 use isolume::export::picture::{Picture, srgb_decode, srgb_encode};
+use isolume::isovalue_axis::IsovalueAxis;
 use isolume::mask::Mask;
 use isolume::view::{Payload, codec};
 use isolume::volume::{Lattice, Samples, Volume};
@@ -71,11 +72,13 @@ fn the_page_holds_the_bake_and_nothing_from_elsewhere() {
             })
             .collect::<Vec<_>>()
     };
+    let axis = IsovalueAxis::of([baked.scene.field.samples()]);
+    assert_eq!(description["axis"], serde_json::to_value(axis).unwrap());
     let (mut code, mut worst) = (0u16, 0f64);
     for (i, &s) in baked.scene.field.samples().iter().enumerate() {
         code = code.wrapping_add(u16::from_be_bytes([bytes[i], bytes[n + i]]));
         let distance = (f64::from(s) - f64::from(s).clamp(0.0, 1.0)).abs();
-        worst = worst.max((codec::decode(code) - f64::from(s)).abs() - 0.001 * distance);
+        worst = worst.max((codec::decode(&axis, code) - f64::from(s)).abs() - 0.001 * distance);
     }
     assert!(worst <= 0.51 / 32_768.0, "isovalues are off by {worst}");
     let scale = description["scale"].as_f64().unwrap();
@@ -176,10 +179,19 @@ struct View {
     render: Vec<String>,
 }
 
-/// Compares views of the bake in `dir`, and returns everything else that the page posted.
-fn compare(dir: &Path, program: &Path, views: &[View], driver: &str) -> Vec<(String, Vec<u8>)> {
+/// The page of the bake in `dir`.
+fn page(dir: &Path) -> String {
     ok(dir, &["view", "out.vti", "-o", "page.html", "-q"]);
-    let page = fs::read_to_string(dir.join("page.html")).unwrap();
+    fs::read_to_string(dir.join("page.html")).unwrap()
+}
+
+/// Compares views of the bake in `dir`, and returns everything else that its page posted.
+fn compare(dir: &Path, program: &Path, views: &[View], driver: &str) -> Vec<(String, Vec<u8>)> {
+    compare_with(&page(dir), dir, program, views, driver)
+}
+
+/// [`compare`], of a page that was changed.
+fn compare_with(page: &str, dir: &Path, program: &Path, views: &[View], driver: &str) -> Vec<(String, Vec<u8>)> {
     let pictures: Vec<Bytes> =
         views.iter().map(|v| Bytes::render(dir, &v.render.iter().map(String::as_str).collect::<Vec<_>>())).collect();
     let mut script = "await isolume.ready;\n".to_owned();
@@ -187,7 +199,7 @@ fn compare(dir: &Path, program: &Path, views: &[View], driver: &str) -> Vec<(Str
         let [w, h] = picture.size;
         script += &format!("isolume.set({}); await post('{}', isolume.pixels({w}, {h}));\n", view.page, view.name);
     }
-    let posted = browser::drive(program, &page, &(script + driver), 240);
+    let posted = browser::drive(program, page, &(script + driver), 240);
     let errors: Vec<_> = posted.iter().filter(|(n, _)| n == "error").map(|(_, b)| String::from_utf8_lossy(b)).collect();
     assert!(errors.is_empty(), "the page says: {errors:?}");
     for (view, picture) in views.iter().zip(&pictures) {
@@ -306,7 +318,8 @@ fn the_browser_shows_what_render_draws() {
     println!("{} ms per frame of 640×480", String::from_utf8_lossy(get("milliseconds")));
 }
 
-/// Labels: a box of 200 within one of 80 within 0. Samples equal to the isovalue belong to the solid.
+/// Labels: a box of 200 within one of 80 within one of 77 within 0. Samples equal to the isovalue belong to the solid,
+/// also in textures of 16-bit floats, in which 77 rounds down; and exposures in the address are those of the slider.
 #[test]
 fn plateaus_at_the_isovalue_are_within() {
     let Some(program) = chromium() else { return };
@@ -314,7 +327,8 @@ fn plateaus_at_the_isovalue_are_within() {
     let dir = dir.path();
     let lattice = Lattice::aligned([17; 3], DVec3::ZERO, DVec3::splat(1.0 / 16.0)).unwrap();
     let within = |o: usize, range: std::ops::Range<usize>| lattice.ijk(o).iter().all(|i| range.contains(i));
-    let label = |o: usize| if within(o, 6..10) { 200 } else { 80 * u8::from(within(o, 4..13)) };
+    let boxes = [(200, 6..10), (80, 4..13), (77, 3..14)];
+    let label = |o: usize| boxes.iter().find(|(_, range)| within(o, range.clone())).map_or(0, |(label, _)| *label);
     let samples = (0..lattice.len()).map(label).collect();
     Volume::new("labels", lattice.clone(), Samples::U8(samples)).unwrap().write(dir.join("b.nrrd")).unwrap();
     let bake = ["bake", "b.nrrd", "--isovalues", "1", "201", "-o", "out.vti", "--engine", "photon"];
@@ -325,7 +339,18 @@ fn plateaus_at_the_isovalue_are_within() {
         page: format!("{{ iso: {} }}", f64::from(isovalue - 1) / 200.0),
         render: words(&format!("--isovalue {isovalue}")),
     };
-    compare(dir, &program, &[view("at-80", 80), view("at-200", 200)], "");
+    let views = [view("at-77", 77), view("at-80", 80), view("at-200", 200)];
+    let driver = "location.hash = '#exposure=0.05'; await new Promise((done) => setTimeout(done, 200));
+        await post('exposure', String(isolume.state.exposure));";
+    let posted = compare(dir, &program, &views, driver);
+    assert!(posted.contains(&("exposure".into(), b"0.25".into())), "what is brighter is not stored");
+    let hidden = "<head><script>{
+            const own = WebGL2RenderingContext.prototype.getExtension;
+            WebGL2RenderingContext.prototype.getExtension = function (name) {
+                return name === 'OES_texture_float_linear' ? null : own.call(this, name);
+            };
+        }</script>";
+    compare_with(&page(dir).replacen("<head>", hidden, 1), dir, &program, &views, "");
 }
 
 /// Anisotropic, oblique and flipped axes, closed by caps inside a box with a margin, both sides stored, far from the
@@ -450,6 +475,30 @@ fn walls_of_crowded_isovalues_are_as_bright_as_render_has_them() {
         name: if isovalue < 0.005 { "faint" } else { "dense" },
         page: format!("{{ iso: {} }}", (isovalue - 0.001) / 0.999),
         render: words(&format!("--isovalue {isovalue}")),
+    });
+    compare(dir, &program, &views, "");
+}
+
+/// Two blobs that only isovalues of some 10⁻⁵ of the sweep join: in even steps of a page there were two of these, and
+/// what was drawn was another isosurface.
+#[test]
+fn isovalues_over_decades_are_where_render_has_them() {
+    let Some(program) = chromium() else { return };
+    let dir = Folder::new();
+    let dir = dir.path();
+    let lattice = Lattice::aligned([40; 3], DVec3::splat(-0.5), DVec3::splat(1.0 / 39.0)).unwrap();
+    let samples = (0..lattice.len()).map(|o| {
+        let x = lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)));
+        let blob = |centre: DVec3, steepness: f64| (-steepness * (x - centre).length()).exp();
+        100.0 * (blob(DVec3::new(0.1, 0.05, -0.1), 28.0) + 0.7 * blob(DVec3::new(-0.15, -0.05, 0.1), 24.0))
+    });
+    let volume = Volume::new("density", lattice.clone(), Samples::F64(samples.collect())).unwrap();
+    volume.write(dir.join("b.nrrd")).unwrap();
+    ok(dir, &[&["bake", "b.nrrd", "--isovalues", "0.001", "100", "-o", "out.vti"][..], &QUICK].concat());
+    let views = [("joined", 0.002), ("faint", 0.01), ("dense", 2.0)].map(|(name, isovalue): (_, f64)| View {
+        name,
+        page: format!("{{ iso: {}, shading: 'local' }}", (isovalue - 0.001) / 99.999),
+        render: words(&format!("--isovalue {isovalue} --local")),
     });
     compare(dir, &program, &views, "");
 }

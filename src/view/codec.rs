@@ -2,11 +2,13 @@
 //! which is what makes zlib effective on them.
 
 use crate::export::picture::srgb_encode;
+use crate::isovalue_axis::IsovalueAxis;
 
 /// The code of a sample that is not finite.
 pub const HOLE: u16 = 0;
 
-/// The codes of 0 and 1: between them lie equal steps, so that every isovalue of the sweep is met to 1/32768 of it.
+/// The codes of 0 and 1: between them lie equal steps of the axis, so that every isovalue of the sweep is met to
+/// 1/32768 of it, or of what is left of an axis that crowds at one end.
 const UNIT: [u16; 2] = [16_384, 49_152];
 
 /// Beyond the sweep codes grow geometrically: so many per octave, from steps as long as the ones inside.
@@ -15,28 +17,28 @@ const PER_OCTAVE: f64 = 512.0;
 /// The distance from the sweep at which an octave has doubled once: PER_OCTAVE steps of 1/32768, over ln 2.
 const OCTAVE: f64 = PER_OCTAVE / (32_768.0 * std::f64::consts::LN_2);
 
-/// A field value in units of the sweep as a code: equal steps of 1/32768 in [0, 1], relative steps of 0.14 % of the
-/// distance to it outside, as far as 9.7·10⁷; [`HOLE`] unless finite.
+/// A field value in units of the sweep as a code: equal steps of 1/32768 of the `axis` in [0, 1], relative steps of
+/// 0.14 % of the distance to it outside, as far as 9.7·10⁷; [`HOLE`] unless finite.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "rounded and clamped to the codes")]
-pub fn encode(value: f32) -> u16 {
+pub fn encode(axis: &IsovalueAxis, value: f32) -> u16 {
     let v = f64::from(value);
     let beyond = |d: f64| (PER_OCTAVE * (1.0 + d / OCTAVE).log2()).round().min(16_383.0) as u16;
     match v {
         v if !v.is_finite() => HOLE,
         v if v < 0.0 => UNIT[0] - beyond(-v),
         v if v > 1.0 => UNIT[1] + beyond(v - 1.0),
-        v => UNIT[0] + (v * 32_768.0).round() as u16,
+        _ => UNIT[0] + (f64::from(axis.place(value)) * 32_768.0).round() as u16,
     }
 }
 
 /// The value of a code; NaN for [`HOLE`]. The page has the same function.
-pub fn decode(code: u16) -> f64 {
+pub fn decode(axis: &IsovalueAxis, code: u16) -> f64 {
     let beyond = |steps: u16| OCTAVE * ((f64::from(steps) / PER_OCTAVE).exp2() - 1.0);
     match code {
         HOLE => f64::NAN,
         c if c < UNIT[0] => -beyond(UNIT[0] - c),
         c if c > UNIT[1] => 1.0 + beyond(c - UNIT[1]),
-        c => f64::from(c - UNIT[0]) / 32_768.0,
+        c => axis.isovalue(f64::from(c - UNIT[0]) / 32_768.0),
     }
 }
 
@@ -63,6 +65,29 @@ pub fn append_colours(out: &mut Vec<u8>, colours: &[[f32; 3]], factor: f32) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn encode(value: f32) -> u16 {
+        super::encode(&IsovalueAxis::EVEN, value)
+    }
+
+    fn decode(code: u16) -> f64 {
+        super::decode(&IsovalueAxis::EVEN, code)
+    }
+
+    /// Densities over decades: each isovalue is met to a thousandth of itself down to a hundred-thousandth of the
+    /// sweep.
+    #[test]
+    fn codes_crowd_where_most_of_a_volume_is() {
+        let axis = IsovalueAxis::around(1e-3);
+        for decade in [1e-5f32, 1e-4, 1e-3, 1e-2, 0.1] {
+            for v in [1.0, 2.3, 9.9].map(|n| n * decade) {
+                let back = super::decode(&axis, super::encode(&axis, v));
+                assert!((back / f64::from(v) - 1.0).abs() < 2e-3, "{v}: {back}");
+            }
+        }
+        let codes: Vec<u16> = (0..=4000).map(|i| super::encode(&axis, i as f32 / 4000.0)).collect();
+        assert!(codes.windows(2).all(|w| w[0] < w[1]) && [codes[0], codes[4000]] == UNIT, "order is kept");
+    }
 
     #[test]
     fn codes_keep_the_sweep_fine_and_the_rest_in_proportion() {

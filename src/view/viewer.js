@@ -7,10 +7,27 @@ const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a
 const unit = (a) => a.map((x) => x / Math.hypot(...a));
 const clamp = (x, lo, hi) => Math.min(Math.max(x, lo), hi);
 const EMPTY = 6e4; // the texture's value for samples that are not finite
+const float = new Float32Array(1), integer = new Int32Array(float.buffer), f32 = Math.fround;
+const bits = (x) => { float[0] = x; return integer[0]; };
+/// Where isovalue c stands along an axis, bit for bit as isovalue_axis.rs has it.
+function place({ even, from, slope, first, scale }, c) {
+  c = clamp(f32(c), 0, 1);
+  return f32(f32(even * c) + f32(scale * f32(bits(from + f32(slope * c)) - first)));
+}
+/// The isovalue that stands at a place of the volume's axis.
+function isovalue(at) {
+  if (scene.axis.scale === 0) return at;
+  let lo = 0, hi = 1;
+  for (let n = 0; n < 40; ++n) {
+    const c = 0.5 * (lo + hi);
+    if (place(scene.axis, c) < at) lo = c; else hi = c;
+  }
+  return 0.5 * (lo + hi);
+}
 
 /// What the user has chosen; lengths in half diagonals, angles in degrees.
 const initial = () => ({
-  iso: 0.5, shading: "global", azimuth: 0, elevation: 0, zoom: 1, shift: [0, 0, 0], exposure: 1, tint: [1, 1, 1],
+  iso: isovalue(0.5), shading: "global", azimuth: 0, elevation: 0, zoom: 1, shift: [0, 0, 0], exposure: 1, tint: [1, 1, 1],
   walls: true, clip: "", cut: 0.5,
 });
 let state = initial();
@@ -24,12 +41,6 @@ function fail(text) {
 
 const toSource = (u) => scene.isovalues[0] + u * (scene.isovalues[1] - scene.isovalues[0]);
 const toUnit = (v) => (v - scene.isovalues[0]) / (scene.isovalues[1] - scene.isovalues[0]);
-const bits = (x) => new Int32Array(Float32Array.of(x).buffer)[0];
-/// Where the isovalue shown stands among a wall's texels (isovalue_axis.rs).
-function place({ even, from, slope, first, scale }) {
-  const c = clamp(state.iso, 0, 1);
-  return even * c + scale * (bits(from + slope * c) - first);
-}
 /// Linear between stops [isovalue, colour], constant beyond, at the isovalue shown.
 function albedo(stops) {
   const next = stops.findIndex(([c]) => c >= state.iso);
@@ -54,13 +65,25 @@ async function unpack() {
   return bytes;
 }
 
-/// The value of a 16-bit code: equal steps over the sweep, geometric ones beyond.
+/// The value of a 16-bit code: equal steps of the volume's axis over the sweep, geometric ones beyond.
 function decode(code) {
   const octave = 512 / (32768 * Math.LN2), beyond = (n) => octave * (2 ** (n / 512) - 1);
   if (code === 0) return EMPTY;
   if (code < 16384) return Math.max(-beyond(16384 - code), -2e4);
   if (code > 49152) return Math.min(1 + beyond(code - 49152), 2e4);
-  return (code - 16384) / 32768;
+  return isovalue((code - 16384) / 32768);
+}
+
+/// Rounded as 16-bit floats are.
+function half(x) {
+  const step = 2 ** Math.max(Math.floor(Math.log2(Math.abs(x))) - 10, -24);
+  return Math.round(x / step) * step;
+}
+
+/// The isovalue shown as samples are stored: equal ones stay equal.
+function stored() {
+  const v = decode(16384 + Math.round(32768 * place(scene.axis, state.iso)));
+  return textures.half ? half(v) : v;
 }
 
 function unpackValues(bytes, count) {
@@ -138,10 +161,10 @@ function program(vertex, fragment) {
 function upload(bytes) {
   const { dims } = scene, count = dims[0] * dims[1] * dims[2], most = gl.getParameter(gl.MAX_3D_TEXTURE_SIZE);
   if (Math.max(...dims) > most) throw new Error(`the volume is ${dims.join(" × ")}; this device holds ${most} along an axis`);
-  const values = unpackValues(bytes, count), b = blocks(values, dims);
   // 32 bits if they can be interpolated, else 16.
-  const full = gl.getExtension("OES_texture_float_linear");
-  textures.value = texture(dims, full ? gl.R32F : gl.R16F, gl.RED, gl.FLOAT, values, gl.LINEAR);
+  textures.half = !gl.getExtension("OES_texture_float_linear");
+  const whole = unpackValues(bytes, count), values = textures.half ? whole.map(half) : whole, b = blocks(values, dims);
+  textures.value = texture(dims, textures.half ? gl.R16F : gl.R32F, gl.RED, gl.FLOAT, values, gl.LINEAR);
   textures.blocks = texture(b.n, gl.RG32F, gl.RG, gl.FLOAT, b.out, gl.NEAREST);
   textures.count = b.n;
   const colours = (offset, size, planes, filter) => {
@@ -220,8 +243,7 @@ function draw() {
   gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
   const common = {
     ...camera(width, height), u_value: 0, u_dims: scene.dims, u_inverse: scene.inverse, u_origin: scene.origin,
-    // As samples are stored: equal ones stay equal.
-    u_iso: Math.round(32768 * state.iso) / 32768, u_clip: clipPlane(), u_clipped: state.clip ? 1 : 0, u_local: state.shading === "local" ? 1 : 0,
+    u_iso: stored(), u_clip: clipPlane(), u_clipped: state.clip ? 1 : 0, u_local: state.shading === "local" ? 1 : 0,
     u_gain: state.tint.map((t) => t * state.exposure), u_scale: scene.scale,
     u_outside_lower: scene.outside_lower ? 1 : 0,
   };
@@ -237,7 +259,7 @@ function draw() {
       u_normal: f.normal, u_albedo: albedo(f.albedo), u_emission: f.emission, u_corner: f.corner, u_du: f.du, u_dv: f.dv,
       u_cap: f.cap ? 1 : 0, u_textured: f.texture ? 1 : 0, u_opaque_back: f.opaqueBack ? 1 : 0,
       u_within: f.within ? 1 : 0, u_outside_only: f.outsideOnly ? 1 : 0,
-      u_place: f.texture ? place(f.texture.axis) : 0,
+      u_place: f.texture ? place(f.texture.axis, state.iso) : 0,
     });
     gl.bindVertexArray(f.vertex_array);
     gl.drawArrays(gl.TRIANGLE_FAN, 0, f.count);
@@ -290,7 +312,7 @@ function histogram() {
     context.fillRect(i * w, c.height - h, Math.ceil(w), h);
   });
   context.fillStyle = "#d9a441";
-  context.fillRect(state.iso * c.width - ratio, 0, 2 * ratio, c.height);
+  context.fillRect(place(scene.axis, state.iso) * c.width - ratio, 0, 2 * ratio, c.height);
 }
 
 const linear = (v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
@@ -303,7 +325,7 @@ function show() {
   state.iso = clamp(state.iso, 0, 1);
   state.elevation = clamp(state.elevation, -89, 89);
   state.zoom = clamp(state.zoom, 0.1, 50);
-  $("isovalue").value = state.iso;
+  $("isovalue").value = place(scene.axis, state.iso);
   $("isovalue").setAttribute("aria-valuetext", digits(toSource(state.iso)));
   if (document.activeElement !== $("number")) $("number").value = digits(toSource(state.iso));
   $("shading").value = state.shading;
@@ -325,7 +347,8 @@ function fromAddress() {
     if (key === "isovalue" && value && Number.isFinite(number)) state.iso = toUnit(number);
     else if (key === "shading" && ["local", "global"].includes(value)) state.shading = value;
     else if (["azimuth", "elevation"].includes(key) && Number.isFinite(number)) state[key] = number;
-    else if (["zoom", "exposure"].includes(key) && number > 0) state[key] = number;
+    else if (key === "zoom" && number > 0) state.zoom = number;
+    else if (key === "exposure" && number > 0) state.exposure = clamp(number, 0.25, 8);
     else if (key === "walls") state.walls = value !== "0";
     else if (key === "tint" && /^[0-9a-f]{6}$/i.test(value)) state.tint = fromHex(value);
     else if (key === "clip") {
@@ -333,6 +356,11 @@ function fromAddress() {
       if (/^-?[xyz]$/.test(axis)) [state.clip, state.cut] = [axis, clamp(Number(at ?? 0.5) || 0, 0, 1)];
     }
   }
+}
+
+/// Moves the isovalue along the volume's axis.
+function move(step) {
+  state.iso = isovalue(clamp(place(scene.axis, state.iso) + step, 0, 1));
 }
 
 function reset() {
@@ -343,14 +371,14 @@ function reset() {
 
 function controls() {
   const on = (id, event, action) => $(id).addEventListener(event, (e) => { action(e.target); show(); });
-  on("isovalue", "input", (t) => { state.iso = Number(t.value); });
+  on("isovalue", "input", (t) => { state.iso = isovalue(Number(t.value)); });
   on("number", "input", (t) => { if (t.value !== "") state.iso = toUnit(Number(t.value)); });
   $("number").addEventListener("blur", (e) => { e.target.value = digits(toSource(state.iso)); });
   $("number").addEventListener("keydown", (e) => {
     const step = { ArrowUp: 0.005, ArrowDown: -0.005 }[e.key];
     if (!step) return;
     e.preventDefault();
-    state.iso += step;
+    move(step);
     show();
     e.target.value = digits(toSource(state.iso));
   });
@@ -364,7 +392,7 @@ function controls() {
   $("keys").addEventListener("click", () => { $("help").hidden = !$("help").hidden; });
   const pick = (e) => {
     const box = $("histogram").getBoundingClientRect();
-    state.iso = (e.clientX - box.left) / box.width;
+    state.iso = isovalue(clamp((e.clientX - box.left) / box.width, 0, 1));
     show();
   };
   $("histogram").addEventListener("pointerdown", (e) => {
@@ -417,8 +445,7 @@ function controls() {
     ArrowLeft: () => { state.azimuth -= 5; }, ArrowRight: () => { state.azimuth += 5; },
     ArrowUp: () => { state.elevation -= 5; }, ArrowDown: () => { state.elevation += 5; },
     "+": () => { state.zoom *= 1.1; }, "=": () => { state.zoom *= 1.1; }, "-": () => { state.zoom /= 1.1; },
-    "[": () => { state.iso -= 0.005; }, "]": () => { state.iso += 0.005; },
-    "{": () => { state.iso -= 0.05; }, "}": () => { state.iso += 0.05; },
+    "[": () => move(-0.005), "]": () => move(0.005), "{": () => move(-0.05), "}": () => move(0.05),
     g: () => { state.shading = state.shading === "local" ? "global" : "local"; },
     w: () => { state.walls = !state.walls; },
     c: () => { const all = ["", "x", "y", "z", "-x", "-y", "-z"]; state.clip = all[(all.indexOf(state.clip) + 1) % 7]; },
