@@ -330,17 +330,19 @@ pub(crate) fn completed(path: &Path, write: impl FnOnce(&mut AtomicFile) -> std:
     file.complete_if(written)
 }
 
+/// Packed bytes, for the tests of readers.
+#[cfg(test)]
+pub(crate) fn gz(bytes: &[u8]) -> Vec<u8> {
+    use std::io::Write;
+    let mut packed = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    packed.write_all(bytes).expect("memory does not fail");
+    packed.finish().expect("memory does not fail")
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use flate2::{Compression, write::GzEncoder};
     use std::io::Write;
-
-    fn gz(bytes: &[u8]) -> Vec<u8> {
-        let mut e = GzEncoder::new(Vec::new(), Compression::fast());
-        e.write_all(bytes).unwrap();
-        e.finish().unwrap()
-    }
 
     #[test]
     fn sections_are_exact() {

@@ -74,11 +74,9 @@ impl<'a> Cursor<'a> {
         }
         let rest = &self.bytes[self.at..];
         let length = if self.binary {
-            let size = element.map_or(1, ElementType::size);
-            let wanted = if element.is_some() { count.checked_mul(size) } else { Some(count.div_ceil(8)) };
-            // Eight bits a byte.
-            let found = if element.is_some() { rest.len() / size } else { rest.len().saturating_mul(8) };
-            wanted.filter(|&n| n <= rest.len()).ok_or(found)
+            let bits = element.map_or(1, |element| 8 * element.size());
+            let wanted = count.checked_mul(bits).map(|n| n.div_ceil(8)).filter(|&n| n <= rest.len());
+            wanted.ok_or(rest.len().saturating_mul(8) / bits)
         } else {
             text_length(rest, count)
         };

@@ -165,8 +165,6 @@ fn origin(header: &NiftiHeader) -> DVec3 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use flate2::{Compression, write::GzEncoder};
-    use std::io::Write;
 
     /// A header of 3×2×2 samples of the datatype, all placement codes 0, to be patched.
     fn header(datatype: i16, big: bool) -> Vec<u8> {
@@ -204,12 +202,6 @@ mod tests {
         read(&path)
     }
 
-    fn gz(bytes: &[u8]) -> Vec<u8> {
-        let mut e = GzEncoder::new(Vec::new(), Compression::fast());
-        e.write_all(bytes).unwrap();
-        e.finish().unwrap()
-    }
-
     #[test]
     fn every_type_in_both_byte_orders() {
         let codes: [(i16, ElementType); 10] = [
@@ -239,7 +231,7 @@ mod tests {
                     file.extend(b);
                 }
                 let half = if matches!(element, ElementType::F32 | ElementType::F64) { 0.5 } else { 0.0 };
-                for bytes in [file.clone(), gz(&file)] {
+                for bytes in [file.clone(), files::gz(&file)] {
                     let v = read_bytes(&bytes).unwrap();
                     assert_eq!(v.samples().element_type(), element);
                     assert_eq!(v.lattice.dims(), [3, 2, 2]);
@@ -292,8 +284,8 @@ mod tests {
         h.extend([0; 24]);
         assert!(read_bytes(&h).is_ok());
         assert!(matches!(read_bytes(&h[..h.len() - 1]), Err(Error::Invalid(_))));
-        assert!(matches!(read_bytes(&gz(&h[..h.len() - 1])), Err(Error::Invalid(_))));
-        let packed = gz(&h);
+        assert!(matches!(read_bytes(&files::gz(&h[..h.len() - 1])), Err(Error::Invalid(_))));
+        let packed = files::gz(&h);
         for cut in [4, 9, 20] {
             assert!(matches!(read_bytes(&packed[..packed.len() - cut]), Err(Error::Invalid(_))), "{cut}");
         }
@@ -302,7 +294,7 @@ mod tests {
         for at in [42, 44, 46] {
             put(&mut h, at, &10_000i16.to_le_bytes(), false);
         }
-        for bytes in [h.clone(), gz(&h)] {
+        for bytes in [h.clone(), files::gz(&h)] {
             let message = read_bytes(&bytes).unwrap_err().to_string();
             assert!(message.contains("promises 2000000000000 bytes"), "{message}");
         }

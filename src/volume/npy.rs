@@ -255,9 +255,7 @@ mod tests {
     #[test]
     fn a_packed_array_is_the_same_array() {
         let bytes = npy(1, &dict("<u2", "False", "(2, 2, 2)"), &(0..16).collect::<Vec<u8>>());
-        let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::default());
-        encoder.write_all(&bytes).unwrap();
-        let packed = encoder.finish().unwrap();
+        let packed = files::gz(&bytes);
         assert_eq!(open(&packed).unwrap().samples(), open(&bytes).unwrap().samples());
         assert!(open(&packed[..packed.len() - 8]).unwrap_err().to_string().contains("damaged"));
     }

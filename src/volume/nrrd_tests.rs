@@ -15,12 +15,6 @@ fn read_one(header: &str, data: &[u8]) -> Result<Volume> {
     read_with(&[header.as_bytes(), data].concat(), &[])
 }
 
-fn gz(bytes: &[u8]) -> Vec<u8> {
-    let mut e = GzEncoder::new(Vec::new(), Compression::fast());
-    e.write_all(bytes).unwrap();
-    e.finish().unwrap()
-}
-
 const U8: &str = "type: uchar\ndimension: 3\nsizes: 3 2 2\n";
 const TWELVE: [u8; 12] = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11];
 
@@ -31,7 +25,7 @@ fn encodings_hold_the_same_samples() {
         let raw = read_one(&format!("NRRD000{version}\r\n{U8}# note: x\nkey:=value\nencoding: raw\n\n"), &TWELVE);
         assert_eq!(raw.unwrap().samples(), &expected);
     }
-    let gzip = read_one(&format!("NRRD0004\n{U8}encoding: gzip\n\n"), &gz(&TWELVE)).unwrap();
+    let gzip = read_one(&format!("NRRD0004\n{U8}encoding: gzip\n\n"), &files::gz(&TWELVE)).unwrap();
     assert_eq!(gzip.samples(), &expected);
     assert_eq!(gzip.lattice.dims(), [3, 2, 2]);
     assert_eq!(gzip.lattice.axes(), DMat3::IDENTITY);
@@ -85,7 +79,7 @@ fn detached_files_and_skips() {
     let get = |extra: &str, data: &[u8]| read_with(header(extra).as_bytes(), &[("d.raw", data)]);
     assert_eq!(get("encoding: raw\nline skip: 2\nbyte skip: 3\n", &behind).unwrap().samples(), &expected);
     assert_eq!(get("encoding: raw\nbyteskip: -1", &behind).unwrap().samples(), &expected);
-    let packed = [b"one\n", &gz(&[&[9, 9], &TWELVE[..]].concat())[..]].concat();
+    let packed = [b"one\n", &files::gz(&[&[9, 9], &TWELVE[..]].concat())[..]].concat();
     assert_eq!(get("encoding: gz\nline skip: 1\nbyte skip: 2\n", &packed).unwrap().samples(), &expected);
     assert_eq!(get("encoding: text\nline skip: 1\n", b"head\n0 1 2 3 4 5 6 7 8 9 10 11").unwrap().samples(), &expected);
     assert!(matches!(get("encoding: raw\nline skip: 9\n", &behind), Err(Error::Invalid(_))));
@@ -201,7 +195,7 @@ fn an_axis_of_vectors_is_none_of_space() {
 fn short_lying_and_unknown_files_are_refused() {
     let raw = format!("NRRD0004\n{U8}encoding: raw\n\n");
     assert!(matches!(read_one(&raw, &TWELVE[..11]), Err(Error::Invalid(_))));
-    let packed = gz(&TWELVE);
+    let packed = files::gz(&TWELVE);
     let gzip = format!("NRRD0004\n{U8}encoding: gzip\n\n");
     for cut in 1..packed.len() {
         assert!(matches!(read_one(&gzip, &packed[..packed.len() - cut]), Err(Error::Invalid(_))), "{cut}");

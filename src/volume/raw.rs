@@ -82,7 +82,6 @@ impl RawLayout {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::io::Write;
 
     #[test]
     fn the_length_must_match() {
@@ -112,9 +111,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.raw.gz");
         let bytes: Vec<u8> = (0..25).collect();
-        let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::default());
-        encoder.write_all(&bytes).unwrap();
-        let packed = encoder.finish().unwrap();
+        let packed = files::gz(&bytes);
         std::fs::write(&path, &packed).unwrap();
         let mut layout = RawLayout::new([3, 2, 4], ElementType::U8);
         layout.header_bytes = 1;
