@@ -36,7 +36,7 @@ use std::path::{Path, PathBuf};
 #[command(
     version,
     about,
-    max_term_width = 100,
+    max_term_width = 132,
     after_help = "\
 Examples:
   isolume info head.nii.gz                               what a volume holds, and a suggested sweep

@@ -92,7 +92,12 @@ fn completions_and_manual_pages() {
         assert!(page.contains(".SH SYNOPSIS") && page.contains(&format!("isolume {}", verb.get_name())), "{page}");
     }
     let page = fs::read_to_string(dir.join("pages/man1/isolume-bake.1")).unwrap();
-    assert!(page.contains("isovalues") && page.contains("Examples:"));
+    let examples = page.split_once(".SH EXAMPLES\n.nf\n").unwrap().1.split_once("\n.fi\n").unwrap().0;
+    assert!(
+        examples.lines().count() > 5 && examples.lines().all(|line| line.starts_with("  isolume bake ")),
+        "{examples}"
+    );
+    assert!(page.contains(".SH NOTES\n") && !page.contains(".SH EXTRA"));
     assert!(dir.join("pages/man1/isolume-study-curve.1").exists());
 }
 

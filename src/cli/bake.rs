@@ -56,7 +56,8 @@ pub(super) struct Bake {
     /// beginning if there is neither
     #[arg(long)]
     resume: bool,
-    /// The estimated memory is to be at most this, such as 8G or 500M: by the photon engine if sweeps need more, its
+    /// The estimated memory is to be at most this, such as 8G or 500M (powers of
+    /// 1024: 8G is 8.6 GB): by the photon engine if sweeps need more, its
     /// isovalues cut into bands; refuse a bake that still needs more
     #[arg(long, value_name = "BYTES", value_parser = bytes)]
     max_memory: Option<u64>,
@@ -85,7 +86,7 @@ impl Bake {
         let series = if self.scene.time.is_none() { load_series(&self.input, &self.scene)? } else { None };
         let Some(series) = series else {
             outputs(self.outputs(), &inputs)?;
-            let (_, json) = self.one(begun, progress, false, &mut BTreeSet::new())?;
+            let (_, json) = self.one(begun, progress, true, &mut BTreeSet::new())?;
             self.print(&json);
             return Ok(());
         };
@@ -178,8 +179,8 @@ impl Bake {
         }
     }
 
-    /// One bake, which may be the first of a series, without the warnings that were `said` before; its sweep, and what
-    /// there is to print about it.
+    /// One bake, `first` unless others of its series went before, without the warnings that were `said` before; its
+    /// sweep, and what there is to print about it.
     fn one(
         &self,
         begun: Clock,
@@ -285,14 +286,14 @@ impl Bake {
                 let reports: Vec<_> = [&bake].into_iter().chain(&bake.companions).map(|b| &b.report).collect();
                 return Ok(Begun::Whole(self.in_one(plan.scene(), &reports)));
             }
-            found => found.is_some() && self.scene.time.is_some(),
+            found => found.is_some(),
         };
-        // Had this series been begun, its first frame or a checkpoint of that would be there.
-        if first && another && checkpoint.held()? != Held::This {
+        // Had this bake been begun, a checkpoint would be there, or of a series the first frame.
+        if first && another && checkpoint.held()? == Held::Nothing {
             return Err(Error::invalid(
                 &self.output,
                 "is a bake of other settings or of another version, which --resume cannot go on with; give its settings, \
-                 or leave --resume out to replace the series",
+                 or leave --resume out to replace it",
             ));
         }
         self.take_up(&checkpoint, progress)?;

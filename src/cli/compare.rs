@@ -215,25 +215,26 @@ fn warn_of_clamped(share: f64, of: &str) {
 /// interpolation costs.
 fn everywhere(s: &Survey, advice: Option<(&str, bool)>) -> String {
     let interval = |[lo, hi]: [f64; 2]| format!("(95 % confidence {lo:.3} … {hi:.3})");
+    // The noise of what it is compared with has been taken off.
+    let found = |percent: f64| if percent > 0.0 { format!("{percent:8.3}") } else { format!("{:>8}", "< noise") };
     let parts: String = s
         .parts
         .iter()
         .filter(|p| p.points > 0)
         .map(|p| {
-            // The noise of what it is compared with has been taken off.
-            let found =
-                if p.percent_rms > 0.0 { format!("{:8.3}", p.percent_rms) } else { format!("{:>8}", "< noise") };
-            format!("  isovalues        {found}   ({}; {} points)\n", brief_span(p.isovalues), p.points)
+            let span = brief_span(p.isovalues);
+            format!("  isovalues        {}   ({span}; {} points)\n", found(p.percent_rms), p.points)
         })
         .collect();
     let at_points = match s.percent_rms_grid_points.zip(s.confidence_grid_points) {
-        Some((percent, confidence)) => format!("{percent:8.3}   {}", interval(confidence)),
+        Some((percent, confidence)) => format!("{}   {}", found(percent), interval(confidence)),
         None => format!("{:>8}   (none holds light of its own level set)", "–"),
     };
     let texture = match s.percent_rms_texture == s.percent_rms {
         true => String::new(),
         false => {
-            format!("  radiance alone   {:8.3}   (as a 3D texture, direct light included)\n", s.percent_rms_texture)
+            let alone = found(s.percent_rms_texture);
+            format!("  radiance alone   {alone}   (as a 3D texture, direct light included)\n")
         }
     };
     let between = s.percent_rms_grid_points.is_some_and(|at| 2.0 * at.powi(2) < s.percent_rms.powi(2));
@@ -245,11 +246,11 @@ fn everywhere(s: &Survey, advice: Option<(&str, bool)>) -> String {
         )
     });
     format!(
-        "percent RMS       {:8.3}   {}\n{texture}  per channel, /√3 {:8.3}\n{parts}at grid points    {at_points}\n\
+        "percent RMS       {}   {}\n{texture}  per channel, /√3 {}\n{parts}at grid points    {at_points}\n\
          bias              {:+8.3}\npoints            {:8}   (2 × {} paths each; {} left out{})\n{advice}",
-        s.percent_rms,
+        found(s.percent_rms),
         interval(s.confidence),
-        s.percent_rms_sqrt3,
+        found(s.percent_rms_sqrt3),
         s.bias,
         s.points,
         s.paths,

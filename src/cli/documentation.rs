@@ -11,8 +11,8 @@ use std::path::{Path, PathBuf};
 #[derive(clap::Args, Debug)]
 #[command(after_help = "\
 Examples:
-  isolume completions bash > ~/.local/share/bash-completion/completions/isolume
-  isolume completions zsh > ~/.zfunc/_isolume
+  isolume completions bash > ~/.local/share/bash-completion/completions/isolume      in folders that
+  isolume completions zsh > ~/.zfunc/_isolume                                        exist: mkdir -p
   isolume completions fish > ~/.config/fish/completions/isolume.fish")]
 pub(super) struct Completions {
     /// The shell
@@ -58,10 +58,23 @@ impl ManualPages {
 fn write_pages(folder: &Path, command: &clap::Command, name: &str) -> Result<usize> {
     let path = folder.join(format!("{name}.1"));
     let page = clap_mangen::Man::new(command.clone().name(name.to_owned()).bin_name(name.replace('-', " ")));
-    files::write_atomically(&path, |out| page.render(out))?;
+    let mut text = Vec::new();
+    page.render(&mut text).map_err(|e| Error::io(&path, e))?;
+    let text = with_examples(&String::from_utf8_lossy(&text));
+    files::write_atomically(&path, |out| out.write_all(text.as_bytes()))?;
     let mut count = 1;
     for verb in command.get_subcommands().filter(|v| v.get_name() != "help") {
         count += write_pages(folder, verb, &format!("{name}-{}", verb.get_name()))?;
     }
     Ok(count)
+}
+
+/// A page whose examples have a heading, and keep their lines: those of a paragraph are filled.
+fn with_examples(page: &str) -> String {
+    let Some((before, after)) = page.split_once("\nExamples:\n") else { return page.to_owned() };
+    let before =
+        before.strip_suffix("\n.SH EXTRA").map_or_else(|| before.replace(".SH EXTRA", ".SH NOTES"), str::to_owned);
+    let end = after.find("\n.SH ").unwrap_or(after.len());
+    let (examples, rest) = after.split_at(end);
+    format!("{before}\n.SH EXAMPLES\n.nf\n{}\n.fi{}\n", examples.trim_end(), rest.trim_end())
 }

@@ -29,8 +29,8 @@ pub(super) struct Export {
     /// The array to write (default: radiance of a bake, the scalars of a volume)
     #[arg(long, value_name = "NAME")]
     array: Option<String>,
-    /// What the world's axes mean, for a .nrrd or .vti: lps, ras, las or none (default: as the volume's own file said);
-    /// nothing is turned
+    /// What the world's axes mean, for a .nrrd or .vti: lps, ras, las or none (default: as the volume's own file said,
+    /// lps where it said nothing); nothing is turned
     #[arg(long, value_name = "SPACE")]
     space: Option<String>,
     #[command(flatten)]

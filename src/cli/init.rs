@@ -1,4 +1,4 @@
-//! `isolume init`: a scene file for a volume, with every key, its default and what it does.
+//! `isolume init`: a scene file for a volume, with the keys that are changed most, their defaults and what they do.
 
 use super::{expect_extension, one_frame};
 use crate::digits::brief_span;

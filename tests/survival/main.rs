@@ -211,6 +211,10 @@ fn an_interrupt_keeps_progress_and_the_old_result() {
     assert!(output.status.success() && text.contains("out.vti is complete"), "{text}");
     assert_eq!(fs::metadata(dir.join("out.vti")).unwrap().modified().unwrap(), written);
     assert_eq!(report()["job"], first["job"]);
+    // Nor is it replaced by one of other settings.
+    let (output, text) = finish(bake(dir, "out.vti", &["--resume", "--seed", "7"]));
+    assert!(output.status.code() == Some(2) && text.contains("out.vti: is a bake of other settings"), "{text}");
+    assert_eq!(fs::metadata(dir.join("out.vti")).unwrap().modified().unwrap(), written);
     let (output, text) = finish(bake(dir, "whole.vti", &[]));
     assert!(output.status.success(), "{text}");
     assert!(light(&dir.join("out.vti")) == light(&dir.join("whole.vti")), "the same bits");
