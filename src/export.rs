@@ -11,6 +11,7 @@ pub mod slices;
 pub mod vtp;
 
 use crate::error::{Error, Result};
+use crate::volume::Space;
 use glam::{DVec3, Vec3};
 use std::path::Path;
 
@@ -43,6 +44,8 @@ pub struct Mesh<'a> {
     pub colours: Option<&'a [[f32; 3]]>,
     /// Named values at the vertices, such as `radiance_r`. Formats that cannot hold them leave them out.
     pub properties: &'a [(&'a str, &'a [f32])],
+    /// What the world's axes mean, if that is to be said: to 3D Slicer, by `.ply`, `.obj` and `.vtp`.
+    pub space: Option<Space>,
 }
 
 impl Mesh<'_> {

@@ -81,8 +81,8 @@ impl SurfaceMesh {
             positions: &self.positions,
             triangles: &self.triangles,
             normals: Some(&self.normals),
-            colours: None,
             properties,
+            ..Mesh::default()
         }
     }
 }

@@ -8,7 +8,7 @@ use isolume::export::Mesh;
 use isolume::export::picture::srgb_encode;
 use isolume::isosurface::extract;
 use isolume::volume::vti::{VtiFile, VtiWriter};
-use isolume::volume::{Lattice, Samples};
+use isolume::volume::{Lattice, Samples, Space};
 use std::io::Read;
 use std::path::Path;
 use std::process::Command;
@@ -253,6 +253,7 @@ fn write_mesh(case: &Case, path: &Path) {
         normals: Some(&normals),
         colours: Some(&colours),
         properties: &[("radiance_r", &channels[0]), ("radiance_g", &channels[1]), ("radiance_b", &channels[2])],
+        space: Some(Space::RightAnteriorSuperior),
     };
     mesh.write(path).unwrap();
 }
@@ -272,6 +273,7 @@ fn ply_holds_linear_light() {
     let end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
     let head = std::str::from_utf8(&bytes[..end]).unwrap();
     let names: Vec<&str> = head.lines().filter_map(|l| l.strip_prefix("property ")).collect();
+    assert!(head.contains("\ncomment SPACE=RAS\n"), "for 3D Slicer: {head}");
     let float = ["x", "y", "z", "nx", "ny", "nz", "radiance_r", "radiance_g", "radiance_b"];
     assert!(names.iter().zip(float).all(|(n, f)| *n == format!("float {f}")), "{names:?}");
     assert_eq!(names[9..12], ["uchar red", "uchar green", "uchar blue"]);
@@ -343,6 +345,11 @@ fn glb_through_gltf() {
     let local = reader.read_positions().unwrap().map(Vec3::from_array);
     let (lo, hi) = local.fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(lo, hi), p| (lo.min(p), hi.max(p)));
     assert_eq!((bounds.min, bounds.max), (lo.to_array(), hi.to_array()));
+    // Without light of its own it takes the viewer's.
+    let bare = Mesh { positions: &case.vertices, triangles: &case.triangles, ..Mesh::default() };
+    bare.write(&path).unwrap();
+    let file = gltf::Gltf::open(&path).unwrap();
+    assert!(file.materials().all(|m| !m.unlit()) && file.extensions_used().next().is_none());
 }
 
 #[test]
@@ -370,6 +377,12 @@ fn vtp_by_its_definition() {
         }
         out
     };
+    let space = document.descendants().find(|n| n.attribute("Name") == Some("SPACE")).unwrap();
+    assert_eq!(
+        (space.attribute("type"), space.text().unwrap().trim()),
+        (Some("String"), "82 65 83 0"),
+        "for 3D Slicer"
+    );
     let n = case.vertices.len();
     let piece = document.descendants().find(|n| n.has_tag_name("Piece")).unwrap();
     assert_eq!(piece.attribute("NumberOfPoints"), Some(&*n.to_string()));

@@ -14,6 +14,7 @@ use crate::progress::{Clock, Progress, say};
 use crate::scene::{Policy, Scene};
 use crate::scene_file::{Inputs, SceneOptions, load, load_series};
 use crate::series::{Series, write_collection};
+use crate::volume::vti::is_foreign;
 use plan::Plan;
 use serde::Serialize;
 use std::collections::BTreeSet;
@@ -92,15 +93,7 @@ impl Bake {
         };
         // Frames are of one volume.
         expect_extension(&self.output, &["vti"])?;
-        let name = self.output.file_name().unwrap_or_default();
-        // What no XML holds.
-        let foreign = |c: char| c < ' ' || matches!(c, '\u{fffe}' | '\u{ffff}');
-        if name.to_str().is_none_or(|name| name.contains(foreign)) {
-            return Err(Error::Invalid(format!(
-                "{:?} holds what the .pvd, which names the frames, cannot: use Unicode without line breaks",
-                self.output
-            )));
-        }
+        self.check_name("the .pvd, which names the frames,")?;
         let frames: Vec<Self> = (0..series.times().len()).map(|n| self.frame(n)).collect();
         let collection = self.output.with_extension("pvd");
         outputs(frames.iter().flat_map(Self::outputs).chain([collection]), &inputs)?;
@@ -225,6 +218,18 @@ impl Bake {
         Ok((sweep, json))
     }
 
+    /// Refuses a name that the XML of `index` cannot hold.
+    fn check_name(&self, index: &str) -> Result<()> {
+        let name = self.output.file_name().unwrap_or_default();
+        if name.to_str().is_none_or(|name| name.contains(is_foreign)) {
+            return Err(Error::Invalid(format!(
+                "{:?} holds what {index} cannot: use Unicode without line breaks",
+                self.output
+            )));
+        }
+        Ok(())
+    }
+
     /// Refuses an output that is for another number of volumes, and one that could not be written.
     fn check_volumes(&self, scene: &Scene) -> Result<()> {
         let extension = self.output.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
@@ -240,7 +245,10 @@ impl Bake {
                 ),
             )),
             (1, _) => Ok(()),
-            _ => outputs(self.outputs().chain(self.field_files(scene)), &Inputs::of(&self.input, &self.scene)?),
+            _ => {
+                self.check_name("the .vtm, which names the volumes' files,")?;
+                outputs(self.outputs().chain(self.field_files(scene)), &Inputs::of(&self.input, &self.scene)?)
+            }
         }
     }
 

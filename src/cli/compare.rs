@@ -304,9 +304,9 @@ fn write_errors(path: &std::path::Path, mesh: &ReferenceMesh, errors: &[f64]) ->
     let mesh = Mesh {
         positions: &mesh.positions,
         triangles: &mesh.triangles,
-        normals: None,
         colours: Some(&colours),
         properties: &properties,
+        ..Mesh::default()
     };
     ply::write(path, &mesh)
 }

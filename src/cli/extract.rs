@@ -79,7 +79,9 @@ impl Extract {
             // There is light on isosurfaces of the sweep only.
             Some(_) => unit_isovalue(&scene.field, self.isovalue).map_err(|e| self.without_light(&e))?,
             None => {
-                if let Some(field) = volume.and_then(|volume| around(&volume, scene.field.sweep(), self.isovalue)) {
+                if let Some(field) =
+                    volume.as_ref().and_then(|volume| around(volume, scene.field.sweep(), self.isovalue))
+                {
                     scene.field = field.into();
                 }
                 scene.field.sweep().isovalue(self.isovalue)
@@ -99,7 +101,8 @@ impl Extract {
         let std_error = found.as_ref().and_then(|f| f.std_error.as_ref());
         properties.extend(std_error.map(|std_error| ("std_error", &std_error[..])));
         unless_interrupted()?;
-        let lit = Mesh { colours: colours.as_deref(), ..mesh.export(&properties) };
+        let space = volume.map(|v| v.space).or_else(|| baked.as_ref().map(|b| b.space));
+        let lit = Mesh { colours: colours.as_deref(), space, ..mesh.export(&properties) };
         // Where it can be said, for compare.
         match baked.is_some() && self.output.extension().is_some_and(|e| e.eq_ignore_ascii_case("ply")) {
             true => ply::write_with_comments(&self.output, &lit, &[Origin::comment_of_bake(self.isovalue)])?,
@@ -107,7 +110,7 @@ impl Extract {
         }
         if self.json {
             let numbers = serde_json::json!({
-                "file": self.output,
+                "file": self.output.to_string_lossy(),
                 "isovalue": self.isovalue,
                 "vertices": mesh.positions.len(),
                 "triangles": mesh.triangles.len(),

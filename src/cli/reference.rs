@@ -116,7 +116,7 @@ impl ReferenceArgs {
         let count = result.sampled.iter().filter(|s| **s).count();
         if self.json {
             let numbers = serde_json::json!({
-                "file": self.output,
+                "file": self.output.to_string_lossy(),
                 "isovalue": self.isovalue,
                 "vertices": mesh.local.len(),
                 "sampled": count,

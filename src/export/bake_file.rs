@@ -17,7 +17,7 @@ use crate::flattened::Side;
 use crate::illumination_grid::{GridSize, IlluminationGrid};
 use crate::scene::{Boundary, Member, Policy, Scene, Surface};
 use crate::volume::vti::{self, VtiFile, VtiWriter};
-use crate::volume::{Lattice, Samples, Volume};
+use crate::volume::{Lattice, Samples, Space, Volume};
 use arrays::Arrays;
 use description::{DESCRIPTION, Description, PolygonDescription, TextureDescription};
 use glam::DVec3;
@@ -222,7 +222,8 @@ fn textures<'a>(scene: &Scene, flats: &'a [Option<FlatLight>]) -> (Vec<TextureDe
     for (n, light, i, t) in flats {
         let (mut array, start) = match scene.polygons().get(n) {
             Some(p) if p.other_face != 0 => (CONTEXT.to_owned(), context.len() / 3),
-            _ => (format!("wall_{}{}", flat_name(scene, n), suffix(i)), 0),
+            // The description says the names as XML gives them back.
+            _ => (format!("wall_{}{}", flat_name(scene, n).replace(vti::is_foreign, "_"), suffix(i)), 0),
         };
         // Names in OBJ files may repeat, and one may be what another becomes here.
         while array != CONTEXT && texels.iter().any(|t| t.0 == array) {
@@ -299,6 +300,8 @@ pub struct BakedVolume {
     pub flats: Vec<Option<FlatLight>>,
     /// Display exposure.
     pub exposure: f64,
+    /// What the world's axes mean.
+    pub space: Space,
     /// The report, as written.
     pub report: serde_json::Value,
     /// The bakes of the scene's companions, in their order, each as if it stood alone.
@@ -344,7 +347,17 @@ impl BakedVolume {
         let scene = if *scene.lattice() == bake.lattice { scene } else { scene.resampled(&bake.lattice) };
         let report = serde_json::to_value(&bake.report).expect("the report is plain data");
         let (sides, flats, exposure) = (bake.sides, bake.flats, bake.exposure);
-        Self { scene, sides, flats, exposure, report, companions: Vec::new(), independent: false, among_others: false }
+        Self {
+            scene,
+            sides,
+            flats,
+            exposure,
+            space: Space::default(),
+            report,
+            companions: Vec::new(),
+            independent: false,
+            among_others: false,
+        }
     }
 
     /// Refuses to light its scene anew if others lit it that are in another file.
@@ -408,7 +421,7 @@ impl BakedVolume {
     }
 
     fn from_parts(path: &Path, file: VtiFile, d: Description) -> Result<Self> {
-        let (points, arrays) = (file.lattice.len(), Arrays(&file.point_data));
+        let (points, arrays, space) = (file.lattice.len(), Arrays(&file.point_data), file.space());
         let surface = Surface { albedo: d.albedo, emission: d.emission, outside: d.outside, both_sides: d.both_sides };
         let sides = surface.stored_sides().into_iter().enumerate();
         let sides = sides.map(|(i, side)| Ok((side, arrays.grid(suffix(i), points)?))).collect::<Result<Vec<_>>>()?;
@@ -429,6 +442,7 @@ impl BakedVolume {
             scene,
             sides,
             exposure: d.exposure,
+            space,
             report: d.report,
             companions: Vec::new(),
             independent: d.independent,

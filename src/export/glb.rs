@@ -17,10 +17,11 @@ const ARRAY_BUFFER: u32 = 34962;
 const ELEMENT_ARRAY_BUFFER: u32 = 34963;
 const FLOAT: u32 = 5126;
 const UNSIGNED_INT: u32 = 5125;
+const UNLIT: &str = "KHR_materials_unlit";
 
 /// Writes `mesh`: `POSITION`, `NORMAL`, and the display colours as linear floats in `COLOR_0`, with a material that
-/// shows them without further light (`KHR_materials_unlit`): light is what they are. The named properties become
-/// `_NAME` attributes.
+/// shows them without further light (`KHR_materials_unlit`): light is what they are; without colours the viewer's light
+/// falls on it. The named properties become `_NAME` attributes.
 ///
 /// # Errors
 /// `Invalid` if the arrays do not fit each other, a position is not finite in f32 or the mesh is empty; `NotSupported`
@@ -67,23 +68,22 @@ pub fn write(path: impl AsRef<Path>, mesh: &Mesh) -> Result<()> {
     let indices = data.accessor(corners.iter().flat_map(|v| v.to_le_bytes()), corners.len(), "SCALAR", UNSIGNED_INT);
 
     let c = centre;
-    let document = json!({
+    let mut document = json!({
         "asset": {"version": "2.0", "generator": format!("isolume {}", env!("CARGO_PKG_VERSION"))},
-        "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         // (x, y, z) + centre, then to (x, z, −y).
         "nodes": [{"mesh": 0, "matrix": [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, c.x, c.z, -c.y, 1]}],
         "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
-        "materials": [{
-            "doubleSided": true,
-            "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1},
-            "extensions": {"KHR_materials_unlit": {}},
-        }],
+        "materials": [{"doubleSided": true, "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1}}],
         "buffers": [{"byteLength": data.bytes.len()}],
         "bufferViews": data.views,
         "accessors": data.accessors,
     });
+    if mesh.colours.is_some() {
+        document["extensionsUsed"] = json!([UNLIT]);
+        document["materials"][0]["extensions"] = json!({UNLIT: {}});
+    }
     let mut text = document.to_string().into_bytes();
     // Chunks end at multiples of 4: the text with spaces; the data does so by itself.
     text.resize(text.len().next_multiple_of(4), b' ');

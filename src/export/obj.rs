@@ -3,6 +3,7 @@
 use super::Mesh;
 use crate::error::Result;
 use crate::files;
+use crate::volume::Space;
 use std::io::{self, Write};
 use std::path::Path;
 
@@ -19,6 +20,7 @@ pub fn write(path: impl AsRef<Path>, mesh: &Mesh) -> Result<()> {
 
 fn write_to(out: &mut impl Write, mesh: &Mesh) -> io::Result<()> {
     writeln!(out, "# isolume {}: {} vertices", env!("CARGO_PKG_VERSION"), mesh.positions.len())?;
+    mesh.space.and_then(Space::of_mesh).map_or(Ok(()), |space| writeln!(out, "# SPACE={space}"))?;
     for (i, p) in mesh.positions.iter().enumerate() {
         write!(out, "v {} {} {}", p.x, p.y, p.z)?;
         if let Some(colours) = mesh.colours {
@@ -53,7 +55,8 @@ mod tests {
             triangles: &[[0, 1, 2], [2, 1, 3]],
             normals: Some(&[Vec3::X, Vec3::Y, Vec3::Z, Vec3::NEG_X]),
             colours: Some(&[[1.0, 0.0, 0.2]; 4]),
-            properties: &[],
+            space: Some(Space::LeftPosteriorSuperior),
+            ..Mesh::default()
         };
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("mesh.obj");
@@ -66,11 +69,13 @@ mod tests {
         assert_eq!(read.vertex_color[..3], [1.0, 0.0, 0.2]);
         assert_eq!(read.normals[9..], [-1.0, 0.0, 0.0]);
         let text = std::fs::read_to_string(&path).unwrap();
+        assert!(text.contains("\n# SPACE=LPS\n"), "{text}");
         assert!(text.contains("v 1000000.1 -2.5 ") && text.contains("f 1//1 2//2 3//3\n"), "{text}");
 
-        let bare = Mesh { normals: None, colours: None, ..mesh };
+        let bare = Mesh { normals: None, colours: None, space: Some(Space::Unnamed), ..mesh };
         write(&path, &bare).unwrap();
         let text = std::fs::read_to_string(&path).unwrap();
+        assert!(!text.contains("SPACE"), "{text}");
         assert!(text.contains("v 1 0 0\n") && text.contains("f 3 2 4\n"), "{text}");
     }
 }

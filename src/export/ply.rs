@@ -7,6 +7,7 @@
 use super::{Mesh, coarse_in_f32, colour_bytes};
 use crate::error::{Error, Result};
 use crate::files;
+use crate::volume::Space;
 use glam::DVec3;
 use std::io::{self, Write};
 use std::path::Path;
@@ -47,6 +48,7 @@ pub fn write_with_comments(path: impl AsRef<Path>, mesh: &Mesh, comments: &[Stri
 
 fn write_to(out: &mut impl Write, mesh: &Mesh, comments: &[String]) -> io::Result<()> {
     writeln!(out, "ply\nformat binary_little_endian 1.0\ncomment isolume {}", env!("CARGO_PKG_VERSION"))?;
+    mesh.space.and_then(Space::of_mesh).map_or(Ok(()), |space| writeln!(out, "comment SPACE={space}"))?;
     comments.iter().try_for_each(|c| writeln!(out, "comment {c}"))?;
     writeln!(out, "element vertex {}", mesh.positions.len())?;
     let (lo, hi) =
@@ -324,6 +326,7 @@ mod tests {
             normals: Some(&[Vec3::X, Vec3::NEG_Y, Vec3::Z, Vec3::X]),
             colours: Some(&COLOURS),
             properties: radiance,
+            space: None,
         }
     }
 

@@ -3,6 +3,7 @@
 
 use super::{Mesh, colour_bytes};
 use crate::error::{Error, Result};
+use crate::volume::Space;
 use crate::volume::vti::XmlDocument;
 use std::path::Path;
 
@@ -28,8 +29,14 @@ pub fn write(path: impl AsRef<Path>, mesh: &Mesh) -> Result<()> {
     let offsets: Vec<i64> = (1..=polys as i64).map(|t| 3 * t).collect();
 
     let mut d = XmlDocument::new("PolyData");
+    d.text("  <PolyData>\n");
+    if let Some(space) = mesh.space.and_then(Space::of_mesh) {
+        d.text("    <FieldData>\n");
+        d.string("SPACE", space);
+        d.text("    </FieldData>\n");
+    }
     d.text(&format!(
-        "  <PolyData>\n    <Piece NumberOfPoints=\"{points}\" NumberOfVerts=\"0\" NumberOfLines=\"0\" NumberOfStrips=\"0\" \
+        "    <Piece NumberOfPoints=\"{points}\" NumberOfVerts=\"0\" NumberOfLines=\"0\" NumberOfStrips=\"0\" \
          NumberOfPolys=\"{polys}\">\n"
     ));
     let scalars = if colours.is_some() { " Scalars=\"rgb\"" } else { "" };

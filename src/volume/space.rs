@@ -26,6 +26,15 @@ impl Space {
         }
     }
 
+    /// Its initials, where 3D Slicer knows them of meshes.
+    pub fn of_mesh(self) -> Option<&'static str> {
+        match self {
+            Space::LeftPosteriorSuperior => Some("LPS"),
+            Space::RightAnteriorSuperior => Some("RAS"),
+            Space::LeftAnteriorSuperior | Space::Unnamed => None,
+        }
+    }
+
     /// The space of a [`Space::name`] or its initials.
     pub fn from_name(name: &str) -> Option<Self> {
         match name.to_ascii_lowercase().as_str() {

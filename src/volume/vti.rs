@@ -7,7 +7,7 @@ mod codec;
 mod document;
 mod writer;
 
-pub(crate) use document::{Document as XmlDocument, escape};
+pub(crate) use document::{Document as XmlDocument, escape, is_foreign};
 pub use writer::{SamplesRef, VtiWriter};
 
 use crate::error::{Error, Result};

@@ -2,7 +2,9 @@
 
 use super::{Folder, QUICK, isolume, ok, refused, text};
 use isolume::volume::vti::VtiFile;
+use std::ffi::OsStr;
 use std::fs;
+use std::os::unix::ffi::OsStrExt;
 use std::process::Command;
 
 #[test]
@@ -76,4 +78,42 @@ fn a_pipe_that_nobody_reads_is_no_fault() {
     drop(child.stdout.take());
     let output = child.wait_with_output().unwrap();
     assert!(output.status.success() && output.stderr.is_empty(), "{}", text(&output.stderr));
+}
+
+/// Names of walls may hold what XML cannot, paths what JSON cannot, and scripts name ends of sweeps by all their digits.
+#[test]
+fn bakes_open_whatever_their_names_and_numbers_are() {
+    let dir = Folder::new();
+    let dir = dir.path();
+    ok(dir, &["generate", "bumps", "--size", "9", "-o", "b.vti", "-q"]);
+    let floor = |name: &str, z: &str| {
+        format!("o {name}\nv -1 -1 {z}\nv 2 -1 {z}\nv 2 2 {z}\nv -1 2 {z}\nusemtl w\nf -4 -3 -2 -1\n")
+    };
+    let names = ["tab\tx", "tab x", "a\u{1}b", "a\u{fffe}b"];
+    let walls: String = names.iter().zip(["-1", "-2", "-3", "-4"]).map(|(name, z)| floor(name, z)).collect();
+    fs::write(dir.join("w.obj"), format!("mtllib w.mtl\n{walls}")).unwrap();
+    fs::write(dir.join("w.mtl"), "newmtl w\nKd 0.5 0.5 0.5\nKe 1 1 1\n").unwrap();
+    // Parsers that round roughly give 90.75844800894184.
+    let (lo, hi) = ("3.6", "90.75844800894185");
+    let bake = ["bake", "b.vti", "--isovalues", lo, hi, "--box", "w.obj", "-o", "lit.vti", "-q"];
+    ok(dir, &[&bake[..], &QUICK].concat());
+    let path = OsStr::from_bytes(b"\xff.ply");
+    for (verb, input) in [("extract", "lit.vti"), ("reference", "lit.vti")] {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_isolume"));
+        command.current_dir(dir).args([verb, input, "--isovalue", hi, "--json", "-q", "-o"]).arg(path);
+        if verb == "reference" {
+            command.args(["--samples", "2", "--batches", "2"]);
+        }
+        let output = command.output().unwrap();
+        assert!(output.status.success(), "{verb}: {}", text(&output.stderr));
+        let printed: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+        assert_eq!(printed["file"], "\u{fffd}.ply");
+    }
+    let file = VtiFile::read(&dir.join("lit.vti")).unwrap();
+    let arrays = file.field_data.iter().filter(|a| a.name.starts_with("wall_"));
+    assert_eq!(arrays.count(), names.len());
+
+    let scene = "[[volume]]\nname = \"a\"\nfile = \"b.vti\"\nisovalues = [3.6, 95]\n";
+    fs::write(dir.join("two.toml"), format!("{scene}{}", scene.replace("\"a\"", "\"b\""))).unwrap();
+    refused(dir, &["bake", "two.toml", "-o", "a\nb.vtm"], &["a\\nb.vtm", "the .vtm", "line breaks"]);
 }

@@ -40,6 +40,16 @@ impl<'a> Document<'a> {
         self.text += text;
     }
 
+    /// Adds a text of field data as VTK writes it: signed character codes.
+    pub(crate) fn string(&mut self, name: &str, text: &str) {
+        let codes: Vec<String> = text.bytes().map(|c| (c as i8).to_string()).collect();
+        self.text += &format!(
+            "      <Array type=\"String\" Name=\"{}\" NumberOfTuples=\"1\" format=\"ascii\">\n        {} 0\n      </Array>\n",
+            escape(name),
+            codes.join(" ")
+        );
+    }
+
     /// Adds a `<DataArray>`, with further attributes after a space each.
     pub(crate) fn array(&mut self, name: &str, components: usize, samples: SamplesRef<'a>, attributes: &str) {
         self.values(name, components, Values::Stored(samples), attributes);
@@ -132,7 +142,12 @@ fn vtk_type(element: ElementType) -> &'static str {
     }
 }
 
-/// Text for an XML attribute.
+/// Whether XML cannot hold a character in an attribute as it is.
+pub(crate) fn is_foreign(c: char) -> bool {
+    c < ' ' || matches!(c, '\u{fffe}' | '\u{ffff}')
+}
+
+/// Text for an XML attribute; what [`is_foreign`] becomes a space.
 pub(crate) fn escape(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
@@ -141,7 +156,7 @@ pub(crate) fn escape(text: &str) -> String {
             '<' => out.push_str("&lt;"),
             '>' => out.push_str("&gt;"),
             '"' => out.push_str("&quot;"),
-            '\n' | '\r' | '\t' => out.push(' '),
+            c if is_foreign(c) => out.push(' '),
             c => out.push(c),
         }
     }

@@ -307,14 +307,7 @@ impl<'a> VtiWriter<'a> {
             d.values(&a.name, a.components, a.samples.clone(), &tuples);
         }
         for (name, text) in &self.field_strings {
-            // As VTK writes them: signed character codes.
-            let codes: Vec<String> = text.bytes().map(|c| (c as i8).to_string()).collect();
-            d.text(&format!(
-                "      <Array type=\"String\" Name=\"{}\" NumberOfTuples=\"1\" format=\"ascii\">\n        {} 0\n      \
-                 </Array>\n",
-                escape(name),
-                codes.join(" ")
-            ));
+            d.string(name, text);
         }
         let scalars = self.active_scalars.as_ref().map(|s| format!(" Scalars=\"{}\"", escape(s))).unwrap_or_default();
         d.text(&format!("    </FieldData>\n    <Piece Extent=\"{extent}\">\n      <PointData{scalars}>\n"));
