@@ -108,7 +108,8 @@ fn main() {
         receivers.par_iter().step_by(16).enumerate().map(gather).collect()
     };
     let scale = (truth.iter().map(|t| luminance(*t).powi(2)).sum::<f64>() / truth.len() as f64).sqrt();
-    println!("estimates of indirect irradiance from {} photons; error in % of its RMS", photons.surface.len());
+    let counted = photons.surface.iter().filter(|p| p.bounces > 0 && p.side == Side::Lower).count();
+    println!("estimates of indirect irradiance from {counted} photons; error in % of its RMS");
     println!("  {:10} {:>4} {:>9} {:>12} {:>8}", "estimator", "k", "map, s", "estimates/s", "error");
     let mut rows: Vec<(Estimator, usize, f64, [f64; 2])> = Vec::new();
     for estimator in [Estimator::Nearest, Estimator::Radius, Estimator::Splat] {

@@ -76,6 +76,14 @@ pub struct ReferenceSettings {
     pub seed: u64,
 }
 
+impl ReferenceSettings {
+    /// Samples per vertex that are taken: as many in each batch.
+    pub fn taken(&self) -> u32 {
+        let batches = self.batches.max(2);
+        self.samples.div_ceil(batches).saturating_mul(batches)
+    }
+}
+
 impl Default for ReferenceSettings {
     fn default() -> Self {
         Self {
@@ -182,7 +190,7 @@ pub fn reference<T: Tracer>(
     let receivers: Vec<Option<Receiver>> =
         chosen.iter().map(|&v| Receiver::on_level_set(scene, mesh.local[v], isovalue, side)).collect();
     let batches = settings.batches.max(2);
-    let samples = settings.samples.div_ceil(batches);
+    let samples = settings.taken() / batches;
     let rays = AtomicU64::new(0);
     let (mut sums, mut squares) = (vec![DVec3::ZERO; chosen.len()], vec![DVec3::ZERO; chosen.len()]);
     for batch in 0..u64::from(batches) {

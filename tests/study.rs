@@ -157,3 +157,48 @@ fn curves_are_refused_where_no_error_would_be_known() {
     let (code, said) = study(&["good.toml"]);
     assert!(code == Some(0) && said.contains("good"), "{code:?} {said}");
 }
+
+/// Each volume of an independent scene is judged as it was lit, without the others; what a study leaves aside it says.
+#[test]
+fn volumes_are_judged_by_the_light_that_they_get() {
+    let dir = Folder::new();
+    let dir = dir.path();
+    for policy in ["joint", "independent"] {
+        let scene = format!(
+            "policy = \"{policy}\"\n[[volume]]\nname = \"a\"\ngenerator = \"bumps\"\nsize = 9\nisovalues = [10, 90]\n\
+             [[volume]]\nname = \"b\"\ngenerator = \"sphere\"\nsize = 9\norigin = [0, 0, 0.9]\nisovalues = [0.02, 0.2]\n\
+             outside = \"higher\"\n[bake]\ngrid = \"2x\"\n"
+        );
+        fs::write(dir.join(format!("{policy}.toml")), scene).unwrap();
+    }
+    let output = ok(
+        dir,
+        &[
+            "study",
+            "datasets",
+            "joint.toml",
+            "independent.toml",
+            "-o",
+            "st",
+            "--quick",
+            "-q",
+            "--engine",
+            "photon",
+            "--photons",
+            "2000",
+            "--gather",
+            "2",
+        ],
+    );
+    let message = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(message.contains("independent.toml: its [bake] is left aside (grid)"), "{message}");
+    let table = fs::read_to_string(dir.join("st/datasets.csv")).unwrap();
+    let floor = |name: &str| -> f64 {
+        let names: Vec<&str> = table.lines().next().unwrap().split(',').collect();
+        let at = names.iter().position(|n| *n == "floor_total").unwrap();
+        let row = table.lines().find(|l| l.starts_with(&format!("{name},"))).unwrap();
+        row.split(',').nth(at).unwrap().parse().unwrap()
+    };
+    // The sphere in the light's way darkens the bumps that it hangs above.
+    assert!((floor("joint") - floor("independent")).abs() > 0.1, "{} {}", floor("joint"), floor("independent"));
+}

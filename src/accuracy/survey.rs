@@ -56,7 +56,8 @@ pub struct Survey {
     /// Paths of each of a point's two estimates.
     pub paths: u32,
     /// 100 √⟨(t − r₁)·(t − r₂)⟩ over points of which each isovalue has as many and each isosurface evenly by its area,
-    /// where t is what the bake shows and r what paths find: without their noise, 0 where that is negative.
+    /// where t is what the bake shows and r what paths find: without their noise, 0 where that is negative. Where they
+    /// reach white noise is clamped on one side, and few paths make this too large.
     pub percent_rms: f64,
     /// The same where t is radiance as a 3D texture shows it: another number if the bake is split
     /// ([`crate::split::Split`]) or looked at by rays ([`crate::final_gather`]).

@@ -19,7 +19,8 @@ use std::path::PathBuf;
 #[derive(clap::Args, Debug)]
 #[command(after_help = "\
 Without references, all isosurfaces of the sweep are looked at: as many random points for each isovalue, over each isosurface
-evenly by area, against two independent sets of paths, whose noise cancels; and points of the grid, which interpolation has no part
+evenly by area, against two independent sets of paths, whose noise cancels but where colours reach white, which few paths make
+darker; and points of the grid, which interpolation has no part
 in. If those are much better, a finer --grid helps; if not, more directions, light points, photons or rays do.
 
 Colours are linear radiance × π / (largest albedo × E0), clamped to [0, 1]; percent_rms = 100 sqrt(mean |difference|²) over the
@@ -59,8 +60,8 @@ pub(super) struct Compare {
     /// Print JSON
     #[arg(long)]
     json: bool,
-    /// With references: write the mesh coloured by the error: `error` per vertex, and colours from black (0) over red
-    /// to white (10 %)
+    /// With references: write the mesh coloured by the error, the references' noise included: `error` per vertex, and
+    /// colours from black (0) over red to white (10 %)
     #[arg(short, long, value_name = "FILE", requires = "references")]
     output: Option<PathBuf>,
 }
@@ -211,12 +212,15 @@ fn warn_of_clamped(share: f64, of: &str) {
     }
 }
 
+/// A percentage from which the noise of what it is compared with has been taken off.
+fn found(percent: f64) -> String {
+    if percent > 0.0 { format!("{percent:8.3}") } else { format!("{:>8}", "< noise") }
+}
+
 /// A survey's numbers, a line each; and, with what is `finer` and whether the bake can be split, how to lower what
 /// interpolation costs.
 fn everywhere(s: &Survey, advice: Option<(&str, bool)>) -> String {
     let interval = |[lo, hi]: [f64; 2]| format!("(95 % confidence {lo:.3} … {hi:.3})");
-    // The noise of what it is compared with has been taken off.
-    let found = |percent: f64| if percent > 0.0 { format!("{percent:8.3}") } else { format!("{:>8}", "< noise") };
     let parts: String = s
         .parts
         .iter()
@@ -263,16 +267,18 @@ fn everywhere(s: &Survey, advice: Option<(&str, bool)>) -> String {
 fn text(a: &Accuracy) -> String {
     let [lo, hi] = a.confidence;
     let noise = if a.references == 2 { "cancelled by two references" } else { "included" };
+    // Of references without noise, such as those of black surfaces, 0 is an answer.
+    let shown = |percent: f64| if a.noise_floor > 0.0 { found(percent) } else { format!("{percent:8.3}") };
     format!(
-        "percent RMS       {:8.3}   (95 % confidence {lo:.3} … {hi:.3}; reference noise {noise})\n\
-         without noise     {:8.3}\n  per channel, /√3 {:8.3}\n  area-weighted    {:8.3}\n  lit vertices     {:8.3}   ({:.1} % of vertices)\n\
-         noise floor       {:8.3}\nmean              {:8.3}\nmax               {:8.3}\nbias              {:+8.3}\n\
-         vertices          {:8}{}\nexposure          {:8.4}\n",
-        a.percent_rms,
-        a.percent_rms_without_noise,
-        a.percent_rms_sqrt3,
-        a.percent_rms_area,
-        a.percent_rms_lit,
+        "percent RMS       {}   (95 % confidence {lo:.3} … {hi:.3}; reference noise {noise})\n\
+         without noise     {}\n  per channel, /√3 {}\n  area-weighted    {}\n  lit vertices     {}   ({:.1} % of vertices)\n\
+         noise floor       {:8.3}\nmean              {:8.3}   (reference noise included)\nmax               {:8.3}   (the same)\n\
+         bias              {:+8.3}\nvertices          {:8}{}\nexposure          {:8.4}\n",
+        shown(a.percent_rms),
+        shown(a.percent_rms_without_noise),
+        shown(a.percent_rms_sqrt3),
+        shown(a.percent_rms_area),
+        shown(a.percent_rms_lit),
         100.0 * a.lit,
         a.noise_floor,
         a.mean,

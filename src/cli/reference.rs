@@ -45,7 +45,7 @@ pub(super) struct ReferenceArgs {
     /// Only a fixed random subset of N vertices
     #[arg(long, value_name = "N")]
     vertices: Option<usize>,
-    /// Paths or gather rays per vertex
+    /// Paths or gather rays per vertex, rounded up to a multiple of --batches
     #[arg(long, default_value_t = 1024, value_name = "N")]
     samples: u32,
     /// Independent batches that tell the variance

@@ -3,7 +3,7 @@
 use crate::bake::BakeOptions;
 use crate::error::{Error, Result};
 use crate::flatland::study::{StudySettings, flatland};
-use crate::progress::Progress;
+use crate::progress::{Progress, say};
 use crate::scene_file::{SceneOptions, load, load_series};
 use crate::study::{self, Subject};
 use std::path::{Path, PathBuf};
@@ -40,7 +40,7 @@ struct Flatland {
     /// Folder for study.csv, study.md, study.svg and figure5.png; made if it does not exist
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
-    /// The largest number of samples
+    /// The largest number of samples, of 1000, 3000, 10000, 20000, 100000 and 1000000
     #[arg(long, default_value_t = 1_000_000, value_name = "N")]
     most: u64,
     /// Seed of all random numbers
@@ -52,7 +52,8 @@ struct Flatland {
 #[command(after_help = "\
 Writes CSV, Markdown and SVG into DIR; rows that are there are kept, so that an interrupted study goes on where it
 stopped. They must be of the same scene and settings: others need a folder of their own. References are cached in
-DIR/references. Options that a study gives values of its own are refused.
+DIR/references. Options that a study gives values of its own are refused, and a scene's [bake] is left aside. Of several
+volumes the first is measured.
 
 Examples:
   isolume study strategies scenes/cornell-bumps.toml -o results
@@ -122,7 +123,17 @@ impl SceneStudy {
                 ));
             }
             let loaded = load(path, &SceneOptions::default())?;
-            subjects.push(Subject { name: stem(path), scene: loaded.scene, isovalue: None });
+            let set = loaded.bake.set();
+            if !set.is_empty() {
+                say!(
+                    "warning: {}: its [bake] is left aside ({}); give what a study may be told as flags",
+                    path.display(),
+                    set.join(", ")
+                );
+            }
+            // Of several volumes the first, alone if they give each other no light.
+            let scene = loaded.scene.lit(loaded.scene.number());
+            subjects.push(Subject { name: stem(path), scene, isovalue: None });
         }
         if let Some(folder) = &self.data {
             for (name, file, isovalues, main) in DATA {

@@ -47,8 +47,8 @@ impl StudySettings {
     /// # Errors
     /// `Invalid` if fewer samples are allowed than the study begins with.
     pub fn check(&self) -> Result<()> {
-        if self.most < 1000 {
-            return Err(Error::Invalid(format!("--most {}: the study begins at 1000 samples", self.most)));
+        if !(COUNTS[0]..=COUNTS[COUNTS.len() - 1]).contains(&self.most) {
+            return Err(Error::Invalid(format!("--most {}: the study goes from 1000 to 1000000 samples", self.most)));
         }
         Ok(())
     }
@@ -222,6 +222,9 @@ impl Bench {
     }
 }
 
+/// Numbers of samples.
+const COUNTS: [u64; 6] = [1000, 3000, 10_000, 20_000, 100_000, 1_000_000];
+
 /// Samples of BB09's Figure 5.
 const FIGURE5: u64 = 20_000;
 
@@ -229,17 +232,16 @@ const FIGURE5: u64 = 20_000;
 /// into `folder`.
 ///
 /// # Errors
-/// `Io`, `Embree`, `Interrupted`; `Invalid` if fewer than 1000 samples are allowed.
+/// `Io`, `Embree`, `Interrupted`; `Invalid` if fewer than 1000 samples are allowed, or more than 10⁶.
 pub fn flatland(folder: &Path, device: &Device, settings: &StudySettings, progress: Progress) -> Result<()> {
     settings.check()?;
     let begun = Instant::now();
     let bench = Bench::new(device, settings)?;
     let solved = begun.elapsed().as_secs_f64();
-    let counts = [1000, 3000, 10_000, 20_000, 100_000, 1_000_000];
     let mut table = Vec::new();
     let mut rows = Vec::new();
     for placement in [Placement::LevelSets, Placement::Uniform] {
-        for &count in counts.iter().filter(|&&n| n <= settings.most) {
+        for count in COUNTS.into_iter().filter(|&n| n <= settings.most) {
             let (measured, positions, grid) = bench.measure(placement, count)?;
             if progress.is_shown() {
                 let (name, n) = (placement.name(), measured.samples);

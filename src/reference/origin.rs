@@ -29,7 +29,7 @@ impl Origin {
             Integrator::Path => "path",
             Integrator::Photon => "photon",
         };
-        let (seed, samples, light) = (settings.seed, settings.samples, light(scene, isovalue));
+        let (seed, samples, light) = (settings.seed, settings.taken(), light(scene, isovalue));
         format!("{MARK} isovalue={isovalue:?} seed={seed} samples={samples} integrator={integrator} light={light}")
     }
 

@@ -4,7 +4,7 @@
 //! rays anew, and a hit may move by as much as that rounding over the slope along the ray.
 
 use super::{Case, Tally, Trials, many};
-use crate::bake::{Bake, BakeOptions, BakeSettings, bake};
+use crate::bake::{Bake, BakeOptions, BakeSettings, Engine, bake};
 use crate::embree::{Device, GraphTracer};
 use crate::error::Result;
 use crate::field::{Field, Sweep};
@@ -242,14 +242,18 @@ pub fn walls(rays: u64, device: &Device, progress: Progress) -> Result<Case> {
 }
 
 /// A small bake.
-fn baked(scene: &Scene, seed: u64, device: &Device) -> Result<Bake> {
-    let options = BakeOptions {
-        photons: Some(1 << 13),
+fn baked(scene: &Scene, engine: Engine, seed: u64, device: &Device) -> Result<Bake> {
+    let common = BakeOptions {
+        engine: Some(engine),
         gather_rays: Some(16),
         shadow_rays: Some(16),
         wall_resolution: Some(8),
         seed: Some(seed),
         ..BakeOptions::default()
+    };
+    let options = match engine {
+        Engine::Photon => BakeOptions { photons: Some(1 << 13), ..common },
+        Engine::Sweep => BakeOptions { directions: Some(32), light_points: Some(8), ..common },
     };
     bake(scene, &BakeSettings::new(&options, scene)?, device, Progress::Quiet)
 }
@@ -272,25 +276,25 @@ fn octants(scene: &Scene, bake: &Bake) -> [f64; 8] {
     means.map(|m| m.mean())
 }
 
-/// Bakes under every change: the same bits where that is promised, else the same light in every octant by z-tests over
+/// Bakes by one engine under every change: the same bits where that is promised, else the same light in every octant by z-tests over
 /// independent seeds at a family-wise level of 1e-3.
 ///
 /// # Errors
 /// From [`bake`].
-pub fn bakes(count: u64, device: &Device, progress: Progress) -> Result<Vec<Case>> {
+pub fn bakes(engine: Engine, count: u64, device: &Device, progress: Progress) -> Result<Vec<Case>> {
     const SIZE: usize = 10;
     let base = scene(SIZE, &SAME, true)?;
     let runs = |scene: &Scene, first: u64| -> Result<[Moments; 8]> {
         let mut moments = [Moments::default(); 8];
         for k in 0..count {
-            let means = octants(scene, &baked(scene, first + k, device)?);
+            let means = octants(scene, &baked(scene, engine, first + k, device)?);
             moments.iter_mut().zip(means).for_each(|(m, x)| m.push(x));
         }
         Ok(moments)
     };
     let stage = progress.stage("bakes", 1 + changes().len() as u64);
     let first = runs(&base, 100)?;
-    let reference = bits(&baked(&base, 1, device)?);
+    let reference = bits(&baked(&base, engine, 1, device)?);
     let changes = changes();
     // Several changes × 8 octants; Student's t with few seeds is wider than a normal, so the level is 1e-3 of that.
     let limit = student_limit(sidak(1e-3, 8 * (changes.len() + 1)), 2 * count - 2);
@@ -302,7 +306,7 @@ pub fn bakes(count: u64, device: &Device, progress: Progress) -> Result<Vec<Case
         let (mut tally, mut apart) = (Tally::default(), 0f64);
         let h_only = change.exact && change.scale == 1.0 && change.shift == DVec3::ZERO;
         if h_only {
-            let same = bits(&baked(&other, 1, device)?) == reference;
+            let same = bits(&baked(&other, engine, 1, device)?) == reference;
             tally.push(0, if same { Ok(0.0) } else { Err("a bake's bits change".into()) });
         } else {
             let second = runs(&other, 1000 * (n as u64 + 1))?;
@@ -318,7 +322,11 @@ pub fn bakes(count: u64, device: &Device, progress: Progress) -> Result<Vec<Case
         } else {
             format!("standard errors, light per octant; at most {:.2} % apart", 100.0 * apart)
         };
-        cases.push(tally.case("bake", change.name, (!h_only).then_some(limit), &note));
+        let by = match engine {
+            Engine::Photon => "bake, photons",
+            Engine::Sweep => "bake, sweeps",
+        };
+        cases.push(tally.case(by, change.name, (!h_only).then_some(limit), &note));
         if !stage.tick(1) {
             break;
         }
@@ -357,6 +365,8 @@ fn bits(bake: &Bake) -> Vec<u32> {
 pub fn cases(trials: &Trials, device: &Device, progress: Progress) -> Result<Vec<Case>> {
     let mut cases = intersections(trials.invariance, device, progress)?;
     cases.push(walls(trials.invariance / 10, device, progress)?);
-    cases.extend(bakes(trials.bakes, device, progress)?);
+    for engine in [Engine::Photon, Engine::Sweep] {
+        cases.extend(bakes(engine, trials.bakes, device, progress)?);
+    }
     Ok(cases)
 }

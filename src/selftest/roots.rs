@@ -183,6 +183,10 @@ fn cell(family: usize, index: u64) -> (Cell, f32, DVec3, DVec3) {
     }
     p[axis] = f64::from(u8::from(far));
     d[axis] = (0.05 + d[axis].abs()) * if far { -1.0 } else { 1.0 };
+    // From an edge or a corner into the cell, not away from it at once.
+    if leave(p, d).1 <= 0.0 {
+        d = d.abs() * (1.0 - 2.0 * p.round());
+    }
     (Cell { s }, c, p, d)
 }
 
@@ -191,9 +195,9 @@ pub fn judge_cell(cell: &Cell, c: f32, p: DVec3, d: DVec3) -> Result<f64, String
     judge_cell_by(Cubic::first_crossing, cell, c, p, d)
 }
 
-fn judge_cell_by(solver: impl Solver, cell: &Cell, c: f32, p: DVec3, d: DVec3) -> Result<f64, String> {
-    // Where it leaves the unit cube.
-    let leave = |a: usize| {
+/// The axis across which a ray from `p` leaves the unit cube, and when.
+fn leave(p: DVec3, d: DVec3) -> (usize, f64) {
+    let time = |a: usize| {
         if d[a] > 0.0 {
             (1.0 - p[a]) / d[a]
         } else if d[a] < 0.0 {
@@ -202,11 +206,11 @@ fn judge_cell_by(solver: impl Solver, cell: &Cell, c: f32, p: DVec3, d: DVec3) -
             f64::INFINITY
         }
     };
-    let axis = (0..3).min_by(|&a, &b| leave(a).total_cmp(&leave(b))).expect("three axes");
-    let end = leave(axis);
-    if end <= 0.0 {
-        return Ok(0.0);
-    }
+    (0..3).map(|a| (a, time(a))).min_by(|(_, a), (_, b)| a.total_cmp(b)).expect("three axes")
+}
+
+fn judge_cell_by(solver: impl Solver, cell: &Cell, c: f32, p: DVec3, d: DVec3) -> Result<f64, String> {
+    let (axis, end) = leave(p, d);
     let exact = |t: f64| {
         let at = |a: usize| {
             let x = Double::from(p[a]) + Double::from(t) * Double::from(d[a]);

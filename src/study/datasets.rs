@@ -70,6 +70,7 @@ pub fn datasets(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Resu
         modes.into_iter().filter(|(_, options)| base.engine.is_none_or(|engine| options.engine == Some(engine)));
     let modes: Vec<(&str, BakeOptions)> = modes.collect();
     let jobs = study.jobs(&table, subjects, base, &["strategy"])?;
+    subjects.iter().try_for_each(|s| s.with_surfaces(&[s.main_isovalue()]).map(drop))?;
     for (subject, job) in subjects.iter().zip(&jobs) {
         let scene = &subject.scene;
         let c = subject.main_isovalue();

@@ -53,7 +53,7 @@ pub fn strategies(study: &Study, subjects: &[Subject], base: &BakeOptions) -> Re
         .collect();
     // Plots of what is there, also after an interrupt.
     let measured = measure(study, &works, base, counts, &mut table);
-    summarise(study, subjects, &table, counts)?;
+    summarise(study, &works, &table, counts)?;
     measured
 }
 
@@ -181,9 +181,10 @@ fn shortly(x: f64) -> String {
     rounded.to_string()
 }
 
-fn summarise(study: &Study, subjects: &[Subject], table: &Table, counts: &[u64]) -> Result<()> {
+/// Tables and plots of what is measured so far, and says so where that is not all.
+fn summarise(study: &Study, works: &[Work], table: &Table, counts: &[u64]) -> Result<()> {
     let mut notes = String::from("RMS over the isovalues | at the isovalue that is reported first:\n\n");
-    for subject in subjects {
+    for Work { subject, isovalues, .. } in works {
         let sweep = subject.scene.field.sweep();
         let (c, lo, hi) = (shortly(subject.main_isovalue()), shortly(sweep.lo()), shortly(sweep.hi()));
         notes += &format!("* {}: at {c} of [{lo}, {hi}]\n", subject.name);
@@ -203,9 +204,14 @@ fn summarise(study: &Study, subjects: &[Subject], table: &Table, counts: &[u64])
                     rows.iter().map(|r| (table.number(r, "isovalue"), table.number(r, "percent_rms"))).collect();
                 points.sort_by(|a, b| a.0.total_cmp(&b.0));
                 let rms = (points.iter().map(|p| p.1 * p.1).sum::<f64>() / points.len() as f64).sqrt();
-                let at_main = rows.iter().find(|r| r[3] == main);
-                let at_main = at_main.map_or("no surface".into(), |r| format!("{:.3}", table.number(r, "percent_rms")));
-                notes += &format!("* {}, {count} samples, {name}: {rms:.3} | {at_main}\n", subject.name);
+                let (done, all) = (rows.len(), isovalues.len());
+                let rms = if done < all { format!("{done} of {all} isovalues so far") } else { format!("{rms:.3}") };
+                let at_main = match rows.iter().find(|r| r[3] == main) {
+                    Some(row) => format!("{:.3}", table.number(row, "percent_rms")),
+                    None if isovalues.contains(&subject.main_isovalue()) => "not yet".into(),
+                    None => "no surface".into(),
+                };
+                notes += &format!("* {}, {count} samples, {name}: {rms} | {at_main}\n", subject.name);
                 series.push(Series {
                     name: format!("{name} {count:.0e}", count = count as f64),
                     points,
@@ -260,8 +266,16 @@ mod tests {
             row.resize(COLUMNS.len(), "0".into());
             table.push(row).unwrap();
         }
-        summarise(&study, &[subject], &table, &[20_000]).unwrap();
-        let notes = std::fs::read_to_string(dir.path().join("strategies.md")).unwrap();
+        let summarised = |isovalues: &[f64]| {
+            let work = Work { subject: &subject, job: Default::default(), isovalues: isovalues.to_vec() };
+            summarise(&study, &[work], &table, &[20_000]).unwrap();
+            std::fs::read_to_string(dir.path().join("strategies.md")).unwrap()
+        };
+        // What an interrupt leaves is no RMS of all.
+        let notes = summarised(&all);
+        let so_far = format!("s, 20000 samples, level-set: 2 of {} isovalues so far | 4.000", all.len());
+        assert!(notes.contains(&so_far), "{notes}");
+        let notes = summarised(&[all[0], main]);
         assert!(notes.contains("s: at 0.00004701 of [0.0000036, 0.000095]"), "{notes}");
         assert!(notes.contains("s, 20000 samples, level-set: 3.536 | 4.000"), "√12.5 and what stands at it: {notes}");
         assert_eq!(shortly(20.000_000_000_000_004), "20");

@@ -33,6 +33,7 @@ fn paths_have_a_most() {
     refused(dir.path(), &["flatland", "s.toml", "-o", "o", "--paths", "65537"], &["--paths 65537: 0 to 65536"]);
     // Before there is a folder.
     refused(dir.path(), &["study", "flatland", "--most", "999", "-o", "none"], &["--most 999"]);
+    refused(dir.path(), &["study", "flatland", "--most", "1000001", "-o", "none"], &["--most 1000001"]);
     for limit in ["nan", "-5"] {
         let curve = ["study", "curve", "s.toml", "-o", "none", &format!("--limit={limit}")];
         refused(dir.path(), &curve, &["--limit", "0 seconds or more"]);
