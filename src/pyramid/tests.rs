@@ -79,6 +79,48 @@ fn with_and_without_simd_hits_are_the_same_bits() {
     }
 }
 
+/// Rays that enter Ω far from its first corner start between f32's numbers. A sheet across all of Ω stops them, also
+/// those that cross lattice planes at a small angle just where they meet it.
+#[test]
+fn rays_that_enter_along_planes_meet_the_sheet_in_their_way() {
+    let across = |x: f64, z: f64| 1.3 * (0.7 * x).sin() + 0.9 * (0.5 * z + 0.3 * x).cos();
+    for long in 0..3 {
+        // Axes x, y, z of the sheet are those of the lattice from `long` on.
+        let axis = |a: usize| (a + long) % 3;
+        let turned = |v: [f64; 3]| {
+            let mut out = DVec3::ZERO;
+            (0..3).for_each(|a| out[axis(a)] = v[a]);
+            out
+        };
+        let dims = turned([2000.0, 24.0, 8.0]).to_array().map(|n| n as usize);
+        let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::ONE).unwrap();
+        let at = |o: usize| {
+            let ijk = lattice.ijk(o).map(|i| i as f64);
+            let [x, y, z] = [0, 1, 2].map(|a| ijk[axis(a)]);
+            (y + across(x, z)) as f32
+        };
+        let samples = (0..lattice.len()).map(at).collect();
+        let volume = Volume::new("sheets", lattice, Samples::F32(samples)).unwrap();
+        let field = Field::new(&volume, Sweep::new(0.0, 20.0).unwrap()).unwrap();
+        let pyramid = Pyramid::new(&field, false);
+        let mut rng = Rng::stream(8, Stage::Test, long as u64);
+        for isa in Isa::found() {
+            let pyramid = pyramid.clone().with(isa);
+            for _ in 0..50_000 {
+                let (x, z) = ((1000.0 + 990.0 * rng.unit()).floor(), 1.0 + 5.0 * rng.unit());
+                let between = z - z.floor();
+                let y = 9.0 - (1.0 - between) * across(x, z.floor()) - between * across(x, z.ceil());
+                let slope = 10f64.powf(-5.0 + 3.0 * rng.unit()) * if rng.bits() & 1 == 0 { 1.0 } else { -1.0 };
+                let (d, before) = ([slope, 1.0, 0.0], 100.0 + 2000.0 * rng.unit());
+                let place = [x, y + 0.6 * rng.unit() - 0.3, z];
+                let origin = turned([0, 1, 2].map(|a| place[a] - before * d[a]));
+                let ray = FlattenedRay::free(origin.as_vec3(), turned(d).as_vec3(), 9.0 / 20.0);
+                assert!(pyramid.occluded(&field, &ray, f64::INFINITY), "{isa:?}, long axis {long}: {ray:?}");
+            }
+        }
+    }
+}
+
 /// Embree asks with the reach that whatever it met first left over: a hit counts up to there and no farther, and is the
 /// same wherever that is.
 #[test]

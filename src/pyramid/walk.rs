@@ -47,6 +47,8 @@ pub(super) struct Ray<'a> {
     c: f64,
     /// The smallest f32 not below `c`: samples compare to both alike.
     c32: f32,
+    /// As [`Pyramid::slack`], and more if the ray is not quite its line.
+    slack: f32,
     /// Where Ω begins.
     t: f64,
     reach: f64,
@@ -197,7 +199,7 @@ impl Pyramid {
             if child.level > 0 {
                 continue;
             }
-            match lane.cell::<ANY, K>(kernel, child, self.slack) {
+            match lane.cell::<ANY, K>(kernel, child) {
                 Step::On => {}
                 Step::Hit(hit) => return Some(hit),
                 Step::End => return None,
@@ -433,7 +435,7 @@ impl<'a, R> Lane<'a, R> {
 
     /// A cell of the path, or one that the path only touches.
     #[inline(always)]
-    pub(super) fn cell<const ANY: bool, K: Kernel>(&self, kernel: K, cell: Child, slack: f32) -> Step {
+    pub(super) fn cell<const ANY: bool, K: Kernel>(&self, kernel: K, cell: Child) -> Step {
         let (ray, line) = (&self.ray, &self.line);
         let corners = kernel.corners(ray.samples, cell.at, ray.steps);
         let inside = kernel.inside(&corners, ray.c32);
@@ -450,7 +452,7 @@ impl<'a, R> Lane<'a, R> {
         }
         // Most cells are passed by.
         let local = |t: f32| (line.start - corner + line.d * t).max(Vec4::ZERO).min(Vec4::ONE);
-        if kernel.clear(&corners, ray.c32, local(t_in.max(0.0)), local(t_out), slack) {
+        if kernel.clear(&corners, ray.c32, local(t_in.max(0.0)), local(t_out), ray.slack) {
             return Step::On;
         }
         let t = ray.time(entry, near.to_array()[entry]).max(0.0);
@@ -458,7 +460,8 @@ impl<'a, R> Lane<'a, R> {
         if t > ray.reach {
             return Step::End;
         }
-        let t_exit = ray.time(exit, far.to_array()[exit]).max(t);
+        // Each face at its own time, as its other cell has it: rounding may have turned their order round.
+        let t_exit = ray.time(exit, far.to_array()[exit]).max(0.0);
         let last = t_exit >= ray.reach;
         let piece = Piece {
             o: &ray.o,
@@ -481,6 +484,9 @@ impl<'a, R> Lane<'a, R> {
         }
         if ANY && !last && begins != ends {
             return Step::Hit(Ray::hit(t, begins));
+        }
+        if t_exit < t {
+            return if begins == ends { Step::On } else { Step::Hit(Ray::hit(t, begins)) };
         }
         // In all of the cell, so that t does not depend on where the reach ends: on what was met before.
         match ray.crossing(cell.at, corner, t, t_exit - t, [begins, ends]) {

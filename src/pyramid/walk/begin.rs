@@ -98,7 +98,19 @@ impl Pyramid {
             departing = true;
         }
         line.hold(&self.ranks, c32);
-        let ray = Ray { samples: field.samples(), steps: self.steps, o, d, inv, c, c32, t: 0.0, reach, within: true };
+        let ray = Ray {
+            samples: field.samples(),
+            steps: self.steps,
+            o,
+            d,
+            inv,
+            c,
+            c32,
+            slack: self.slack,
+            t: 0.0,
+            reach,
+            within: true,
+        };
         *lane = Some(Lane::new(kernel.constants(&line), ray, line, start, departing, self.capped));
         Begun::On
     }
@@ -143,6 +155,14 @@ impl Pyramid {
         let inv = d.map(|x| 1.0 / x);
         let Some(Entry { t, axis: entry }) = enter(self.cells, o, d, inv, reach) else { return Begun::Done(None) };
         let (cell, mut line) = self.line([o, d, inv], t, reach);
+        // A ray that enters starts between f32's numbers, and crosses planes sooner or later than its line: the more,
+        // the smaller the angle. Parts of it are not clear that are so on the line.
+        let scale = d.iter().fold(0.0, |most, x| x.abs().max(most));
+        let apart = (0..3).filter(|&a| d[a].abs() > f64::from(PARALLEL) * scale).fold(0.0, |most, a| {
+            let off = o[a] + t * d[a] - f64::from(line.start[a]);
+            (off * inv[a] * scale).abs().max(most)
+        });
+        let slack = self.slack + 6.0 * apart as f32;
         let start = self.nodes(cell);
         self.prefetch(kernel, &start);
 
@@ -151,7 +171,7 @@ impl Pyramid {
         let four = |[x, y, z]: [f64; 3]| [x, y, z, 0.0];
         let (samples, steps) = (field.samples(), self.steps);
         let (o, d, inv) = (four(o), four(d), four(inv));
-        let mut ray_in = Ray { samples, steps, o, d, inv, c, c32: ray.isovalue, t, reach, within };
+        let mut ray_in = Ray { samples, steps, o, d, inv, c, c32: ray.isovalue, slack, t, reach, within };
         let mut departing = None;
         if let (Departure::Surface(side), true) = (ray.departure, within) {
             let here = ray_in.cell_at(self.sample(cell)).value(ray_in.local(point(cell), 0.0));
