@@ -229,8 +229,12 @@ impl Polygon {
     }
 }
 
+/// How far, as a share of its size, a parallelogram or rectangle may be off: as coordinates of six digits, and those
+/// of f64 far from the origin, put it.
+pub(crate) const SQUARE: f64 = 1e-6;
+
 fn is_parallelogram(v: &[DVec3]) -> bool {
-    v.len() == 4 && (v[0] + v[2] - v[1] - v[3]).length() <= 1e-12 * (v[2] - v[0]).length()
+    v.len() == 4 && (v[0] + v[2] - v[1] - v[3]).length() <= SQUARE * (v[2] - v[0]).length()
 }
 
 /// Area of triangle `i` of the fan of a planar convex polygon.
@@ -411,6 +415,21 @@ mod tests {
     fn square() -> Polygon {
         let v = [(0., 0.), (2., 0.), (2., 1.), (0., 1.)].map(|(x, y)| DVec3::new(x, y, 3.0)).to_vec();
         Polygon::new("s", v, DVec3::ONE, DVec3::ZERO).unwrap()
+    }
+
+    /// Survey coordinates, and what a modeller writes with six digits.
+    #[test]
+    fn rounded_rectangles_are_rectangles() {
+        let e = [DVec3::new(0.6, 0.8, 0.0), DVec3::new(-0.4, 0.3, 0.0)];
+        for (shift, digits) in [(DVec3::new(148_376.1, 1_234.2, -223_423.3), 1e15), (DVec3::new(0.1, 0.2, 0.3), 1e6)] {
+            let corners = [shift, shift + e[0], shift + e[0] + e[1], shift + e[1]];
+            let rounded = corners.map(|x| (x * digits).round() / digits).to_vec();
+            let p = Polygon::new("s", rounded, DVec3::ONE, DVec3::ONE).unwrap();
+            assert!(p.is_parallelogram(), "{shift}");
+            assert!((p.area() - 0.5).abs() < 2e-6);
+        }
+        let off = [DVec3::ZERO, DVec3::X, DVec3::new(1.0, 1.0, 0.0), DVec3::new(0.001, 1.0, 0.0)];
+        assert!(!Polygon::new("s", off.to_vec(), DVec3::ONE, DVec3::ONE).unwrap().is_parallelogram());
     }
 
     #[test]

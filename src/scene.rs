@@ -7,7 +7,7 @@ mod mtl;
 mod obj;
 
 pub use companion::{Companion, Member, Policy};
-pub(crate) use cover::{ON, SLIT, voxel_along};
+pub(crate) use cover::{ON, SLIT, value_on, voxel_along};
 pub use obj::{Placement, read_context, read_obj};
 
 use crate::digits::{Shortest, brief_within};

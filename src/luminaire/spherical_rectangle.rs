@@ -1,6 +1,6 @@
 //! Points uniform over the solid angle of a rectangle.
 
-use crate::polygon::Polygon;
+use crate::polygon::{Polygon, SQUARE};
 use glam::DVec3;
 
 /// A rectangle projected onto the unit sphere. \[Urena13\]
@@ -23,7 +23,7 @@ impl SphericalRectangle {
     pub(super) fn new(polygon: &Polygon, o: DVec3) -> Option<Self> {
         let [e, f] = polygon.texture_edges();
         let lengths = [e.length(), f.length()];
-        if !polygon.is_parallelogram() || e.dot(f).abs() > 1e-12 * lengths[0] * lengths[1] {
+        if !polygon.is_parallelogram() || e.dot(f).abs() > SQUARE * lengths[0] * lengths[1] {
             return None;
         }
         let (ex, ey) = (e / lengths[0], f / lengths[1]);

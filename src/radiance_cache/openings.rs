@@ -6,7 +6,7 @@ use crate::flattened::{Side, split_face};
 use crate::isovalue_axis::IsovalueAxis;
 use crate::neighbourhood::neighbourhood;
 use crate::polygon::Polygon;
-use crate::scene::Scene;
+use crate::scene::{Scene, value_on};
 use glam::DVec3;
 use rayon::prelude::*;
 
@@ -69,7 +69,7 @@ impl<'a> Solid<'a> {
         let p = self.scene.lattice().to_index(self.flat.at(uv));
         let mut open = [f64::NEG_INFINITY, f64::INFINITY];
         let mut close = |number: Option<u8>, field: &Field, p: DVec3, outside: Side| {
-            let h = if field.lattice().holds(p) { field.value(p) } else { f64::NAN };
+            let h = value_on(field, p);
             // A cap is the outer side of what is higher.
             let below = outside == Side::Lower && self.capped != Some(number);
             // NaN: nothing is there.

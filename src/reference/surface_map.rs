@@ -9,7 +9,7 @@ use crate::landing::{Landing, landing};
 use crate::nearest::{Neighbours, PointGrid};
 use crate::photon::Photons;
 use crate::rng::{Key, Sobol, Stage};
-use crate::scene::Scene;
+use crate::scene::{Scene, value_on};
 use crate::surface_mesh::SurfaceMesh;
 use crate::tracer::Tracer;
 use crate::warp::{self, Frame, cosine_hemisphere};
@@ -100,7 +100,7 @@ impl On {
 
 /// On which side of each field's level set a local point lies, as bits.
 fn higher(scene: &Scene, isovalue: f32, p: DVec3) -> u32 {
-    let higher_in = |field: &Field, p: DVec3| field.lattice().holds(p) && field.value(p) >= f64::from(isovalue);
+    let higher_in = |field: &Field, p: DVec3| value_on(field, p) >= f64::from(isovalue);
     let others = scene.companions().iter().map(|c| higher_in(&c.member.field, c.to_index(p)));
     others.fold(u32::from(higher_in(&scene.field, p)), |bits, higher| bits << 1 | u32::from(higher))
 }

@@ -3,6 +3,7 @@
 //! is seen everywhere: which of the two a ray meets first would be up to rounding.
 
 use super::Scene;
+use crate::field::Field;
 use crate::polygon::{Polygon, clip, convex_area};
 use crate::volume::Lattice;
 use glam::DVec3;
@@ -17,6 +18,12 @@ const FLUSH: f64 = 2e-4;
 /// Such a share of a voxel before a wall a luminaire hangs that stood in its plane: within [`SLIT`] on grids four times
 /// as fine, too, and farther than positions are rounded.
 const HUNG: f64 = 0.05;
+
+/// h where a flat stands that is in Ω or lies on its faces; NaN off Ω.
+#[inline]
+pub(crate) fn value_on(field: &Field, p: DVec3) -> f64 {
+    field.lattice().nearest(p, ON).map_or(f64::NAN, |p| field.value(p))
+}
 
 /// Moves the luminaires, the first `emitting` of `polygons`, out of the planes of walls that face where they face and
 /// that they hide a part of. Of one with two faces either is then a luminaire with an opaque back: what shines into

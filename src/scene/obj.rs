@@ -48,12 +48,12 @@ impl Default for Placement {
 }
 
 /// Reads all faces as polygons with two faces each ([`Polygon::both_faces`]). Faces that are not planar and convex are
-/// split into triangles; those without an area are left out.
+/// split into triangles from a vertex that sees all of them; those without an area are left out.
 ///
 /// # Errors
 /// `Io` if the OBJ or its MTL cannot be read; `Invalid` if no face has an area, for coordinates that are not finite,
-/// for an albedo or emission out of range, for malformed lines of the MTL, and for materials that no library has unless
-/// `placement` has an albedo in place of them.
+/// for faces that no vertex sees all of, for an albedo or emission out of range, for malformed lines of the MTL, and
+/// for materials that no library has unless `placement` has an albedo in place of them.
 pub fn read_context(path: &Path, placement: &Placement) -> Result<Vec<Polygon>> {
     let Placement { scale, rotate, translate, .. } = *placement;
     let [x, y, z] = rotate.to_array().map(f64::to_radians);
@@ -72,9 +72,12 @@ pub fn read_context(path: &Path, placement: &Placement) -> Result<Vec<Polygon>> 
         };
         match polygon(vertices.clone()) {
             Ok(whole) => polygons.extend(whole.both_faces()),
+            Err(_) if vertices.len() < 3 => {}
             Err(_) => {
-                for n in 1..vertices.len().saturating_sub(1) {
-                    let triangle = vec![vertices[0], vertices[n], vertices[n + 1]];
+                let fan = fan(&vertices).ok_or_else(|| {
+                    Error::invalid(path, format!("{}: no vertex sees all of it; split it into triangles", face.place))
+                })?;
+                for triangle in fan {
                     if has_area(&triangle) {
                         let triangle =
                             polygon(triangle).map_err(|e| Error::invalid(path, format!("{}: {e}", face.place)))?;
@@ -88,6 +91,17 @@ pub fn read_context(path: &Path, placement: &Placement) -> Result<Vec<Polygon>> 
         return Err(Error::invalid(path, "none of its faces has an area"));
     }
     Ok(polygons)
+}
+
+/// The triangles from a vertex that sees all of a face, planar or not; `None` if there is none.
+fn fan(v: &[DVec3]) -> Option<Vec<Vec<DVec3>>> {
+    let n = v.len();
+    let from = |s: usize| (1..n - 1).map(move |i| [v[s], v[(s + i) % n], v[(s + i + 1) % n]]);
+    let area = |[a, b, c]: [DVec3; 3]| (b - a).cross(c - a);
+    let whole: DVec3 = from(0).map(area).sum();
+    let folds = |s: usize| from(s).any(|t| area(t).dot(whole) < -1e-9 * whole.length_squared());
+    let s = (0..n).find(|&s| !folds(s))?;
+    Some(from(s).map(|t| t.to_vec()).collect())
 }
 
 /// An 'f' line.
@@ -276,6 +290,25 @@ mod tests {
         }
         assert!(p.chunks(2).all(|f| (f[0].normal() + f[1].normal()).length() < 1e-12 && f[0].albedo.x == 0.3));
         assert!(p.iter().zip([1, -1].into_iter().cycle()).all(|(p, n)| p.other_face == n && !p.opaque_back));
+        // An L, begun at each of its corners, of which two see all of it; and a Z, of which none does.
+        let l = [(0, 0), (4, 0), (4, 4), (3, 4), (3, 1), (0, 1)];
+        let placement = Placement { albedo: Some(DVec3::splat(0.3)), ..Placement::default() };
+        let face = |corners: &[(i32, i32)], first: usize| {
+            let n = corners.len();
+            let vertices: String =
+                (0..n).map(|i| corners[(first + i) % n]).map(|(x, y)| format!("v {x} {y} 0\n")).collect();
+            let numbers: Vec<String> = (1..=n).map(|i| i.to_string()).collect();
+            std::fs::write(&obj, format!("{vertices}f {}\n", numbers.join(" "))).unwrap();
+            read_context(&obj, &placement)
+        };
+        for first in 0..6 {
+            let p = face(&l, first).unwrap();
+            let area = p.iter().map(Polygon::area).sum::<f64>();
+            assert!((area - 2.0 * 7.0).abs() < 1e-12, "from corner {first}: {area}");
+        }
+        let z = [(0, 0), (5, 0), (5, 5), (9, 5), (9, 6), (4, 6), (4, 1), (0, 1)];
+        let message = face(&z, 0).unwrap_err().to_string();
+        assert!(message.contains("face 1") && message.contains("split it into triangles"), "{message}");
         std::fs::write(&obj, "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n").unwrap();
         assert!(read_context(&obj, &Placement::default()).unwrap_err().to_string().contains("thing.obj"));
     }

@@ -3,7 +3,7 @@
 use super::flats::below;
 use crate::flat::Flat;
 use crate::isovalue_axis::IsovalueAxis;
-use crate::scene::Scene;
+use crate::scene::{Scene, value_on};
 use rayon::prelude::*;
 
 /// Off Ω, and where samples are missing, there is one light for all.
@@ -15,7 +15,7 @@ pub(super) fn solid(scene: &Scene, flat: &Flat, [nu, nv]: [usize; 2], axis: &Iso
     let of = |texel: usize| {
         let uv = [((texel % nu) as f64 + 0.5) / nu as f64, ((texel / nu) as f64 + 0.5) / nv as f64];
         let p = scene.lattice().to_index(flat.at(uv));
-        let h = if scene.lattice().holds(p) { scene.field.value(p) as f32 } else { f32::NAN };
+        let h = value_on(&scene.field, p) as f32;
         if h.is_nan() { FREE } else { below(axis, n, h) as u32 }
     };
     (0..nu * nv).into_par_iter().with_min_len(256).map(of).collect()
@@ -46,8 +46,9 @@ mod tests {
             (Flats::new(&scene, sides, 8, 8), left)
         };
         let both = [Side::Lower, Side::Higher];
-        for gap in [false, true] {
-            let (apart, left) = flats(&both, 0.0, gap);
+        // Walls in the volume's faces, one of them by a box that a modeller wrote with six digits.
+        for (margin, gap) in [(0.0, false), (0.0, true), (1e-5, false)] {
+            let (apart, left) = flats(&both, margin, gap);
             assert_eq!(
                 (apart.textures.len(), apart.number(3, Side::Higher)),
                 (2 * apart.count, 3 + apart.count as u32)

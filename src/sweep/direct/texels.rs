@@ -8,6 +8,7 @@ use crate::isovalue_axis::IsovalueAxis;
 use crate::luminaire::{point_term, unoccluded};
 use crate::polygon::Polygon;
 use crate::rng::{Rng, Stage};
+use crate::scene::ON;
 use crate::sweep::blockers::Blockers;
 use crate::sweep::flats::{self, Flats};
 use crate::sweep::open_share::OpenShare;
@@ -124,7 +125,8 @@ impl Seer<'_> {
                     continue;
                 }
                 let (lx, ly) = (lattice.to_index(x), lattice.to_index(y));
-                let here = if lattice.holds(lx) && !self.is_cap() && !scene.is_capped() { below(h(lx)) } else { 0 };
+                let on = lattice.nearest(lx, ON).filter(|_| !self.is_cap() && !scene.is_capped());
+                let here = on.map_or(0, |on| below(h(on)));
                 all.add(g, here, here);
                 if blockers.block(*number, receiver, ly, lx) {
                     continue;
