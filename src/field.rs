@@ -1,6 +1,7 @@
 //! The function h whose graph is illuminated: a volume's samples mapped so that the sweep is [0, 1], trilinear in
 //! every cell, with its gradient and the one receiver normal that every engine shares.
 
+mod cells;
 mod rows;
 mod sweep;
 

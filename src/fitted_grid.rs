@@ -112,8 +112,9 @@ impl<'a> GridFit<'a> {
         fitted.into_iter().map(|draws| draws.length_squared() / 3.0).collect()
     }
 
-    /// Improves a grid that blends `samples`, and its standard errors.
-    pub(crate) fn improve(&self, grid: &mut IlluminationGrid, samples: Vec<RadianceSample>) {
+    /// Improves a grid that blends `samples`, and its standard errors; the same blend of their [`errors`] is `blended`,
+    /// since nodes begin with errors of the samples that they are fitted to.
+    pub(crate) fn improve(&self, grid: &mut IlluminationGrid, samples: Vec<RadianceSample>, blended: &[[f32; 3]]) {
         let mut targets: Vec<FitSample> = samples.iter().map(FitSample::from).collect();
         let errors: Vec<f32> = samples.iter().map(|s| s.variance.sqrt()).collect();
         drop(samples);
@@ -121,8 +122,7 @@ impl<'a> GridFit<'a> {
         for ((n, target), &error) in (0..).zip(&mut targets).zip(&errors) {
             target.light = draws(n, error);
         }
-        let start = |o: usize| draws((errors.len() + o) as u64, grid.std_error[o]);
-        let variances = self.variances(&targets, &start);
+        let variances = self.variances(&targets, &|o| Vec3::from_array(blended[o]));
         for (o, variance) in self.free.members(0..self.lattice.len()).zip(variances) {
             if grid.std_error[o].is_finite() {
                 grid.std_error[o] = variance.sqrt();
@@ -184,6 +184,12 @@ impl<'a> GridFit<'a> {
         d.iter_mut().zip(nodes()).for_each(|(d, o)| *d += start(o));
         d
     }
+}
+
+/// Samples that hold [`draws`] of their errors as light.
+pub(crate) fn errors(samples: &[RadianceSample]) -> Vec<RadianceSample> {
+    let drawn = (0..).zip(samples);
+    drawn.map(|(n, s)| RadianceSample { radiance: draws(n, s.variance.sqrt()), ..*s }).collect()
 }
 
 /// Three draws of an error with mean 0 and this standard deviation; equal `index`, equal signs. None where it is not
@@ -410,5 +416,40 @@ mod tests {
         let (said, found) = (mean(&said), mean(&found));
         println!("variance {said}, of many fits {found}");
         assert!((said / found - 1.0).abs() < 0.15, "{said} {found}");
+    }
+
+    /// Nodes begin with a blend of the samples that they are fitted to: the errors of both are the same ones.
+    #[test]
+    fn errors_of_samples_are_in_the_blend_and_in_the_fit() {
+        let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::ONE).unwrap();
+        let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[0] as f32).collect();
+        let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
+        let field = Field::new(&volume, Sweep::new(0.0, 8.0).unwrap()).unwrap();
+        let masks = masks(&field, &lattice);
+        let mut rng = Rng::stream(5, Stage::Test, 0);
+        let places: Vec<Vec3> = (0..729).map(|_| 8.0 * Vec3::from_array([(); 3].map(|()| rng.unit() as f32))).collect();
+        let mut grids = |normal: bool| {
+            let light = |rng: &mut Rng| if normal { 100.0 + rng.normal() as f32 } else { 100.0 };
+            let sample = |&position| RadianceSample {
+                position,
+                radiance: Vec3::splat(light(&mut rng)),
+                variance: 1.0,
+                ..RadianceSample::default()
+            };
+            let samples: Vec<RadianceSample> = places.iter().map(sample).collect();
+            let mut grid = shepard(&field, &lattice, &masks, &samples, 8, &|_| true);
+            let blended = shepard(&field, &lattice, &masks, &errors(&samples), 8, &|_| true).radiance;
+            let free = NodeSet::new(lattice.len(), |o| grid.mask[o] != Mask::Empty);
+            GridFit::new(&field, &lattice, &free, &|_| true).improve(&mut grid, samples, &blended);
+            grid
+        };
+        let told = grids(false).std_error.iter().map(|e| f64::from(*e).powi(2)).sum::<f64>() / lattice.len() as f64;
+        let squares = |grid: IlluminationGrid| -> f64 {
+            grid.radiance.iter().map(|r| f64::from(r[1] - 100.0).powi(2)).sum::<f64>() / lattice.len() as f64
+        };
+        let found = (0..24).map(|_| squares(grids(true))).sum::<f64>() / 24.0;
+        println!("variance told {told}, found {found}");
+        // Three draws know a mean of 729 nodes, whose errors their neighbours share, to a tenth or so.
+        assert!((told / found - 1.0).abs() < 0.2, "{told} {found}");
     }
 }

@@ -137,7 +137,7 @@ impl Rng {
 }
 
 /// Dimensions of [`Sobol`].
-pub const SOBOL_DIMENSIONS: usize = 6;
+pub const SOBOL_DIMENSIONS: usize = 7;
 
 /// Direction numbers as byte tables: point = XOR of four table entries. Dimension 0 is van der Corput's, the others
 /// come from the primitive polynomials and initial numbers of \[JoeKuo08\].
@@ -152,6 +152,7 @@ const fn direction_tables() -> [[[u32; 256]; 4]; SOBOL_DIMENSIONS] {
         (3, 1, [1, 3, 1, 0]),
         (3, 2, [1, 1, 1, 0]),
         (4, 1, [1, 1, 3, 3]),
+        (4, 4, [1, 3, 5, 13]),
     ];
     let mut tables = [[[0u32; 256]; 4]; SOBOL_DIMENSIONS];
     let mut d = 0;

@@ -48,8 +48,9 @@ pub fn positions_at_hand(field: &Field, strategy: &Strategy, count: u64, seed: u
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within the strata")]
 pub fn positions_by_isovalue(field: &Field, strata: u8, count: u64, seed: u64) -> Vec<Vec<Vec3>> {
     let stratum = |h: f64| ((h * f64::from(strata)) as u8).min(strata - 1);
-    let cells = cells_on_sweep(field);
-    let spans: Vec<[u8; 2]> = cells.par_iter().map(|&cell| range(field, cell).map(|h| stratum(f64::from(h)))).collect();
+    let cells = field.cells_on_sweep();
+    let spans: Vec<[u8; 2]> =
+        cells.par_iter().map(|&cell| field.cell_range(cell).map(|h| stratum(f64::from(h)))).collect();
     let of = |n: u8| {
         let passed = cells.par_iter().zip(&spans).filter(|(_, span)| (span[0]..=span[1]).contains(&n));
         let own: Vec<usize> = passed.map(|(cell, _)| *cell).collect();
@@ -72,7 +73,7 @@ fn positions_in(field: &Field, strategy: &Strategy, count: u64, seed: u64, most:
         far * DVec3::new(x, y, set.coordinate(i as u32, 2))
     };
     match strategy {
-        Strategy::Uniform => Ok(positions_in_cells(field, &cells_on_sweep(field), on_sweep, (count, most), (seed, 0))),
+        Strategy::Uniform => Ok(positions_in_cells(field, &field.cells_on_sweep(), on_sweep, (count, most), (seed, 0))),
         Strategy::Planes(planes) => Ok(in_batches(count, most, |i| {
             // Across (1,1,1) in units of Ω, all planes alike: their projection onto z = 0 scales all areas alike.
             let p = uniform(i) / far;
@@ -98,11 +99,10 @@ fn positions_in_cells(
     if cells.is_empty() {
         return Vec::new();
     }
-    let [nx, ny, _] = field.lattice().cells();
     let in_cell = |i: usize| {
         let set = Sobol::set(seed, Stage::Sample, set << 32 | (i >> 32) as u64);
         let cell = cells[(set.coordinate(i as u32, 3) * cells.len() as f64) as usize];
-        let corner = DVec3::new((cell % nx) as f64, (cell / nx % ny) as f64, (cell / (nx * ny)) as f64);
+        let corner = DVec3::from_array(field.cell_corner(cell).map(|i| i as f64));
         let [x, y] = set.point2(i as u32, 0);
         (corner + DVec3::new(x, y, set.coordinate(i as u32, 2))).as_vec3()
     };
@@ -110,23 +110,6 @@ fn positions_in_cells(
     // Neighbours one after another: their rays read the same memory.
     found.par_sort_by_key(|p| [p.z as u32, p.y as u32, p.x as u32]);
     found
-}
-
-/// Numbers of the cells that level sets of the sweep pass.
-fn cells_on_sweep(field: &Field) -> Vec<usize> {
-    let [nx, ny, nz] = field.lattice().cells();
-    let passed = |&cell: &usize| {
-        let [lo, hi] = range(field, cell);
-        lo <= 1.0 && hi >= 0.0
-    };
-    (0..nx * ny * nz).into_par_iter().filter(passed).collect()
-}
-
-/// Least and greatest h of a cell, units of the sweep.
-fn range(field: &Field, cell: usize) -> [f32; 2] {
-    let [nx, ny, _] = field.lattice().cells();
-    let corners = field.corners([cell % nx, cell / nx % ny, cell / (nx * ny)]);
-    corners.into_iter().fold([f32::INFINITY, f32::NEG_INFINITY], |[lo, hi], h| [lo.min(h), hi.max(h)])
 }
 
 /// The first `count` points that `point` gives for 0, 1, 2 …, tried in batches until there are enough or `most` were
@@ -203,7 +186,7 @@ mod tests {
         let lattice = Lattice::aligned([2; 3], DVec3::ZERO, DVec3::ONE).unwrap();
         let samples = (0..8).map(|o| o as f32).collect();
         let volume = Volume::new("x", lattice, Samples::F32(samples)).unwrap();
-        let on = |lo, hi| cells_on_sweep(&Field::new(&volume, Sweep::new(lo, hi).unwrap()).unwrap());
+        let on = |lo, hi| Field::new(&volume, Sweep::new(lo, hi).unwrap()).unwrap().cells_on_sweep();
         assert_eq!(on(2.0, 3.0), [0]);
     }
 

@@ -333,7 +333,8 @@ impl Census {
         }
         let looked_at = match settings.interpolation {
             Interpolation::Shepard => self.samples * SHEPARD,
-            Interpolation::Fit => self.samples * SHEPARD + self.points * FITTED,
+            // The samples' errors are blended, too.
+            Interpolation::Fit => self.samples * (SHEPARD + SAMPLE) + self.points * (FITTED + 12),
             Interpolation::Irradiance => self.samples * CACHING,
         };
         [self.samples * self.stored * SAMPLE, self.samples * SAMPLE + looked_at + self.points * GRID]

@@ -6,7 +6,7 @@ use super::grid_points::{Beside, BesideLight, Counts, GridPoints, PointLight, ra
 use super::{BakeSettings, Context, Interpolation, Lit, PhotonCounts};
 use crate::embree::{GraphTracer, pyramids};
 use crate::error::{Error, Result};
-use crate::fitted_grid::GridFit;
+use crate::fitted_grid::{GridFit, errors};
 use crate::flat;
 use crate::flattened::Side;
 use crate::illumination_grid::{IlluminationGrid, shepard};
@@ -260,7 +260,12 @@ impl<'a> FieldLight<'a> {
                         Interpolation::Fit => {
                             let mut grid = blended();
                             let free = NodeSet::new(lattice.len(), |o| grid.mask[o] != Mask::Empty);
-                            GridFit::new(&scene.field, lattice, &free, tick).improve(&mut grid, samples);
+                            let errors = errors(&samples);
+                            let quiet = &|_| tick(0);
+                            let blended =
+                                shepard(&scene.field, lattice, masks, &errors, settings.neighbours, quiet).radiance;
+                            drop(errors);
+                            GridFit::new(&scene.field, lattice, &free, tick).improve(&mut grid, samples, &blended);
                             grid
                         }
                     }

@@ -14,7 +14,7 @@ use rayon::prelude::*;
 /// (noise, thin sheets) a fixed number would make the divisor, and with it the estimate, jump.
 const FOOTPRINT_STEP: usize = 64;
 const FOOTPRINT_POINTS: usize = 1024;
-const FOOTPRINT_ENOUGH: usize = 32;
+const FOOTPRINT_ENOUGH: f64 = 32.0;
 /// Several sets, so that neighbouring estimates do not share their pattern.
 const FOOTPRINT_SETS: usize = 16;
 
@@ -76,9 +76,8 @@ impl<'a> PhotonPoints<'a> {
         let mut radius = settings.max_radius * diagonal;
         if settings.estimator == Estimator::Radius {
             // As many photons on average over the part of Ω that the sweep's level sets fill.
-            let inside = |h: &&f32| (0.0..=1.0).contains(*h);
-            let share = scene.field.samples().par_iter().filter(inside).count() as f64 / lattice.len() as f64;
-            let volume = lattice.world_volume() * share * settings.photons as f64 / kept.len().max(1) as f64;
+            let volume = lattice.world_volume() * scene.field.share_on_sweep() * settings.photons as f64
+                / kept.len().max(1) as f64;
             radius = radius.min((volume * 3.0 / (4.0 * std::f64::consts::PI)).cbrt());
         }
         let radius = radius as f32;
@@ -128,14 +127,19 @@ impl<'a> PhotonPoints<'a> {
         Irradiance { mean: power / measure, variance: squares / (measure * measure) }
     }
 
-    /// ∫_A K |∇h| dV over the accepted part of the ball, by low-discrepancy points.
+    /// ∫_A K |∇h| dV over the accepted part of the ball, by low-discrepancy points. Each stands for as much of h as a
+    /// ball spans of which there are [`FOOTPRINT_POINTS`] in the whole: where little of that is accepted (thin sweeps),
+    /// points would else hit or miss it, and the mean of 1 / ∫ is not 1 / the mean.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a hash of the position")]
     fn footprint(&self, position: DVec3, isovalue: f64, normal: Vec3, radius: f64) -> f64 {
         let lattice = self.field.lattice();
         let hash = folded(0, position);
         let points = &self.footprints[(hash >> 60) as usize % FOOTPRINT_SETS];
         let far = lattice.far();
-        let (mut sum, mut accepted, mut tried) = (0.0, 0, 0);
+        // Only the sweep's hyperplanes carry photons.
+        let (lo, hi) = ((isovalue - self.settings.tau).max(0.0), (isovalue + self.settings.tau).min(1.0));
+        let own = radius / (FOOTPRINT_POINTS as f64).cbrt();
+        let (mut sum, mut accepted, mut tried) = (0.0, 0.0, 0);
         for b in points {
             if tried % FOOTPRINT_STEP == 0 && accepted >= FOOTPRINT_ENOUGH {
                 break;
@@ -145,18 +149,52 @@ impl<'a> PhotonPoints<'a> {
             if p.cmplt(DVec3::ZERO).any() || p.cmpgt(far).any() {
                 continue;
             }
-            let h = self.field.value(p);
-            // Only the sweep's hyperplanes carry photons.
-            if !((h - isovalue).abs() <= self.settings.tau && (0.0..=1.0).contains(&h)) {
-                continue;
-            }
-            let g = self.field.gradient(p);
+            let (h, g) = (self.field.value(p), self.field.gradient(p));
             let slope = g.length();
-            if g.dot(normal.as_dvec3()) >= self.settings.cone * slope {
-                sum += (1.0 - b.length_squared()) * slope;
-                accepted += 1;
+            let half = own * slope;
+            let share = match half > 0.0 {
+                true => ((h + half).min(hi) - (h - half).max(lo)) / (2.0 * half),
+                false => f64::from(u8::from((lo..=hi).contains(&h))),
+            };
+            if share > 0.0 && g.dot(normal.as_dvec3()) >= self.settings.cone * slope {
+                sum += (1.0 - b.length_squared()) * slope * share;
+                accepted += share;
             }
         }
         sum * (4.0 / 3.0 * std::f64::consts::PI * radius.powi(3)) / tried as f64
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::Sweep;
+    use crate::scene::{Boundary, Surface, cornell_box};
+    use crate::volume::{Lattice, Samples, Volume};
+
+    /// Planes: of a ball much thicker than the sweep ∫ K |∇h| dV = π r² / 2, and sweeps between two samples fill a part
+    /// of Ω, too.
+    #[test]
+    fn thin_sweeps_have_a_measure() {
+        for width in [0.5, 0.05, 0.005, 5e-5] {
+            let lattice = Lattice::aligned([17; 3], DVec3::ZERO, DVec3::ONE).unwrap();
+            let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[2] as f32).collect();
+            let volume = Volume::new("planes", lattice.clone(), Samples::F32(samples)).unwrap();
+            let field = Field::new(&volume, Sweep::new(8.2, 8.2 + width).unwrap()).unwrap();
+            assert!((field.share_on_sweep() / (width / 16.0) - 1.0).abs() < 1e-3, "{width}");
+            let walls = cornell_box(&lattice, 0.1).unwrap();
+            let scene = Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap();
+            let points = PhotonPoints::new(&scene, &[], |_| true, EstimateSettings { tau: 1.0, ..Default::default() });
+            let radius = 3.0;
+            let exact = 0.5 * std::f64::consts::PI * radius * radius;
+            let mut mean = 0.0;
+            for n in 0..200 {
+                let p = DVec3::new(6.0 + 0.01 * f64::from(n), 8.0, 8.2 + 0.5 * width);
+                let found = points.footprint(p, 0.5, Vec3::Z, radius) / exact;
+                mean += found / 200.0;
+                assert!((found - 1.0).abs() < 0.25, "{width}: {found} of what it is");
+            }
+            assert!((mean - 1.0).abs() < 0.03, "{width}: {mean} of what it is");
+        }
     }
 }

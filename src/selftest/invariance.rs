@@ -276,8 +276,8 @@ fn octants(scene: &Scene, bake: &Bake) -> [f64; 8] {
     means.map(|m| m.mean())
 }
 
-/// Bakes by one engine under every change: the same bits where that is promised, else the same light in every octant by z-tests over
-/// independent seeds at a family-wise level of 1e-3.
+/// Bakes by one engine under every change: the same bits where that is promised, else the same light in every octant by
+/// z-tests over independent seeds at a family-wise level of 1e-3.
 ///
 /// # Errors
 /// From [`bake`].

@@ -38,7 +38,7 @@ fn refused(dir: &Path, args: &[&str], words: &[&str]) {
     }
     let left: Vec<String> = fs::read_dir(dir)
         .unwrap()
-        .map(|e| e.unwrap().file_name().into_string().unwrap())
+        .map(|e| e.unwrap().file_name().to_string_lossy().into_owned())
         .filter(|n| n.contains("out.vti"))
         .collect();
     assert!(left.is_empty(), "{args:?} left {left:?}");

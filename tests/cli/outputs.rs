@@ -80,7 +80,8 @@ fn a_pipe_that_nobody_reads_is_no_fault() {
     assert!(output.status.success() && output.stderr.is_empty(), "{}", text(&output.stderr));
 }
 
-/// Names of walls may hold what XML cannot, paths what JSON cannot, and scripts name ends of sweeps by all their digits.
+/// Names of walls may hold what XML cannot, paths what JSON cannot, and scripts name ends of sweeps by all their
+/// digits.
 #[test]
 fn bakes_open_whatever_their_names_and_numbers_are() {
     let dir = Folder::new();
