@@ -299,6 +299,11 @@ impl ElementType {
         }
     }
 
+    /// Bytes of `count` elements, `u64::MAX` if there are more.
+    pub fn bytes(self, count: usize) -> u64 {
+        (count as u64).saturating_mul(self.size() as u64)
+    }
+
     /// The name used on the command line and in messages: `u8`, `i16`, `f32` …
     pub fn name(self) -> &'static str {
         match self {

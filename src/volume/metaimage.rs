@@ -157,7 +157,7 @@ impl<'a> Fields<'a> {
             "LOCAL" | "Local" | "local" => (self.path.to_path_buf(), self.length),
             _ => (self.beside(DATA_FILE, name)?, 0),
         };
-        let promised = (count as u64).saturating_mul(element.size() as u64);
+        let promised = element.bytes(count);
         let compressed = self.flag(&["CompressedData"])?;
         let skip: i64 = self.numbers("HeaderSize", 1)?.map_or(0, |v| v[0]);
         let start = match u64::try_from(skip) {

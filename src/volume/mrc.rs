@@ -68,7 +68,7 @@ pub fn read(path: &Path) -> Result<Volume> {
     let extended = u64::try_from(header.int(24))
         .map_err(|_| Error::invalid(path, format!("NSYMBT (word 24) is {}; it is a length", header.int(24))))?;
     let section = Section { start: 0, packing, skip: HEADER as u64 + extended };
-    let promised = (lattice.len() as u64).saturating_mul(element.size() as u64);
+    let promised = element.bytes(lattice.len());
     let samples = Samples::from_vec(files::read_section(path, section, promised)?, element, header.endian);
     let samples = match samples {
         Samples::U16(v) if half => Samples::F32(v.into_iter().map(|b| half::f16::from_bits(b).to_f32()).collect()),

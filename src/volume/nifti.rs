@@ -63,7 +63,7 @@ pub fn read(path: &Path) -> Result<Volume> {
             return Err(Error::invalid(path, format!("vox_offset is {v}; the samples start at byte {DATA} or later")));
         }
     };
-    let promised = (lattice.len() as u64).saturating_mul(element.size() as u64);
+    let promised = element.bytes(lattice.len());
     let bytes = files::read_section(path, Section { start: 0, packing, skip: skip as u64 }, promised)?;
     let endian = match header.endianness {
         Endianness::Little => Endian::Little,

@@ -66,7 +66,7 @@ pub fn read(path: &Path) -> Result<Volume> {
         )
     })?;
     let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::ONE).map_err(|e| e.in_file(path))?;
-    let promised = (lattice.len() as u64).saturating_mul(header.element.size() as u64);
+    let promised = header.element.bytes(lattice.len());
     let bytes = files::read_section(path, behind(from + length), promised)?;
     let samples = match Samples::from_vec(bytes, header.element, header.endian) {
         Samples::U16(v) if header.half => {

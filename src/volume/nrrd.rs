@@ -362,7 +362,7 @@ impl<'a> Fields<'a> {
             self.get(key).map_or(Ok(0), |v| v.parse().map_err(|_| self.wrong(key, "it must be a whole number")))
         };
         let start = start + skip_lines(&path, start, number("lineskip")?)?;
-        let promised = (count as u64).saturating_mul(element.size() as u64);
+        let promised = element.bytes(count);
         let skip = match number("byteskip")? {
             n if n >= 0 => n as u64,
             // -1: the samples are the end of the file.

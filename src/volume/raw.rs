@@ -36,7 +36,7 @@ impl RawLayout {
     /// `Io`; `Invalid` if the length differs, a gzip stream is damaged or the lattice is degenerate.
     pub fn read(&self, path: &Path) -> Result<Volume> {
         let lattice = Lattice::aligned(self.dims, self.origin, self.spacing).map_err(|e| e.in_file(path))?;
-        let bytes = (lattice.len() as u64).saturating_mul(self.element.size() as u64);
+        let bytes = self.element.bytes(lattice.len());
         let [nx, ny, nz] = self.dims;
         let wanted = bytes.saturating_add(self.header_bytes);
         let extension = path.extension().map(|e| format!(".{}", e.to_string_lossy().to_ascii_lowercase()));
