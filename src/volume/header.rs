@@ -106,3 +106,13 @@ impl<'a> Header<'a> {
         Ok(self.path.parent().map_or_else(|| PathBuf::from(name), |p| p.join(name)))
     }
 }
+
+/// Bytes between `start` and the samples where these, `promised` bytes, are the end of the file.
+///
+/// # Errors
+/// `Io`; `Invalid` if there are fewer.
+pub(super) fn before_last(path: &Path, start: u64, promised: u64) -> Result<u64> {
+    let stored = files::length(path)?.saturating_sub(start);
+    let short = || Error::invalid(path, format!("{promised} bytes of samples promised, {stored} found"));
+    stored.checked_sub(promised).ok_or_else(short)
+}

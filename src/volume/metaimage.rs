@@ -5,7 +5,7 @@
 
 use crate::error::{Error, Result};
 use crate::files::{self, Packing, Section};
-use crate::volume::header::{Header, Line};
+use crate::volume::header::{Header, Line, before_last};
 use crate::volume::{ElementType, Endian, Lattice, Samples, Volume, ascii};
 use glam::{DMat3, DVec3};
 use std::path::{Path, PathBuf};
@@ -166,12 +166,7 @@ impl<'a> Fields<'a> {
             Ok(bytes) if bytes >= behind => bytes,
             Ok(_) => return Err(self.wrong("HeaderSize", &format!("the header alone has {behind} bytes"))),
             // −1: the samples are the end of the file.
-            Err(_) if skip == -1 && !compressed => {
-                let stored = files::length(&path)?;
-                stored.checked_sub(promised).ok_or_else(|| {
-                    Error::invalid(&path, format!("{promised} bytes of samples promised, {stored} found"))
-                })?
-            }
+            Err(_) if skip == -1 && !compressed => before_last(&path, 0, promised)?,
             Err(_) => {
                 let wanted = "it must not be negative (−1 is for samples that are not compressed)";
                 return Err(self.wrong("HeaderSize", wanted));

@@ -5,7 +5,7 @@
 
 use crate::error::{Error, Result};
 use crate::files::{self, Packing, Section};
-use crate::volume::header::{Header, Line};
+use crate::volume::header::{Header, Line, before_last};
 use crate::volume::plane::Plane;
 use crate::volume::vti::SamplesRef;
 use crate::volume::{ElementType, Endian, Lattice, Samples, Space, Volume, ascii};
@@ -366,12 +366,7 @@ impl<'a> Fields<'a> {
         let skip = match number("byteskip")? {
             n if n >= 0 => n as u64,
             // -1: the samples are the end of the file.
-            -1 if encoding == "raw" => {
-                let stored = files::length(&path)?.saturating_sub(start);
-                stored.checked_sub(promised).ok_or_else(|| {
-                    Error::invalid(&path, format!("{promised} bytes of samples promised, {stored} found"))
-                })?
-            }
+            -1 if encoding == "raw" => before_last(&path, start, promised)?,
             _ => return Err(self.wrong("byteskip", "it must not be negative (-1 is for the raw encoding only)")),
         };
         if matches!(encoding.as_str(), "ascii" | "text" | "txt") {
