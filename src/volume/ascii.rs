@@ -1,6 +1,19 @@
 //! Samples written as text, as NRRD and VTK do.
 
+use crate::error::{Error, Result};
+use crate::files;
 use crate::volume::{ElementType, Samples};
+use std::path::Path;
+
+/// [`parse`] of what a file holds from byte `start` on.
+///
+/// # Errors
+/// `Io`; `Invalid` with what [`parse`] says.
+pub(super) fn read(path: &Path, start: u64, element: ElementType, count: usize) -> Result<Samples> {
+    let text = files::read(path)?;
+    let start = usize::try_from(start).unwrap_or(usize::MAX).min(text.len());
+    parse(&text[start..], element, count).map_err(|e| Error::invalid(path, e))
+}
 
 /// Parses exactly `count` numbers separated by white space or commas.
 ///

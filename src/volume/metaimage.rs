@@ -182,9 +182,7 @@ impl<'a> Fields<'a> {
             Packing::Plain
         };
         if self.get("BinaryData").is_some() && !self.flag(&["BinaryData"])? {
-            let text = files::read(&path)?;
-            let from = usize::try_from(start).unwrap_or(usize::MAX).min(text.len());
-            return ascii::parse(&text[from..], element, count).map_err(|e| Error::invalid(&path, e));
+            return ascii::read(&path, start, element, count);
         }
         let msb = self.flag(&["BinaryDataByteOrderMSB", "ElementByteOrderMSB"])?;
         let bytes = files::read_section(&path, Section { start, packing, skip: 0 }, promised)?;

@@ -370,9 +370,7 @@ impl<'a> Fields<'a> {
             _ => return Err(self.wrong("byteskip", "it must not be negative (-1 is for the raw encoding only)")),
         };
         if matches!(encoding.as_str(), "ascii" | "text" | "txt") {
-            let text = files::read(&path)?;
-            let from = usize::try_from(start.saturating_add(skip)).unwrap_or(usize::MAX).min(text.len());
-            return ascii::parse(&text[from..], element, count).map_err(|e| Error::invalid(&path, e));
+            return ascii::read(&path, start.saturating_add(skip), element, count);
         }
         let endian = match self.get("endian").map(str::to_ascii_lowercase).as_deref() {
             Some("little") => Endian::Little,
