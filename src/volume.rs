@@ -289,6 +289,10 @@ macro_rules! each_sample_type {
 pub(crate) use each_sample_type;
 
 impl ElementType {
+    /// Every one.
+    const ALL: [Self; 10] =
+        [Self::U8, Self::I8, Self::U16, Self::I16, Self::U32, Self::I32, Self::U64, Self::I64, Self::F32, Self::F64];
+
     /// Bytes per element.
     pub fn size(self) -> usize {
         match self {
@@ -322,10 +326,7 @@ impl ElementType {
 
     /// The type of a [`ElementType::name`].
     pub fn from_name(name: &str) -> Option<Self> {
-        use ElementType as T;
-        [T::U8, T::I8, T::U16, T::I16, T::U32, T::I32, T::U64, T::I64, T::F32, T::F64]
-            .into_iter()
-            .find(|t| t.name() == name)
+        Self::ALL.into_iter().find(|t| t.name() == name)
     }
 }
 

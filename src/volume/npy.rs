@@ -77,6 +77,11 @@ pub fn read(path: &Path) -> Result<Volume> {
     Volume::new(path.display().to_string(), lattice, samples)
 }
 
+/// What a `descr` calls a type, behind the byte order: the letter of its name and its bytes.
+fn descr_of(element: ElementType) -> String {
+    format!("{}{}", &element.name()[..1], element.size())
+}
+
 /// The Python dictionary `{'descr': '<f4', 'fortran_order': False, 'shape': (3, 4, 5), }`.
 fn parse_header(text: &str) -> Result<Header> {
     let shown: String = text.trim_end().chars().take(120).map(|c| if c.is_control() { ' ' } else { c }).collect();
@@ -97,24 +102,17 @@ fn parse_header(text: &str) -> Result<Header> {
         [order @ (b'<' | b'>' | b'|' | b'='), ..] => (*order, &descr[1..]),
         _ => (b'|', descr),
     };
-    let (element, half) = match kind {
-        "u1" | "b1" => (ElementType::U8, false),
-        "i1" => (ElementType::I8, false),
-        "u2" => (ElementType::U16, false),
-        "i2" => (ElementType::I16, false),
-        "u4" => (ElementType::U32, false),
-        "i4" => (ElementType::I32, false),
-        "u8" => (ElementType::U64, false),
-        "i8" => (ElementType::I64, false),
-        "f2" => (ElementType::U16, true),
-        "f4" => (ElementType::F32, false),
-        "f8" => (ElementType::F64, false),
-        _ => {
-            return Err(Error::NotSupported(format!(
-                "descr '{descr}': integers, booleans and floats of 16 to 64 bits are read; convert it with .astype('f4')"
-            )));
-        }
+    let half = kind == "f2";
+    let element = match kind {
+        "b1" => Some(ElementType::U8),
+        "f2" => Some(ElementType::U16),
+        _ => ElementType::ALL.into_iter().find(|&e| descr_of(e) == kind),
     };
+    let element = element.ok_or_else(|| {
+        Error::NotSupported(format!(
+            "descr '{descr}': integers, booleans and floats of 16 to 64 bits are read; convert it with .astype('f4')"
+        ))
+    })?;
     let fortran = match value("fortran_order")? {
         v if v.starts_with("True") => true,
         v if v.starts_with("False") => false,
@@ -140,22 +138,12 @@ fn parse_header(text: &str) -> Result<Header> {
 /// `Invalid` if the count is not the lattice's samples × `components`; `Io`.
 pub fn write(path: &Path, lattice: &Lattice, components: usize, values: SamplesRef<'_>) -> Result<()> {
     values.check(lattice, components).map_err(|e| Error::invalid(path, e))?;
-    let kind = match values.element_type() {
-        ElementType::U8 => "|u1",
-        ElementType::I8 => "|i1",
-        ElementType::U16 => "<u2",
-        ElementType::I16 => "<i2",
-        ElementType::U32 => "<u4",
-        ElementType::I32 => "<i4",
-        ElementType::U64 => "<u8",
-        ElementType::I64 => "<i8",
-        ElementType::F32 => "<f4",
-        ElementType::F64 => "<f8",
-    };
+    let element = values.element_type();
+    let order = if element.size() == 1 { '|' } else { '<' };
     let [nx, ny, nz] = lattice.dims();
     let shape =
         if components == 1 { format!("({nz}, {ny}, {nx})") } else { format!("({nz}, {ny}, {nx}, {components})") };
-    let mut head = format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}");
+    let mut head = format!("{{'descr': '{order}{}', 'fortran_order': False, 'shape': {shape}, }}", descr_of(element));
     // The samples begin at a multiple of 64 bytes.
     let length = (10 + head.len() + 1).next_multiple_of(64) - 10;
     head.extend(std::iter::repeat_n(' ', length - 1 - head.len()));
