@@ -20,6 +20,7 @@ use crate::atomic;
 use crate::embree::Device;
 use crate::error::{Error, Result};
 use crate::export::bake_file::BakeSummary;
+use crate::files;
 use crate::isa::Isa;
 use crate::progress::{Progress, say, unless_interrupted};
 use crate::scene_file::{self, Inputs, ReadOptions};
@@ -267,7 +268,7 @@ fn device() -> Result<Device> {
 impl Info {
     fn run(self) -> Result<()> {
         one_frame(&self.file)?;
-        let vti = !self.read.raw.given() && self.file.extension().is_some_and(|e| e.eq_ignore_ascii_case("vti"));
+        let vti = !self.read.raw.given() && files::has_extension(&self.file, "vti");
         let mut array = None;
         let (volume, bake) = if vti {
             let file = VtiFile::read(&self.file)?;

@@ -11,6 +11,7 @@ pub mod slices;
 pub mod vtp;
 
 use crate::error::{Error, Result};
+use crate::files;
 use crate::volume::Space;
 use glam::{DVec3, Vec3};
 use std::path::Path;
@@ -54,7 +55,7 @@ impl Mesh<'_> {
     /// # Errors
     /// `NotSupported` for another extension, or what the format's writer returns.
     pub fn write(&self, path: &Path) -> Result<()> {
-        match path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase().as_str() {
+        match files::extension(path).as_str() {
             "ply" => ply::write(path, self),
             "obj" => obj::write(path, self),
             "glb" => glb::write(path, self),

@@ -47,6 +47,16 @@ pub(crate) struct Section {
     pub(crate) skip: u64,
 }
 
+/// The extension of a path in lower case, empty without one.
+pub(crate) fn extension(path: &Path) -> String {
+    path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase()
+}
+
+/// Whether a path has an `extension`, in whatever case.
+pub(crate) fn has_extension(path: &Path, extension: &str) -> bool {
+    path.extension().is_some_and(|e| e.eq_ignore_ascii_case(extension))
+}
+
 /// Opens a file for reading.
 ///
 /// # Errors

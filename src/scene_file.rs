@@ -385,7 +385,7 @@ fn suggested(volume: &Volume) -> Result<[f64; 2]> {
 
 /// The scene file that `input` is or stands for, its text if it is one, and where its paths begin.
 fn parse(input: &Path) -> Result<(Option<Source>, SceneFile, PathBuf)> {
-    if input.extension().is_some_and(|e| e.eq_ignore_ascii_case("toml")) {
+    if files::has_extension(input, "toml") {
         let source = Source::read(input)?;
         let file = source.parse()?;
         return Ok((Some(source), file, input.parent().unwrap_or(Path::new("")).to_path_buf()));

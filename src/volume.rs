@@ -22,6 +22,7 @@ pub use space::Space;
 
 use crate::digits::Shortest;
 use crate::error::{Error, Result};
+use crate::files;
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 use std::path::Path;
@@ -525,8 +526,7 @@ impl Volume {
     /// As [`Volume::write`].
     pub fn write_with_notes(&self, path: impl AsRef<Path>, notes: &[(String, String)]) -> Result<()> {
         let path = path.as_ref();
-        let extension = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
-        match extension.as_str() {
+        match files::extension(path).as_str() {
             "vti" => {
                 let writer = vti::VtiWriter::new(&self.lattice)
                     .point_data("value", 1, &self.samples)

@@ -74,7 +74,7 @@ pub(super) struct Bake {
 impl Bake {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
         let begun = Clock::start();
-        let found = self.output.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        let found = files::extension(&self.output);
         if ["nrrd", "npy", "exr"].contains(&found.as_str()) {
             return Err(Error::invalid(
                 &self.output,
@@ -232,7 +232,7 @@ impl Bake {
 
     /// Refuses an output that is for another number of volumes, and one that could not be written.
     fn check_volumes(&self, scene: &Scene) -> Result<()> {
-        let extension = self.output.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        let extension = files::extension(&self.output);
         match (scene.fields(), extension.as_str()) {
             (1, "vtm") => {
                 Err(Error::invalid(&self.output, "is for several volumes that sweep, the scene has one; name a .vti"))

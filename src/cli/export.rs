@@ -3,6 +3,7 @@
 use super::{expect_extension, one_frame, outputs};
 use crate::error::{Error, Result};
 use crate::export::{bake_file, slices};
+use crate::files;
 use crate::progress::{Progress, say, unless_interrupted};
 use crate::scene_file::{Inputs, PlaceOptions, RawOptions, ReadOptions};
 use crate::volume::vti::{self, VtiFile, VtiWriter};
@@ -52,7 +53,7 @@ impl Export {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
         expect_extension(&self.output, &["nrrd", "npy", "exr", "vti"])?;
         one_frame(&self.input)?;
-        let extension = self.output.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        let extension = files::extension(&self.output);
         if let (Some(space), "npy" | "exr") = (&self.space, extension.as_str()) {
             return Err(Error::invalid(
                 &self.output,
@@ -101,12 +102,12 @@ impl Export {
     }
 
     fn load(&self) -> Result<Array> {
-        let is_vti = self.input.extension().is_some_and(|e| e.eq_ignore_ascii_case("vti"));
+        let is_vti = files::has_extension(&self.input, "vti");
         if is_vti && !self.raw.given() {
             let array = array_of(&self.input, self.array.as_deref())?;
             return Ok(Array { lattice: self.place.of(array.lattice, &self.input)?, ..array });
         }
-        let is_vtk = self.input.extension().is_some_and(|e| e.eq_ignore_ascii_case("vtk"));
+        let is_vtk = files::has_extension(&self.input, "vtk");
         if let Some(name) = self.array.as_deref().filter(|n| !is_vtk && *n != "value") {
             return Err(Error::invalid(
                 &self.input,

@@ -6,6 +6,7 @@ use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
 use crate::export::{Mesh, ply};
 use crate::field::{Field, Sweep};
+use crate::files;
 use crate::progress::{Progress, say, unless_interrupted};
 use crate::reference::Origin;
 use crate::scene::Scene;
@@ -104,7 +105,7 @@ impl Extract {
         let space = volume.map(|v| v.space).or_else(|| baked.as_ref().map(|b| b.space));
         let lit = Mesh { colours: colours.as_deref(), space, ..mesh.export(&properties) };
         // Where it can be said, for compare.
-        match baked.is_some() && self.output.extension().is_some_and(|e| e.eq_ignore_ascii_case("ply")) {
+        match baked.is_some() && files::has_extension(&self.output, "ply") {
             true => ply::write_with_comments(&self.output, &lit, &[Origin::comment_of_bake(self.isovalue)])?,
             false => lit.write(&self.output)?,
         }
@@ -158,10 +159,9 @@ fn around(volume: &Volume, sweep: Sweep, isovalue: f64) -> Option<Field> {
 
 /// The bake in a `.vti` or `.vtm`, if it is one; it takes no scene from `options`.
 pub(super) fn open_bake(path: &Path, options: &SceneOptions) -> Result<Option<BakedVolume>> {
-    let is = |extension: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(extension));
     let baked = match () {
-        () if is("vtm") => BakedVolume::read(path).map(Some),
-        () if is("vti") && !is_pattern(path) => BakedVolume::try_read(path),
+        () if files::has_extension(path, "vtm") => BakedVolume::read(path).map(Some),
+        () if files::has_extension(path, "vti") && !is_pattern(path) => BakedVolume::try_read(path),
         () => Ok(None),
     }?;
     match options.first_given().filter(|_| baked.is_some()) {

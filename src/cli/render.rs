@@ -7,6 +7,7 @@ use super::{device, expect_extension, outputs};
 use crate::digits::Shortest;
 use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
+use crate::files;
 use crate::final_gather::FinalGatherSettings;
 use crate::progress::{Progress, say};
 use crate::render::{Camera, Rendered, Shading, render};
@@ -144,7 +145,7 @@ impl Render {
         };
         let camera = self.camera(scene)?;
         let exposure = source.exposure() * self.exposure;
-        let exr = self.output.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr"));
+        let exr = files::has_extension(&self.output, "exr");
         #[allow(clippy::cast_possible_truncation, reason = "a brightness")]
         let brightness = exposure as f32;
         let storable = exr || (brightness > 0.0 && brightness.is_finite());

@@ -380,7 +380,7 @@ impl BakedVolume {
     /// # Errors
     /// `Io`; `Invalid` if the file is no bake or is damaged.
     pub fn read(path: &Path) -> Result<Self> {
-        if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("vtm")) {
+        if files::has_extension(path, "vtm") {
             let fields = multi_block::read(path)?.iter().map(|file| Self::one(file)).collect::<Result<Vec<_>>>()?;
             let job = |bake: &Self| bake.report.get("job").cloned();
             if fields.iter().any(|bake| job(bake) != job(&fields[0])) {
@@ -388,9 +388,9 @@ impl BakedVolume {
             }
             return Self::seen_from(fields, 0).map_err(|e| e.in_file(path));
         }
-        if !path.extension().is_some_and(|e| e.eq_ignore_ascii_case("vti")) {
+        if !files::has_extension(path, "vti") {
             std::fs::metadata(path).map_err(|e| Error::io(path, e))?;
-            if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("pvd")) {
+            if files::has_extension(path, "pvd") {
                 return Err(Error::invalid(path, "is a series of bakes; name one of its .vti"));
             }
             return Err(Error::invalid(path, "is no bake (.vti, .vtm); make one with `isolume bake`"));

@@ -99,7 +99,7 @@ impl HeightField {
     /// # Errors
     /// `Io`, `Invalid` or `NotSupported` with the file's name.
     pub fn open(path: &Path, sweep: Option<Sweep>) -> Result<Self> {
-        let (dims, origin, spacing, values) = if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("png")) {
+        let (dims, origin, spacing, values) = if files::has_extension(path, "png") {
             read_png(path)?
         } else if let Some(plane) = Plane::open(path)? {
             let values = (0..plane.samples.len()).map(|o| plane.samples.get(o)).collect();

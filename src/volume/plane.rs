@@ -1,6 +1,7 @@
 //! A flat field as its file gives it: what `isolume flatland` takes for h₂.
 
 use crate::error::{Error, Result};
+use crate::files;
 use crate::volume::{Samples, nrrd, vti};
 use std::path::Path;
 
@@ -22,7 +23,7 @@ impl Plane {
     /// # Errors
     /// What the format's reader returns.
     pub fn open(path: &Path) -> Result<Option<Self>> {
-        match path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase().as_str() {
+        match files::extension(path).as_str() {
             "nrrd" | "nhdr" => nrrd::read_plane(path),
             "vti" => vti::read_plane(path),
             _ => Ok(None),

@@ -35,7 +35,7 @@ const TEXT_LIMIT: usize = 16 << 20;
 /// for pages that differ, for colours, series of channels or times, other numbers or orders of pages than OME's text
 /// tells, and for pages that are stored mirrored or turned (upside down is read).
 pub fn read(path: &Path) -> Result<Volume> {
-    if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("zip")) {
+    if files::has_extension(path, "zip") {
         decode(Cursor::new(unzip(path)?), path)
     } else {
         decode(BufReader::new(files::open(path)?), path)
