@@ -71,22 +71,34 @@ pub enum Held {
 pub struct Saved<'a> {
     checkpoint: Option<&'a Checkpoint>,
     number: u32,
+    /// The number in the stage of what is block 0 here.
+    first: usize,
 }
 
 impl Saved<'_> {
     /// Of a stage that nobody saves.
-    pub const NOWHERE: Saved<'static> = Saved { checkpoint: None, number: 0 };
+    pub const NOWHERE: Saved<'static> = Saved { checkpoint: None, number: 0, first: 0 };
+
+    /// The same stage, its blocks counted from number `first` on.
+    #[must_use]
+    pub fn starting_at(self, first: usize) -> Self {
+        Self { first, ..self }
+    }
+
+    fn key(&self, block: usize) -> Key {
+        (self.number, (self.first + block) as u64)
+    }
 
     /// A finished block, if it was saved with exactly `length` bytes.
     pub fn load(&self, block: usize, length: usize) -> Option<Vec<u8>> {
         let state = self.checkpoint?.state.lock().ok()?;
-        state.load((self.number, block as u64)).filter(|b| b.len() == length)
+        state.load(self.key(block)).filter(|b| b.len() == length)
     }
 
     /// What `parse` makes of a saved block, if there is one.
     pub fn read<T>(&self, block: usize, parse: impl FnOnce(&[u8]) -> T) -> Option<T> {
         let state = self.checkpoint?.state.lock().ok()?;
-        state.load((self.number, block as u64)).map(|bytes| parse(&bytes))
+        state.load(self.key(block)).map(|bytes| parse(&bytes))
     }
 
     /// Whether the file is to be written as soon as something is saved: the time to save what is large.
@@ -97,7 +109,7 @@ impl Saved<'_> {
     /// Keeps a finished block, in place of an earlier one; `bytes` is asked for only if there is a checkpoint.
     pub fn save(&self, block: usize, bytes: impl FnOnce() -> Vec<u8>) {
         if let Some(checkpoint) = self.checkpoint {
-            let key = (self.number, block as u64);
+            let key = self.key(block);
             // Never both: a block may be as large as the work itself. The file holds the earlier one.
             if let Ok(mut state) = checkpoint.state.lock() {
                 state.drop_waiting(key);
@@ -188,7 +200,7 @@ impl Checkpoint {
 
     /// Stage `number` of the job.
     pub fn stage(&self, number: u32) -> Saved<'_> {
-        Saved { checkpoint: Some(self), number }
+        Saved { checkpoint: Some(self), number, first: 0 }
     }
 
     /// Blocks held.
@@ -317,6 +329,7 @@ mod tests {
         let again = Checkpoint::new(&path, job(1), Duration::ZERO).unwrap();
         assert!(again.resume().unwrap());
         assert_eq!(again.stage(1).load(7, 3), Some(vec![1, 2, 3]));
+        assert_eq!(again.stage(1).starting_at(5).load(2, 3), Some(vec![1, 2, 3]));
         assert_eq!(
             (again.stage(1).load(7, 4), again.stage(1).load(8, 3), Saved::NOWHERE.load(7, 3)),
             (None, None, None)

@@ -112,7 +112,7 @@ impl<T: Tracer> Sampler<'_, T> {
     /// returning false stops early.
     pub fn samples(&self, positions: &[Vec3], tick: Tick) -> RadianceSamples {
         let place = |n: usize| (n as u64, positions[n]);
-        sample_places(self, positions.len(), &place, Saved::NOWHERE, 0, tick)
+        sample_places(self, positions.len(), &place, Saved::NOWHERE, tick)
     }
 
     /// The sample at `position`, its random numbers keyed by `key`; `None` where ∇h vanishes, no light between a
@@ -193,13 +193,12 @@ impl<T: Tracer> Sampler<'_, T> {
 pub const BLOCK: usize = 1024;
 
 /// As [`Sampler::samples`], at places given by number with the keys of their random numbers. Blocks are kept in `saved`
-/// and looked for there; `first` is the number of the first.
+/// and looked for there.
 pub fn sample_places<T: Tracer>(
     sampler: &Sampler<'_, T>,
     count: usize,
     place: &(dyn Fn(usize) -> (u64, Vec3) + Sync),
     saved: Saved<'_>,
-    first: usize,
     tick: Tick,
 ) -> RadianceSamples {
     let (rays, misses) = (AtomicU64::new(0), AtomicU64::new(0));
@@ -209,7 +208,7 @@ pub fn sample_places<T: Tracer>(
             return;
         }
         let places: Vec<(u64, Vec3)> = (n * BLOCK..n * BLOCK + out.len()).map(place).collect();
-        let counts = sampler.block(&places, out, saved, first + n);
+        let counts = sampler.block(&places, out, saved, n);
         rays.fetch_add(counts[0], Ordering::Relaxed);
         misses.fetch_add(counts[1], Ordering::Relaxed);
         tick(out.len() as u64);

@@ -126,13 +126,11 @@ pub struct NodeBand<'a> {
     pub range: RangeInclusive<f32>,
     /// Where blocks of the nodes of each side (lower, higher) are kept and looked for.
     pub saved: [Saved<'a>; 2],
-    /// The number of the first of these blocks.
-    pub first: usize,
 }
 
 impl NodeBand<'_> {
     /// The whole sweep, kept nowhere.
-    pub const WHOLE: Self = NodeBand { range: 0.0..=1.0, saved: [Saved::NOWHERE; 2], first: 0 };
+    pub const WHOLE: Self = NodeBand { range: 0.0..=1.0, saved: [Saved::NOWHERE; 2] };
 }
 
 /// Isovalues beyond a band, in units of the sweep, whose cells a hit may be rounded into.
@@ -183,7 +181,7 @@ impl RadianceCache {
         tracer: &T,
         source: &NodePhotons<'_>,
         settings: &CacheSettings,
-        NodeBand { range: band, saved, first }: NodeBand<'_>,
+        NodeBand { range: band, saved }: NodeBand<'_>,
         tick: Tick,
     ) {
         let rays = AtomicU64::new(0);
@@ -195,7 +193,7 @@ impl RadianceCache {
         if let Some(old) = &mut old {
             old.sides = Nodes::default();
         }
-        let fill = Fill { scene, tracer, settings, filled: &filled, stored: &stored, first, tick, rays: &rays };
+        let fill = Fill { scene, tracer, settings, filled: &filled, stored: &stored, tick, rays: &rays };
         let mut light = Nodes::default();
         let sides = [Side::Lower, Side::Higher].map(|side| {
             let before = old.as_mut().and_then(|old| old.filled[side.index()].take());
@@ -364,7 +362,6 @@ struct Fill<'a, T> {
     settings: &'a CacheSettings,
     filled: &'a NodeSet,
     stored: &'a NodeSet,
-    first: usize,
     tick: Tick<'a>,
     rays: &'a AtomicU64,
 }
@@ -401,8 +398,7 @@ impl<T: Tracer> Fill<'_, T> {
             if new.is_empty() {
                 return;
             }
-            let block = self.first + row;
-            if let Some(bytes) = saved.load(block, 8 + 12 * new.len()) {
+            if let Some(bytes) = saved.load(row, 8 + 12 * new.len()) {
                 let (traced, values) = bytes.split_first_chunk().expect("8 bytes and more");
                 self.rays.fetch_add(u64::from_le_bytes(*traced), Ordering::Relaxed);
                 let mut numbers = values.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b));
@@ -415,7 +411,7 @@ impl<T: Tracer> Fill<'_, T> {
                     out[slot(o)] = self.node(o, side, map, &mut scratch, &mut traced);
                 }
                 self.rays.fetch_add(traced, Ordering::Relaxed);
-                saved.save(block, || {
+                saved.save(row, || {
                     let values = new.iter().flat_map(|&o| out[slot(o)]).flat_map(f32::to_le_bytes);
                     traced.to_le_bytes().into_iter().chain(values).collect()
                 });

@@ -180,7 +180,7 @@ impl<'a> GridPoints<'a> {
             Some(halves) => self.set.split(halves, BLOCK),
             None => (0..blocks(self.lattice)).map(|_| &mut [][..]).collect(),
         };
-        let first = band.number * blocks(self.lattice);
+        let saved = saved.starting_at(band.number * blocks(self.lattice));
         let rows = grid.radiance.par_chunks_mut(BLOCK).zip(grid.std_error.par_chunks_mut(BLOCK));
         let direct: Vec<&mut [[f32; 3]]> = match direct {
             Some(direct) => direct.chunks_mut(BLOCK).collect(),
@@ -201,7 +201,7 @@ impl<'a> GridPoints<'a> {
                 };
                 let places: Vec<(u64, Vec3)> = own.iter().map(place).collect();
                 let mut samples = vec![None; own.len()];
-                let [rays, misses] = sampler.block(&places, &mut samples, saved, first + block);
+                let [rays, misses] = sampler.block(&places, &mut samples, saved, block);
                 let before = self.set.before(start);
                 for (&o, s) in own.iter().zip(&samples) {
                     let Some(s) = s else { continue };
@@ -387,7 +387,7 @@ impl<'a> Beside<'a> {
         vec![BesideLight::NONE; self.len()]
     }
 
-    /// Samples the places of a band; `first` is the number of its first block.
+    /// Samples the places of a band.
     #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32; places below 2³²")]
     pub(super) fn sample<T: Tracer>(
         &self,
@@ -407,8 +407,8 @@ impl<'a> Beside<'a> {
             let number = (1..STAND_INS).take_while(|&k| n >= k && self.owners[n - k] == owner).count();
             (STAND_INS as u64 * owner + number as u64, self.positions[n])
         };
-        let first = band.number * self.len().div_ceil(BLOCK);
-        let sampled = sample_places(sampler, own.len(), &place, saved, first, tick);
+        let saved = saved.starting_at(band.number * self.len().div_ceil(BLOCK));
+        let sampled = sample_places(sampler, own.len(), &place, saved, tick);
         for (&n, s) in own.iter().zip(&sampled.samples) {
             if let Some(RadianceSample { radiance, variance, indirect, indirect_variance, direct, .. }) = *s {
                 let halves = Packed::new(indirect);

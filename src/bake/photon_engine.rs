@@ -87,9 +87,9 @@ pub(super) fn light(jobs: &[Job], context: Context) -> Result<Lit> {
         let begun = Instant::now();
         let clock = Clock::start();
         for ((job, tracer), source) in jobs.iter().zip(&tracers).zip(&sources).filter(|_| gather) {
-            let saved = context.saved(job.number, 0);
             let first = band.number * RadianceCache::blocks(&job.scene);
-            let nodes = NodeBand { range: band.range(), saved, first };
+            let saved = context.saved(job.number, 0).map(|saved| saved.starting_at(first));
+            let nodes = NodeBand { range: band.range(), saved };
             cache.fill(&job.scene, tracer, source, &cache_settings, nodes, &|n| stage.tick(n * node));
         }
         lit.spend(clock, |s| &mut s.cache);
@@ -226,9 +226,9 @@ impl<'a> FieldLight<'a> {
                 (Places::Scattered(at), _) => {
                     let isovalue = |p: Vec3| (scene.field.value(p.as_dvec3()) as f32).clamp(0.0, 1.0);
                     let own: Vec<usize> = (0..at.len()).filter(|&n| band.holds(isovalue(at[n]))).collect();
-                    let first = band.number * at.len().div_ceil(BLOCK);
+                    let saved = saved(2).starting_at(band.number * at.len().div_ceil(BLOCK));
                     let place = |n: usize| (own[n] as u64, at[own[n]]);
-                    let got = sample_places(&sampler, own.len(), &place, saved(2), first, &|n| tick(n * each));
+                    let got = sample_places(&sampler, own.len(), &place, saved, &|n| tick(n * each));
                     counts += Counts::from(&got);
                     own.iter().zip(got.samples).for_each(|(&n, s)| scattered[n] = s);
                 }

@@ -90,7 +90,7 @@ pub(super) fn light(Job { number, scene, lattice, masks }: &Job, context: Contex
         let sampler = Sampler { indirect: &indirect, shadow_rays, ..sampler };
         // Keys of a point beside; none of these is one.
         let place = |n: usize| ((STAND_INS * near[n]) as u64, local_position(&scene.field, lattice, near[n]).as_vec3());
-        let sampled = sample_places(&sampler, near.len(), &place, Saved::NOWHERE, 0, &|n| stage.tick(n));
+        let sampled = sample_places(&sampler, near.len(), &place, Saved::NOWHERE, &|n| stage.tick(n));
         lit.counts += Counts::from(&sampled);
         let mut grid = swept_grid((&own, masks), outgoing(scene, &own, s.irradiance), s.std_error);
         for (&o, sample) in near.iter().zip(&sampled.samples) {
