@@ -5,7 +5,6 @@ use super::bands::Band;
 use crate::brdf::reflected;
 use crate::checkpoint::Saved;
 use crate::direct::{luminance, luminous_reflectance};
-use crate::field::Field;
 use crate::fitted_grid::{FitSample, GridFit, draws};
 use crate::flattened::Side;
 use crate::illumination_grid::IlluminationGrid;
@@ -21,7 +20,7 @@ use crate::volume::Lattice;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use std::f64::consts::PI;
-use std::ops::AddAssign;
+use std::ops::{AddAssign, Range};
 
 /// Places around a point without a level set of its own.
 pub(super) const STAND_INS: usize = 4;
@@ -60,7 +59,7 @@ impl From<&RadianceSamples> for Counts {
 
 /// The points of a grid that hold light of their own level set.
 pub(super) struct GridPoints<'a> {
-    field: &'a Field,
+    scene: &'a Scene,
     lattice: &'a Lattice,
     masks: &'a [Mask],
     set: NodeSet,
@@ -126,8 +125,9 @@ pub(super) fn blocks(lattice: &Lattice) -> usize {
 
 impl<'a> GridPoints<'a> {
     /// Those on a level set of the sweep, and with `beyond` those just outside that light themselves.
-    pub(super) fn new(field: &'a Field, lattice: &'a Lattice, masks: &'a [Mask], beyond: bool) -> Self {
-        Self { field, lattice, masks, set: NodeSet::new(masks.len(), own_light(field, lattice, masks, beyond)) }
+    pub(super) fn new(scene: &'a Scene, lattice: &'a Lattice, masks: &'a [Mask], beyond: bool) -> Self {
+        let set = NodeSet::new(masks.len(), own_light(&scene.field, lattice, masks, beyond));
+        Self { scene, lattice, masks, set }
     }
 
     /// Whether a point is one of them.
@@ -155,10 +155,10 @@ impl<'a> GridPoints<'a> {
     #[inline]
     #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
     pub(super) fn isovalue(&self, o: usize) -> f32 {
-        let h = if self.lattice == self.field.lattice() {
-            self.field.samples()[o]
+        let h = if self.lattice == self.scene.lattice() {
+            self.scene.field.samples()[o]
         } else {
-            self.field.value(local_position(self.field, self.lattice, o)) as f32
+            self.scene.field.value(local_position(&self.scene.field, self.lattice, o)) as f32
         };
         h.clamp(0.0, 1.0)
     }
@@ -196,7 +196,7 @@ impl<'a> GridPoints<'a> {
                     return Counts::default();
                 }
                 let place = |&o: &usize| {
-                    let position = local_position(self.field, self.lattice, o).as_vec3();
+                    let position = local_position(&self.scene.field, self.lattice, o).as_vec3();
                     ((STAND_INS * o) as u64, position)
                 };
                 let places: Vec<(u64, Vec3)> = own.iter().map(place).collect();
@@ -231,31 +231,23 @@ impl<'a> GridPoints<'a> {
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     pub(super) fn finish(
         &self,
-        scene: &Scene,
         side: Side,
         tau: f64,
         PointLight { mut grid, halves, direct }: PointLight,
         tick: Tick,
     ) -> IlluminationGrid {
         if let Some(packed) = halves {
-            self.smooth(scene, side, tau, (&mut grid, &packed), tick);
+            self.smooth(side, tau, (&mut grid, &packed), tick);
         }
-        grid.split = direct.map(|direct| split(scene, self.lattice, side, &grid, &direct));
+        grid.split = direct.map(|direct| split(self.scene, self.lattice, side, &grid, &direct));
         grid
     }
 
     /// Smooths what was gathered, in `packed` halves, over the points.
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-    fn smooth(
-        &self,
-        scene: &Scene,
-        side: Side,
-        tau: f64,
-        (grid, packed): (&mut IlluminationGrid, &[Packed]),
-        tick: Tick,
-    ) {
+    fn smooth(&self, side: Side, tau: f64, (grid, packed): (&mut IlluminationGrid, &[Packed]), tick: Tick) {
         let halves = |o: usize| self.set.slot(o).map_or([Vec3::NAN; 2], |slot| packed[slot].unpack());
-        smooth(scene, self.lattice, side, tau, &halves, &mut |z, smoothed| {
+        smooth(self.scene, self.lattice, side, tau, &halves, &mut |z, smoothed| {
             if !tick(0) {
                 return;
             }
@@ -269,8 +261,8 @@ impl<'a> GridPoints<'a> {
                 if a.is_nan() {
                     return;
                 }
-                let p = local_position(self.field, self.lattice, o).as_vec3();
-                let (light, variance) = smoothed_light(scene, p, Vec3::from_array(*radiance), [a, b], smoothed);
+                let p = local_position(&self.scene.field, self.lattice, o).as_vec3();
+                let (light, variance) = smoothed_light(self.scene, p, Vec3::from_array(*radiance), [a, b], smoothed);
                 *radiance = light.to_array();
                 *std_error = (*std_error + variance).max(0.0).sqrt();
             });
@@ -311,7 +303,7 @@ fn smoothed_light(scene: &Scene, p: Vec3, radiance: Vec3, [a, b]: Halves, smooth
 
 /// Places beside the points of a grid that hold no level set of the sweep, while surfaces beside them do.
 pub(super) struct Beside<'a> {
-    field: &'a Field,
+    scene: &'a Scene,
     lattice: &'a Lattice,
     positions: Vec<Vec3>,
     /// Of each position, the point it stands for, in rising order.
@@ -351,7 +343,7 @@ impl<'a> Beside<'a> {
     /// Places around the points that `stand_in` picks.
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     pub(super) fn new(
-        field: &'a Field,
+        scene: &'a Scene,
         lattice: &'a Lattice,
         stand_in: impl Fn(usize) -> bool + Sync,
         seed: u64,
@@ -363,7 +355,7 @@ impl<'a> Beside<'a> {
         const ROW: usize = 4096;
         set.split(&mut found, ROW).into_par_iter().enumerate().for_each(|(row, found)| {
             for (found, o) in found.iter_mut().zip(set.members(row * ROW..points.min((row + 1) * ROW))) {
-                *found = stand_ins::<STAND_INS>(field, lattice, o, seed).map(|p| p.map(|p: DVec3| p.as_vec3()));
+                *found = stand_ins::<STAND_INS>(&scene.field, lattice, o, seed).map(|p| p.map(|p: DVec3| p.as_vec3()));
             }
         });
         let count = found.iter().flatten().flatten().count();
@@ -374,12 +366,22 @@ impl<'a> Beside<'a> {
             owners.resize(positions.len(), o as u64);
             starts.push(positions.len() as u32);
         }
-        Self { field, lattice, positions, owners, points: set, starts }
+        Self { scene, lattice, positions, owners, points: set, starts }
     }
 
     /// Places.
     pub(super) fn len(&self) -> usize {
         self.positions.len()
+    }
+
+    /// The points that have places, with the numbers of these.
+    fn runs(&self) -> impl Iterator<Item = (usize, Range<usize>)> {
+        let mut end = 0;
+        self.owners.chunk_by(|a, b| a == b).map(move |run| {
+            let start = end;
+            end += run.len();
+            (usize::try_from(run[0]).expect("a point's number"), start..end)
+        })
     }
 
     /// Darkness at all of them.
@@ -397,7 +399,7 @@ impl<'a> Beside<'a> {
         saved: Saved<'_>,
         tick: Tick,
     ) -> Counts {
-        let isovalue = |n: usize| (self.field.value(self.positions[n].as_dvec3()) as f32).clamp(0.0, 1.0);
+        let isovalue = |n: usize| (self.scene.field.value(self.positions[n].as_dvec3()) as f32).clamp(0.0, 1.0);
         let own: Vec<u32> =
             (0..self.len()).into_par_iter().filter(|&n| band.holds(isovalue(n))).map(|n| n as u32).collect();
         // Its number among its owner's tells them apart.
@@ -420,14 +422,14 @@ impl<'a> Beside<'a> {
 
     /// Smooths what was gathered over the places around ([`smooth_scattered`]): where little arrives, few rays bring
     /// it, and the fit would show them as specks. Leaves all as it is if `tick` says stop.
-    pub(super) fn smooth(&self, scene: &Scene, side: Side, tau: f64, light: &mut [BesideLight], tick: Tick) {
+    pub(super) fn smooth(&self, side: Side, tau: f64, light: &mut [BesideLight], tick: Tick) {
         let scattered =
             Scattered { lattice: self.lattice, owners: &self.points, starts: &self.starts, positions: &self.positions };
         let halves = |n: usize| light[n].halves.unpack();
-        let Some(smoothed) = smooth_scattered(scene, &scattered, side, tau, &halves, tick) else { return };
+        let Some(smoothed) = smooth_scattered(self.scene, &scattered, side, tau, &halves, tick) else { return };
         let places = light.par_iter_mut().zip(smoothed).zip(&self.positions).with_min_len(1024);
         places.filter(|((l, _), _)| l.halves != Packed::NONE).for_each(|((l, smoothed), &p)| {
-            (l.radiance, l.common) = smoothed_light(scene, p, l.radiance, l.halves.unpack(), smoothed);
+            (l.radiance, l.common) = smoothed_light(self.scene, p, l.radiance, l.halves.unpack(), smoothed);
             l.variance = (l.variance - l.indirect_variance).max(0.0) + l.common;
         });
     }
@@ -436,32 +438,24 @@ impl<'a> Beside<'a> {
     /// cells around them: between the points of a steep edge there may be none with one. Points around which no light
     /// was found stay empty, which viewers and [`IlluminationGrid::interpolate`] leave out. Points beside which are no
     /// places stay as they are. Both parts of light that is split are fitted each on its own.
-    pub(super) fn fit(
-        &self,
-        scene: &Scene,
-        side: Side,
-        mut grid: IlluminationGrid,
-        light: &[BesideLight],
-    ) -> IlluminationGrid {
+    pub(super) fn fit(&self, side: Side, mut grid: IlluminationGrid, light: &[BesideLight]) -> IlluminationGrid {
         // Of the points that get light, its error where the fit starts: three draws of each place's own, and the
         // variance of what places have in common, which no fit enlarges.
-        let (mut lit, mut errors, mut start) = (Vec::new(), Vec::new(), 0);
+        let (mut lit, mut errors) = (Vec::new(), Vec::new());
         let own = |n: usize| draws(n as u64, (light[n].variance - light[n].common).max(0.0).sqrt());
-        for run in self.owners.chunk_by(|a, b| a == b) {
+        for (owner, run) in self.runs() {
             let (mut sum, mut drawn, mut common, mut count) = (Vec3::ZERO, Vec3::ZERO, 0.0, 0.0);
-            for n in (start..start + run.len()).filter(|&n| light[n].variance >= 0.0) {
+            for n in run.clone().filter(|&n| light[n].variance >= 0.0) {
                 (sum, drawn, common) = (sum + light[n].radiance, drawn + own(n), common + light[n].common);
                 count += 1.0;
             }
             if count > 0.0 {
-                let owner = usize::try_from(run[0]).expect("a point's number");
                 grid.radiance[owner] = (sum / count).to_array();
                 grid.mask[owner] = Mask::Filled;
                 lit.push(owner);
-                let unknown = light[start..start + run.len()].iter().any(|l| l.variance == f32::INFINITY);
+                let unknown = light[run].iter().any(|l| l.variance == f32::INFINITY);
                 errors.push((drawn / count, if unknown { f32::INFINITY } else { common / count }));
             }
-            start += run.len();
         }
         let free = NodeSet::new(self.lattice.len(), |o| grid.mask[o] == Mask::Filled && lit.binary_search(&o).is_ok());
         let targets = |target: &(dyn Fn(usize) -> Vec3 + Sync)| -> Vec<FitSample> {
@@ -473,23 +467,24 @@ impl<'a> Beside<'a> {
             Some(slot) => errors[slot].0,
             None => draws(places + o as u64, grid.std_error[o]),
         };
-        let fit = GridFit::new(self.field, self.lattice, &free, &|_| true);
+        let fit = GridFit::new(&self.scene.field, self.lattice, &free, &|_| true);
         let variances = fit.variances(&targets(&own), &before);
         for ((o, variance), (_, common)) in lit.into_iter().zip(variances).zip(errors) {
             grid.std_error[o] = (variance + common).sqrt();
         }
         let targets = targets(&|n| light[n].radiance);
         grid.radiance = fit.light(&targets, grid.radiance);
-        grid.split = grid.split.map(|split| self.fit_parts(scene, side, split, light, &free));
+        grid.split = grid.split.map(|split| self.fit_parts(side, split, light, &free));
         grid
     }
 
     /// Fits both parts of light from their means at the places of each point. What is visible counts for as much as
     /// could be seen.
-    fn fit_parts(&self, scene: &Scene, side: Side, split: Split, light: &[BesideLight], free: &NodeSet) -> Split {
+    fn fit_parts(&self, side: Side, split: Split, light: &[BesideLight], free: &NodeSet) -> Split {
         let places = self.positions.par_iter().zip(light).with_min_len(1024);
-        let parts: Vec<Parts> =
-            places.map(|(position, l)| Parts::new(scene, position.as_dvec3(), side, l.radiance, l.direct)).collect();
+        let parts: Vec<Parts> = places
+            .map(|(position, l)| Parts::new(self.scene, position.as_dvec3(), side, l.radiance, l.direct))
+            .collect();
         let full = parts.iter().map(|parts| luminance(parts.open)).fold(f64::MIN_POSITIVE, f64::max);
         let places = self.positions.par_iter().zip(light).zip(parts).with_min_len(1024);
         let parts: Vec<[FitSample; 2]> = places
@@ -505,22 +500,19 @@ impl<'a> Beside<'a> {
             })
             .collect();
         let Split { mut indirect, mut visible } = split;
-        let mut start = 0;
-        for run in self.owners.chunk_by(|a, b| a == b) {
-            let owner = usize::try_from(run[0]).expect("a point's number");
+        for (owner, run) in self.runs() {
             for (n, values) in [&mut indirect, &mut visible].into_iter().enumerate() {
-                let own = parts[start..start + run.len()].iter().map(|parts| parts[n]);
+                let own = parts[run.clone()].iter().map(|parts| parts[n]);
                 let (sum, weight) =
                     own.fold((Vec3::ZERO, 0.0), |(sum, weight), w| (sum + w.weight * w.light, weight + w.weight));
                 if weight > 0.0 {
                     values[owner] = (sum / weight).to_array();
                 }
             }
-            start += run.len();
         }
         let fitted = |n: usize, start| {
             let targets: Vec<FitSample> = parts.par_iter().map(|parts| parts[n]).filter(|w| w.weight > 0.0).collect();
-            GridFit::new(self.field, self.lattice, free, &|_| true).light(&targets, start)
+            GridFit::new(&self.scene.field, self.lattice, free, &|_| true).light(&targets, start)
         };
         let (indirect, mut visible) = (fitted(0, indirect), fitted(1, visible));
         let shares = visible.as_flattened_mut().par_iter_mut().with_min_len(1 << 14);
@@ -532,7 +524,7 @@ impl<'a> Beside<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::Sweep;
+    use crate::field::{Field, Sweep};
     use crate::rng::{Rng, Stage};
     use crate::scene::{Boundary, Surface};
     use crate::volume::{Samples, Volume};

@@ -153,9 +153,9 @@ impl<'a> FieldLight<'a> {
             Some(strategy) => Places::Scattered(scatter(scene, settings, masks, &strategy)?),
             None => {
                 // The photon map knows nothing beyond the sweep; what gather rays find there goes on.
-                let points = GridPoints::new(&scene.field, lattice, masks, settings.gather_rays > 0);
+                let points = GridPoints::new(scene, lattice, masks, settings.gather_rays > 0);
                 let fitted = |o: usize| masks[o] == Mask::Filled && !points.contains(o);
-                let beside = Beside::new(&scene.field, lattice, fitted, settings.seed);
+                let beside = Beside::new(scene, lattice, fitted, settings.seed);
                 // Only a cache knows what walls show there.
                 let gathers = settings.gather_rays > 0;
                 let contacts = Contacts::new(scene, lattice, |o| gathers && masks[o] == Mask::Valid);
@@ -245,9 +245,9 @@ impl<'a> FieldLight<'a> {
             let grid = match (&places, points) {
                 (Places::Grid(grid, beside, _), Some((at_points, mut at_beside))) => {
                     if settings.smooths() {
-                        beside.smooth(scene, side, settings.tau, &mut at_beside, tick);
+                        beside.smooth(side, settings.tau, &mut at_beside, tick);
                     }
-                    beside.fit(scene, side, grid.finish(scene, side, settings.tau, at_points, tick), &at_beside)
+                    beside.fit(side, grid.finish(side, settings.tau, at_points, tick), &at_beside)
                 }
                 _ => {
                     let samples: Vec<RadianceSample> = scattered.into_iter().flatten().collect();

@@ -65,7 +65,7 @@ pub(super) fn light(Job { number, scene, lattice, masks }: &Job, context: Contex
     let clock = Clock::start();
     // Just outside the sweep, light on the point's own level set is a better end of interpolation than any fit.
     let fitted = |o: usize| masks[o] == Mask::Filled && !own[o];
-    let beside = Beside::new(&scene.field, lattice, fitted, settings.seed);
+    let beside = Beside::new(scene, lattice, fitted, settings.seed);
     let near = beside_luminaires(scene, masks);
     let contacts = Contacts::new(scene, scene.lattice(), |o| masks[o] == Mask::Valid && own[o]);
     // What the sweep knows is what rays from these points gather.
@@ -85,7 +85,7 @@ pub(super) fn light(Job { number, scene, lattice, masks }: &Job, context: Contex
         let mut light = beside.dark();
         let counts = beside.sample(&sampler, Band::WHOLE, &mut light, saved, &|n| stage.tick(n));
         lit.counts += counts;
-        beside.smooth(scene, s.side, settings.tau, &mut light, &|n| stage.tick(n));
+        beside.smooth(s.side, settings.tau, &mut light, &|n| stage.tick(n));
         let (indirect, shadow_rays) = (Indirect::Gather(&cache, rays[0]), rays[1]);
         let sampler = Sampler { indirect: &indirect, shadow_rays, ..sampler };
         // Keys of a point beside; none of these is one.
@@ -105,7 +105,7 @@ pub(super) fn light(Job { number, scene, lattice, masks }: &Job, context: Contex
         stage.end()?;
         grid.split = settings.split.then(|| split(scene, lattice, s.side, &grid, &s.direct));
         drop(s.direct);
-        sides.push((s.side, beside.fit(scene, s.side, grid, &light)));
+        sides.push((s.side, beside.fit(s.side, grid, &light)));
     }
     lit.fields.push(sides);
     lit.spend(clock, |s| &mut s.samples);
