@@ -21,7 +21,7 @@ use isolume::radiance::{Indirect, RadianceSample, Sampler};
 use isolume::radiance_cache::{CacheSettings, NodeBand, NodePhotons, RadianceCache};
 use isolume::reference::{Integrator, ReferenceSettings, reference};
 use isolume::scene::{Boundary, Scene, Surface, cornell_box};
-use isolume::smoothing::smooth;
+use isolume::smoothing::{Smoothing, smooth};
 use isolume::surface_mesh::{SurfaceMesh, unit_isovalue};
 use isolume::sweep::{SweepSettings, sweep};
 use isolume::volume::Volume;
@@ -198,7 +198,8 @@ fn main() {
         (
             "smoothing",
             Box::new(|| {
-                smooth(&scene, lattice, Side::Lower, 0.1, &halves, &mut |_, slice| drop(black_box(slice)));
+                let smoothing = Smoothing { scene: &scene, side: Side::Lower, tau: 0.1 };
+                smooth(smoothing, lattice, &halves, &mut |_, slice| drop(black_box(slice)));
             }),
         ),
         ("shepard", Box::new(|| drop(black_box(shepard(&scene.field, lattice, &masks, &samples, 8, &|_| true))))),

@@ -43,6 +43,17 @@ struct Tap {
     d2: f32,
 }
 
+/// Whose light is smoothed, and how far it is shared.
+#[derive(Clone, Copy, Debug)]
+pub struct Smoothing<'a> {
+    /// The scene.
+    pub scene: &'a Scene,
+    /// The side of its level sets.
+    pub side: Side,
+    /// Largest isovalue difference of points that share light, in units of the sweep.
+    pub tau: f64,
+}
+
 /// Two independent estimates of one irradiance; NaN: none.
 pub type Halves = [Vec3; 2];
 
@@ -160,18 +171,16 @@ impl<T> Slices<T> {
     }
 }
 
-/// Smooths the irradiance of points whose two `halves` are given by their offset. `tau`: largest isovalue difference of
-/// points that share light, in units of the sweep. Slice after slice of the lattice goes to `out`, with its number:
-/// about 770 bytes per point of a slice are held at once. The same bits on any number of threads.
+/// Smooths the irradiance of points whose two `halves` are given by their offset. Slice after slice of the lattice goes
+/// to `out`, with its number: about 770 bytes per point of a slice are held at once. The same bits on any number of
+/// threads.
 pub fn smooth(
-    scene: &Scene,
+    smoothing: Smoothing<'_>,
     lattice: &Lattice,
-    side: Side,
-    tau: f64,
     halves: &(dyn Fn(usize) -> Halves + Sync),
     out: &mut dyn FnMut(usize, Vec<Smoothed>),
 ) {
-    let mut points = Points::new(scene, lattice, side, tau);
+    let mut points = Points::new(smoothing, lattice);
     let [nx, ny, nz] = lattice.dims();
     let (area, reach) = (nx * ny, points.reach);
     let (mut raw, mut once, mut twice, mut blended) =
@@ -204,7 +213,7 @@ pub fn smooth(
 
 impl<'a> Points<'a> {
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
-    fn new(scene: &'a Scene, lattice: &'a Lattice, side: Side, tau: f64) -> Self {
+    fn new(Smoothing { scene, side, tau }: Smoothing<'a>, lattice: &'a Lattice) -> Self {
         let axes = lattice.axes();
         let radius = RADIUS * lattice.spacing().min_element();
         let inverse = axes.inverse();
@@ -298,7 +307,8 @@ mod tests {
             })
             .collect();
         let mut smoothed = Vec::new();
-        smooth(&scene, &lattice, Side::Lower, 0.2, &|o| halves[o], &mut |z, slice| {
+        let smoothing = Smoothing { scene: &scene, side: Side::Lower, tau: 0.2 };
+        smooth(smoothing, &lattice, &|o| halves[o], &mut |z, slice| {
             assert_eq!(smoothed.len(), z * 16 * 17);
             smoothed.extend(slice);
         });

@@ -13,7 +13,7 @@ use crate::node_set::NodeSet;
 use crate::progress::Tick;
 use crate::radiance::{BLOCK, RadianceSample, RadianceSamples, Sampler, sample_places};
 use crate::scene::Scene;
-use crate::smoothing::{Halves, Scattered, Smoothed, smooth, smooth_scattered};
+use crate::smoothing::{Halves, Scattered, Smoothed, Smoothing, smooth, smooth_scattered};
 use crate::split::{MOST_VISIBLE, Parts, Split};
 use crate::tracer::Tracer;
 use crate::volume::Lattice;
@@ -247,7 +247,8 @@ impl<'a> GridPoints<'a> {
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     fn smooth(&self, side: Side, tau: f64, (grid, packed): (&mut IlluminationGrid, &[Packed]), tick: Tick) {
         let halves = |o: usize| self.set.slot(o).map_or([Vec3::NAN; 2], |slot| packed[slot].unpack());
-        smooth(self.scene, self.lattice, side, tau, &halves, &mut |z, smoothed| {
+        let smoothing = Smoothing { scene: self.scene, side, tau };
+        smooth(smoothing, self.lattice, &halves, &mut |z, smoothed| {
             if !tick(0) {
                 return;
             }
@@ -426,7 +427,8 @@ impl<'a> Beside<'a> {
         let scattered =
             Scattered { lattice: self.lattice, owners: &self.points, starts: &self.starts, positions: &self.positions };
         let halves = |n: usize| light[n].halves.unpack();
-        let Some(smoothed) = smooth_scattered(self.scene, &scattered, side, tau, &halves, tick) else { return };
+        let smoothing = Smoothing { scene: self.scene, side, tau };
+        let Some(smoothed) = smooth_scattered(smoothing, &scattered, &halves, tick) else { return };
         let places = light.par_iter_mut().zip(smoothed).zip(&self.positions).with_min_len(1024);
         places.filter(|((l, _), _)| l.halves != Packed::NONE).for_each(|((l, smoothed), &p)| {
             (l.radiance, l.common) = smoothed_light(self.scene, p, l.radiance, l.halves.unpack(), smoothed);

@@ -1,10 +1,8 @@
 //! Light smoothed over places scattered beside grid points.
 
-use super::{CONE, Halves, Smoothed, Surroundings};
-use crate::flattened::Side;
+use super::{CONE, Halves, Smoothed, Smoothing, Surroundings};
 use crate::node_set::NodeSet;
 use crate::progress::Tick;
-use crate::scene::Scene;
 use crate::volume::Lattice;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
@@ -56,14 +54,12 @@ struct Cloud<'a> {
 /// once `tick` says stop.
 #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
 pub fn smooth_scattered(
-    scene: &Scene,
+    smoothing: Smoothing<'_>,
     scattered: &Scattered<'_>,
-    side: Side,
-    tau: f64,
     halves: &(dyn Fn(usize) -> Halves + Sync),
     tick: Tick,
 ) -> Option<Vec<Smoothed>> {
-    let cloud = Cloud::new(scene, scattered, side, tau, halves);
+    let cloud = Cloud::new(smoothing, scattered, halves);
     let once = cloud.each(tick, |n| cloud.fit(n, halves))?;
     let twice = cloud.each(tick, |n| cloud.fit_again(n, halves, |m| once[m]))?;
     drop(once);
@@ -75,10 +71,8 @@ pub fn smooth_scattered(
 impl<'a> Cloud<'a> {
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     fn new(
-        scene: &Scene,
+        Smoothing { scene, side, tau }: Smoothing<'_>,
         scattered: &'a Scattered<'a>,
-        side: Side,
-        tau: f64,
         halves: &(dyn Fn(usize) -> Halves + Sync),
     ) -> Self {
         let (field, lattice) = (&scene.field, scattered.lattice);
@@ -174,8 +168,9 @@ impl Surroundings for Cloud<'_> {
 mod tests {
     use super::*;
     use crate::field::{Field, Sweep};
+    use crate::flattened::Side;
     use crate::rng::{Rng, Stage};
-    use crate::scene::{Boundary, Surface};
+    use crate::scene::{Boundary, Scene, Surface};
     use crate::volume::{Samples, Volume};
 
     /// Four places about most points of three in four planes of x, where h rises by `slope` a step from x = 0 and falls
@@ -215,6 +210,10 @@ mod tests {
             Scattered { lattice, owners, starts: &self.starts, positions: &self.positions }
         }
 
+        fn smoothing(&self) -> Smoothing<'_> {
+            Smoothing { scene: &self.scene, side: Side::Lower, tau: 0.01 }
+        }
+
         /// `light` with noise of standard deviation 0.1 on either half, as it is and smoothed.
         fn smoothed(&self, light: impl Fn(DVec3) -> f32) -> (Vec<Halves>, Vec<Smoothed>) {
             let noisy = |(n, p): (usize, &Vec3)| {
@@ -224,7 +223,7 @@ mod tests {
             };
             let halves: Vec<Halves> = self.positions.iter().enumerate().map(noisy).collect();
             let get = |n: usize| halves[n];
-            let smoothed = smooth_scattered(&self.scene, &self.scattered(), Side::Lower, 0.01, &get, &|_| true);
+            let smoothed = smooth_scattered(self.smoothing(), &self.scattered(), &get, &|_| true);
             (halves, smoothed.unwrap())
         }
 
@@ -293,7 +292,7 @@ mod tests {
         let left = AtomicUsize::new(3 * steep.positions.len() / 2);
         let tick = |_: u64| left.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |n| n.checked_sub(1)).is_ok();
         let bright = |_: usize| [Vec3::ONE; 2];
-        assert_eq!(smooth_scattered(&steep.scene, &steep.scattered(), Side::Lower, 0.01, &bright, &tick), None);
+        assert_eq!(smooth_scattered(steep.smoothing(), &steep.scattered(), &bright, &tick), None);
     }
 
     /// The variance told is that of the error, not of what went in.
