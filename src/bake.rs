@@ -2,6 +2,7 @@
 
 mod bands;
 mod grid_points;
+mod beside;
 mod contacts;
 mod memory;
 mod photon_engine;

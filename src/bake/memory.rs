@@ -1,7 +1,8 @@
 //! How much memory a bake takes, before it takes it.
 
 use super::bands::{Band, Levels, REACH};
-use super::grid_points::{BesideLight, STAND_INS};
+use super::beside::BesideLight;
+use super::grid_points::STAND_INS;
 use super::{BakeSettings, Engine, Interpolation, MOST_BANDS, StrategyName};
 use crate::checkpoint;
 use crate::embree::{Device, GraphTracer};

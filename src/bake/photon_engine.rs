@@ -1,8 +1,9 @@
 //! BB09's engine: photons, a radiance cache, samples by exact rays, interpolation.
 
 use super::bands::{Band, Levels, REACH};
+use super::beside::{Beside, BesideLight, rays_beside};
 use super::contacts::{Contacts, Wedge};
-use super::grid_points::{Beside, BesideLight, Counts, GridPoints, PointLight, rays_beside};
+use super::grid_points::{Counts, GridPoints, PointLight};
 use super::{BakeSettings, Context, Interpolation, Lit, PhotonCounts};
 use crate::embree::{GraphTracer, pyramids};
 use crate::error::{Error, Result};

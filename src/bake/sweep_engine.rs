@@ -2,8 +2,9 @@
 //! those next to luminaires.
 
 use super::bands::Band;
+use super::beside::{Beside, rays_beside};
 use super::contacts::{Contacts, Wedge};
-use super::grid_points::{Beside, Counts, STAND_INS, rays_beside, split};
+use super::grid_points::{Counts, STAND_INS, split};
 use super::photon_engine::Job;
 use super::{Context, Lit};
 use crate::brdf::reflected;
