@@ -58,7 +58,8 @@ pub(super) struct GridPoints<'a> {
 
 /// Light at such points of one side, as far as it is known.
 pub(super) struct PointLight {
-    /// Radiance as sampled; the standard error, or before smoothing what of the variance is not the gather's.
+    /// Radiance as sampled. Where `halves` are kept, `std_error` is a variance until [`GridPoints::finish`]: the part
+    /// that is not the gather's; at points that stand apart it is a standard error all along.
     grid: IlluminationGrid,
     /// Gathered light of the points, if it is to be smoothed.
     halves: Option<Vec<Packed>>,

@@ -127,31 +127,40 @@ pub(super) fn light(jobs: &[Job], context: Context) -> Result<Lit> {
 /// The light of one field while it is gathered.
 struct FieldLight<'a> {
     job: &'a Job,
-    places: Places<'a>,
-    sides: Vec<SideLight>,
+    sampled: Sampled<'a>,
 }
 
-/// Where a field is sampled.
-#[allow(clippy::large_enum_variant, reason = "one of a field")]
-enum Places<'a> {
-    /// At its grid's points and beside them; which of them lie on walls.
-    Grid(GridPoints<'a>, Beside<'a>, Contacts<'a>),
+/// Where a field is sampled, and what is known there on each side.
+enum Sampled<'a> {
+    /// At its grid's points and beside them.
+    Grid(Box<GridPlaces<'a>>, Vec<GridSide>),
     /// Anywhere.
-    Scattered(Vec<Vec3>),
+    Scattered(Vec<Vec3>, Vec<(Side, Vec<Option<RadianceSample>>)>),
 }
 
-struct SideLight {
+struct GridPlaces<'a> {
+    points: GridPoints<'a>,
+    beside: Beside<'a>,
+    /// Which of the points lie on walls.
+    contacts: Contacts<'a>,
+}
+
+struct GridSide {
     side: Side,
-    /// At the grid's points and beside them.
-    points: Option<(PointLight, Vec<BesideLight>)>,
-    scattered: Vec<Option<RadianceSample>>,
+    at_points: PointLight,
+    at_beside: Vec<BesideLight>,
 }
 
 impl<'a> FieldLight<'a> {
     fn new(job: &'a Job, settings: &BakeSettings) -> Result<Self> {
         let Job { scene, lattice, masks, .. } = job;
-        let places = match settings.strategy.placed() {
-            Some(strategy) => Places::Scattered(scatter(scene, settings, masks, &strategy)?),
+        let sides = scene.surface.stored_sides().into_iter();
+        let sampled = match settings.strategy.placed() {
+            Some(strategy) => {
+                let at = scatter(scene, settings, masks, &strategy)?;
+                let sides = sides.map(|side| (side, vec![None; at.len()])).collect();
+                Sampled::Scattered(at, sides)
+            }
             None => {
                 // The photon map knows nothing beyond the sweep; what gather rays find there goes on.
                 let points = GridPoints::new(scene, lattice, masks, settings.gather_rays > 0);
@@ -160,37 +169,37 @@ impl<'a> FieldLight<'a> {
                 // Only a cache knows what walls show there.
                 let gathers = settings.gather_rays > 0;
                 let contacts = Contacts::new(scene, lattice, |o| gathers && masks[o] == Mask::Valid);
-                Places::Grid(points, beside, contacts)
+                let sides = sides.map(|side| {
+                    let at_points = points.dark(settings.smooths(), settings.split);
+                    GridSide { side, at_points, at_beside: beside.dark() }
+                });
+                let sides = sides.collect();
+                Sampled::Grid(Box::new(GridPlaces { points, beside, contacts }), sides)
             }
         };
-        let sides = scene.surface.stored_sides().into_iter().map(|side| match &places {
-            Places::Grid(points, beside, _) => SideLight {
-                side,
-                points: Some((points.dark(settings.smooths(), settings.split), beside.dark())),
-                scattered: Vec::new(),
-            },
-            Places::Scattered(at) => SideLight { side, points: None, scattered: vec![None; at.len()] },
-        });
-        let sides = sides.collect();
-        Ok(Self { job, places, sides })
+        Ok(Self { job, sampled })
     }
 
     /// Ticks of [`FieldLight::sample`]: rays of all sides, about.
     fn work(&self, settings: &BakeSettings) -> u64 {
         let rays = [settings.gather_rays, settings.shadow_rays];
-        let each = match &self.places {
-            Places::Grid(points, beside, contacts) => {
-                let at_points = (points.len() + contacts.len()) as u64 * rays_of(rays);
-                at_points + beside.len() as u64 * rays_of(rays_beside(rays))
+        let each = match &self.sampled {
+            Sampled::Grid(places, _) => {
+                let at_points = (places.points.len() + places.contacts.len()) as u64 * rays_of(rays);
+                at_points + places.beside.len() as u64 * rays_of(rays_beside(rays))
             }
-            Places::Scattered(at) => at.len() as u64 * rays_of(rays),
+            Sampled::Scattered(at, _) => at.len() as u64 * rays_of(rays),
         };
-        each * self.sides.len() as u64
+        each * self.sides() as u64
+    }
+
+    fn sides(&self) -> usize {
+        self.job.scene.surface.stored_sides().len()
     }
 
     /// Ticks of [`FieldLight::finish`].
     fn interpolation(&self) -> u64 {
-        2 * (self.job.lattice.len() * self.sides.len()) as u64
+        2 * (self.job.lattice.len() * self.sides()) as u64
     }
 
     /// Samples the isovalues of a band, on all sides.
@@ -205,35 +214,46 @@ impl<'a> FieldLight<'a> {
     ) -> Counts {
         let settings = context.settings;
         let Job { scene, number, .. } = self.job;
+        let rays @ [gather_rays, shadow_rays] = [settings.gather_rays, settings.shadow_rays];
+        let (seed, each) = (settings.seed, rays_of(rays));
+        let indirect = |side: Side, rays: u32| {
+            let map = source.map(side).filter(|_| settings.gather_rays == 0);
+            map.map_or(Indirect::Gather(cache, rays), Indirect::Map)
+        };
+        let saved = |side: Side, kind: u32| context.saved(*number, kind)[side.index()];
         let mut counts = Counts::default();
-        for SideLight { side, points, scattered } in &mut self.sides {
-            let map = source.map(*side).filter(|_| settings.gather_rays == 0);
-            let indirect = |rays: u32| map.map_or(Indirect::Gather(cache, rays), Indirect::Map);
-            let rays @ [gather_rays, shadow_rays] = [settings.gather_rays, settings.shadow_rays];
-            let (gathered, seed, each) = (indirect(gather_rays), settings.seed, rays_of(rays));
-            let sampler = Sampler { scene, tracer, indirect: &gathered, side: *side, shadow_rays, seed };
-            let saved = |kind: u32| context.saved(*number, kind)[side.index()];
-            match (&self.places, points) {
-                (Places::Grid(grid, beside, contacts), Some((at_points, at_beside))) => {
-                    let apart = |o: usize| contacts.holds(o);
-                    counts += grid.sample(&sampler, band, at_points, &apart, saved(2), &|n| tick(n * each));
-                    let wedge = Wedge::new(tracer, cache, settings);
-                    let own = |o: usize| band.holds(grid.isovalue(o));
-                    counts += contacts.solve(at_points.grid(), own, *side, &wedge, &|n| tick(n * each));
+        match &mut self.sampled {
+            Sampled::Grid(places, sides) => {
+                let GridPlaces { points, beside, contacts } = &**places;
+                let apart = |o: usize| contacts.holds(o);
+                let own = |o: usize| band.holds(points.isovalue(o));
+                let wedge = Wedge::new(tracer, cache, settings);
+                for GridSide { side, at_points, at_beside } in sides {
+                    let side = *side;
+                    let gathered = indirect(side, gather_rays);
+                    let sampler = Sampler { scene, tracer, indirect: &gathered, side, shadow_rays, seed };
+                    counts += points.sample(&sampler, band, at_points, &apart, saved(side, 2), &|n| tick(n * each));
+                    counts += contacts.solve(at_points.grid(), own, side, &wedge, &|n| tick(n * each));
                     let fewer @ [gather_rays, shadow_rays] = rays_beside(rays);
-                    let sampler = Sampler { indirect: &indirect(gather_rays), shadow_rays, ..sampler };
-                    counts += beside.sample(&sampler, band, at_beside, saved(4), &|n| tick(n * rays_of(fewer)));
+                    let sampler = Sampler { indirect: &indirect(side, gather_rays), shadow_rays, ..sampler };
+                    let tick = |n: u64| tick(n * rays_of(fewer));
+                    counts += beside.sample(&sampler, band, at_beside, saved(side, 4), &tick);
                 }
-                (Places::Scattered(at), _) => {
-                    let isovalue = |p: Vec3| (scene.field.value(p.as_dvec3()) as f32).clamp(0.0, 1.0);
-                    let own: Vec<usize> = (0..at.len()).filter(|&n| band.holds(isovalue(at[n]))).collect();
-                    let saved = saved(2).starting_at(band.number * at.len().div_ceil(BLOCK));
-                    let place = |n: usize| (own[n] as u64, at[own[n]]);
+            }
+            Sampled::Scattered(at, sides) => {
+                let isovalue = |p: Vec3| (scene.field.value(p.as_dvec3()) as f32).clamp(0.0, 1.0);
+                let own: Vec<usize> = (0..at.len()).filter(|&n| band.holds(isovalue(at[n]))).collect();
+                let place = |n: usize| (own[n] as u64, at[own[n]]);
+                let first = band.number * at.len().div_ceil(BLOCK);
+                for (side, samples) in sides {
+                    let side = *side;
+                    let gathered = indirect(side, gather_rays);
+                    let sampler = Sampler { scene, tracer, indirect: &gathered, side, shadow_rays, seed };
+                    let saved = saved(side, 2).starting_at(first);
                     let got = sample_places(&sampler, own.len(), &place, saved, &|n| tick(n * each));
                     counts += Counts::from(&got);
-                    own.iter().zip(got.samples).for_each(|(&n, s)| scattered[n] = s);
+                    own.iter().zip(got.samples).for_each(|(&n, s)| samples[n] = s);
                 }
-                (Places::Grid(..), None) => {}
             }
         }
         counts
@@ -241,40 +261,48 @@ impl<'a> FieldLight<'a> {
 
     /// The grids of all sides.
     fn finish(self, settings: &BakeSettings, tick: Tick) -> Vec<(Side, IlluminationGrid)> {
-        let Self { job: Job { scene, lattice, masks, .. }, places, sides } = self;
-        let each = |SideLight { side, points, scattered }: SideLight| {
-            let grid = match (&places, points) {
-                (Places::Grid(grid, beside, _), Some((at_points, mut at_beside))) => {
+        match self.sampled {
+            Sampled::Grid(places, sides) => {
+                let fitted = |GridSide { side, at_points, mut at_beside }: GridSide| {
                     if settings.smooths() {
-                        beside.smooth(side, settings.tau, &mut at_beside, tick);
+                        places.beside.smooth(side, settings.tau, &mut at_beside, tick);
                     }
-                    beside.fit(side, grid.finish(side, settings.tau, at_points, tick), &at_beside)
-                }
-                _ => {
-                    let samples: Vec<RadianceSample> = scattered.into_iter().flatten().collect();
-                    let blended = || shepard(&scene.field, lattice, masks, &samples, settings.neighbours, tick);
-                    match settings.interpolation {
-                        Interpolation::Shepard => blended(),
-                        Interpolation::Irradiance => {
-                            interpolate(scene, side, lattice, masks, &samples, settings.neighbours, tick)
-                        }
-                        Interpolation::Fit => {
-                            let mut grid = blended();
-                            let free = NodeSet::new(lattice.len(), |o| grid.mask[o] != Mask::Empty);
-                            let errors = errors(&samples);
-                            let quiet = &|_| tick(0);
-                            let blended =
-                                shepard(&scene.field, lattice, masks, &errors, settings.neighbours, quiet).radiance;
-                            drop(errors);
-                            GridFit::new(&scene.field, lattice, &free, tick).improve(&mut grid, samples, &blended);
-                            grid
-                        }
-                    }
-                }
-            };
-            (side, grid)
-        };
-        sides.into_iter().map(each).collect()
+                    let grid = places.points.finish(side, settings.tau, at_points, tick);
+                    (side, places.beside.fit(side, grid, &at_beside))
+                };
+                sides.into_iter().map(fitted).collect()
+            }
+            Sampled::Scattered(_, sides) => {
+                let interpolated = |(side, samples): (Side, Vec<Option<RadianceSample>>)| {
+                    (side, scattered_grid(self.job, side, samples.into_iter().flatten().collect(), settings, tick))
+                };
+                sides.into_iter().map(interpolated).collect()
+            }
+        }
+    }
+}
+
+/// The grid of one side, interpolated from scattered samples.
+fn scattered_grid(
+    Job { scene, lattice, masks, .. }: &Job,
+    side: Side,
+    samples: Vec<RadianceSample>,
+    settings: &BakeSettings,
+    tick: Tick,
+) -> IlluminationGrid {
+    let blended = || shepard(&scene.field, lattice, masks, &samples, settings.neighbours, tick);
+    match settings.interpolation {
+        Interpolation::Shepard => blended(),
+        Interpolation::Irradiance => interpolate(scene, side, lattice, masks, &samples, settings.neighbours, tick),
+        Interpolation::Fit => {
+            let mut grid = blended();
+            let free = NodeSet::new(lattice.len(), |o| grid.mask[o] != Mask::Empty);
+            let errors = errors(&samples);
+            let blended = shepard(&scene.field, lattice, masks, &errors, settings.neighbours, &|_| tick(0)).radiance;
+            drop(errors);
+            GridFit::new(&scene.field, lattice, &free, tick).improve(&mut grid, samples, &blended);
+            grid
+        }
     }
 }
 
