@@ -5,6 +5,7 @@
 mod openings;
 mod binned;
 mod flats;
+mod known;
 mod pools;
 
 use crate::brdf::reflected;
@@ -26,6 +27,7 @@ use crate::sharpening::sharpen;
 use crate::tracer::Tracer;
 use flats::{ByFlat, fill_flat};
 use glam::DVec3;
+use known::Known;
 use pools::Pools;
 use rayon::prelude::*;
 use std::ops::RangeInclusive;
@@ -162,9 +164,10 @@ impl RadianceCache {
         let rays = AtomicU64::new(0);
         let photons_of = ByFlat::new(&photons.flat, flat::count(scene));
         let pools = Pools::new(scene, settings.flat_resolution);
+        let filler = Filler { scene, tracer, settings, rays: &rays, tick };
         let filled = (0..flat::count(scene)).into_par_iter().map(|n| {
             let photons = pools.of(n).flat_map(|m| photons_of.flat(m));
-            let filled = fill_flat(scene, tracer, n, photons, pools.area(scene, n), settings, (&rays, tick));
+            let filled = fill_flat(&filler, n, photons, pools.area(scene, n));
             (filled.gathered, filled.shown)
         });
         let (flats, shown) = filled.unzip();
@@ -193,7 +196,8 @@ impl RadianceCache {
         if let Some(old) = &mut old {
             old.sides = Nodes::default();
         }
-        let fill = Fill { scene, tracer, settings, filled: &filled, stored: &stored, tick, rays: &rays };
+        let filler = &Filler { scene, tracer, settings, rays: &rays, tick };
+        let fill = Fill { filler, filled: &filled, stored: &stored };
         let mut light = Nodes::default();
         let sides = [Side::Lower, Side::Higher].map(|side| {
             let before = old.as_mut().and_then(|old| old.filled[side.index()].take());
@@ -269,10 +273,7 @@ impl RadianceCache {
         texture.map_or(DVec3::ZERO, |texture| texture.lookup([u, v, f64::from(isovalue)]))
     }
 
-    /// What a white surface of field `number` would reflect where its level set `isovalue` is at a position: the mean
-    /// of the filled nodes of the cell. Each counts by w / (d² + ε Σ w d²), w being its trilinear weight and d how far
-    /// off its isovalue is; so by w where all are as far off. Light mostly changes faster from level set to level set
-    /// than along one.
+    /// What a white surface of field `number` would reflect where its level set `isovalue` is at a position.
     fn white(
         &self,
         number: usize,
@@ -283,55 +284,12 @@ impl RadianceCache {
     ) -> DVec3 {
         let Some(nodes) = self.nodes.get(number).and_then(Option::as_ref) else { return DVec3::ZERO };
         let Some(values) = nodes.sides[side.index()].as_ref() else { return DVec3::ZERO };
-        let ([i, j, k], u) = field.locate(position);
-        // What each has to say, w and d².
-        let (mut found, mut count) = ([(DVec3::ZERO, 0.0, 0.0); 8], 0);
-        for row in 0..4 {
-            let [y, z] = [row & 1, row >> 1];
-            let across = (if y == 1 { u.y } else { 1.0 - u.y }, if z == 1 { u.z } else { 1.0 - u.z });
-            let first = field.lattice().offset(i, j + y, k + z);
-            let slots = nodes.stored.pair(first);
-            for ((slot, along), h) in slots.into_iter().zip([1.0 - u.x, u.x]).zip(&field.samples()[first..]) {
-                let Some(value) = slot.map(|slot| values[slot]).filter(|v| !v[0].is_nan()) else { continue };
-                let off = f64::from(h - isovalue);
-                // 1e-6 keeps a hit at a node without surface on the others.
-                let w = along * across.0 * across.1 + 1e-6;
-                found[count] = (DVec3::from_array(value.map(f64::from)), w, (off * off).min(1e30));
-                count += 1;
-            }
-        }
-        let found = &found[..count];
-        // Never 0, since all nodes may be on the hit's level set.
-        let around = LEVEL * found.iter().map(|&(_, w, off)| w * off).sum::<f64>() + 1e-30;
-        let (mut sum, mut weight) = (DVec3::ZERO, 0.0);
-        for &(value, w, off) in found {
-            let w = w / (off + around);
-            (sum, weight) = (sum + w * value, weight + w);
-        }
-        if weight > 0.0 {
-            return sum / weight;
-        }
-        // Level sets just outside the sweep run beside its cells.
-        for reach in 1..=BESIDE {
-            let dims = field.lattice().dims();
-            let range = |a: usize, n: usize| a.saturating_sub(reach)..=(a + 1 + reach).min(n - 1);
-            for z in range(k, dims[2]) {
-                for y in range(j, dims[1]) {
-                    for x in range(i, dims[0]) {
-                        let slot = nodes.stored.slot(field.lattice().offset(x, y, z));
-                        if let Some(value) = slot.map(|slot| values[slot]).filter(|v| !v[0].is_nan()) {
-                            sum += DVec3::from_array(value.map(f64::from));
-                            weight += 1.0;
-                        }
-                    }
-                }
-            }
-            if weight > 0.0 {
-                return sum / weight;
-            }
-        }
-        *misses += 1;
-        DVec3::ZERO
+        let known = Known { field, stored: &nodes.stored, values };
+        let (cell, u) = field.locate(position);
+        known.between(cell, u, isovalue).or_else(|| known.beside(cell)).unwrap_or_else(|| {
+            *misses += 1;
+            DVec3::ZERO
+        })
     }
 
     /// The flats' light for pictures, without the rest; `None` for flats that reflect nothing.
@@ -345,25 +303,24 @@ impl RadianceCache {
 /// What they hold may be less than black: hits are averaged, and are to be right on average.
 const SHARPENING: f32 = 1.0 / 12.0;
 
-/// ε of the weights by which the nodes of a cell count.
-const LEVEL: f64 = 0.1;
-
-/// So many steps beside a cell without filled nodes some are looked for. (A fluid's points just outside the sweep send
-/// a few rays in a hundred beyond 2 steps, one in a hundred beyond 5.)
-const BESIDE: usize = 5;
-
 /// Nodes of the lattice per block.
 const ROW: usize = 4096;
 
-/// One filling of a field's nodes.
-struct Fill<'a, T> {
+/// With what nodes and flats are filled.
+struct Filler<'a, T> {
     scene: &'a Scene,
     tracer: &'a T,
     settings: &'a CacheSettings,
+    /// Rays traced.
+    rays: &'a AtomicU64,
+    tick: Tick<'a>,
+}
+
+/// One filling of a field's nodes.
+struct Fill<'a, T> {
+    filler: &'a Filler<'a, T>,
     filled: &'a NodeSet,
     stored: &'a NodeSet,
-    tick: Tick<'a>,
-    rays: &'a AtomicU64,
 }
 
 impl<T: Tracer> Fill<'_, T> {
@@ -380,10 +337,11 @@ impl<T: Tracer> Fill<'_, T> {
             let (old, values) = before?;
             Some(values[old.slot(o)?])
         };
-        let points = self.scene.lattice().len();
+        let Filler { scene, rays, tick, .. } = *self.filler;
+        let points = scene.lattice().len();
         let rows = self.stored.split(&mut nodes, ROW);
         rows.into_par_iter().enumerate().with_max_len(1).for_each(|(row, out)| {
-            if !(self.tick)(0) {
+            if !tick(0) {
                 return;
             }
             let range = row * ROW..points.min((row + 1) * ROW);
@@ -400,7 +358,7 @@ impl<T: Tracer> Fill<'_, T> {
             }
             if let Some(bytes) = saved.load(row, 8 + 12 * new.len()) {
                 let (traced, values) = bytes.split_first_chunk().expect("8 bytes and more");
-                self.rays.fetch_add(u64::from_le_bytes(*traced), Ordering::Relaxed);
+                rays.fetch_add(u64::from_le_bytes(*traced), Ordering::Relaxed);
                 let mut numbers = values.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b));
                 for &o in &new {
                     out[slot(o)] = std::array::from_fn(|_| numbers.next().unwrap_or(f32::NAN));
@@ -410,13 +368,13 @@ impl<T: Tracer> Fill<'_, T> {
                 for &o in &new {
                     out[slot(o)] = self.node(o, side, map, &mut scratch, &mut traced);
                 }
-                self.rays.fetch_add(traced, Ordering::Relaxed);
+                rays.fetch_add(traced, Ordering::Relaxed);
                 saved.save(row, || {
                     let values = new.iter().flat_map(|&o| out[slot(o)]).flat_map(f32::to_le_bytes);
                     traced.to_le_bytes().into_iter().chain(values).collect()
                 });
             }
-            (self.tick)(new.len() as u64);
+            tick(new.len() as u64);
         });
         nodes
     }
@@ -431,7 +389,7 @@ impl<T: Tracer> Fill<'_, T> {
         scratch: &mut Neighbours,
         traced: &mut u64,
     ) -> [f32; 3] {
-        let Self { scene, settings, .. } = *self;
+        let Filler { scene, tracer, settings, .. } = *self.filler;
         let (mut sum, mut count) = (DVec3::ZERO, 0.0);
         let places = stand_ins::<2>(&scene.field, scene.lattice(), node, settings.seed);
         for (stand_in, p) in places.into_iter().flatten().enumerate() {
@@ -439,7 +397,7 @@ impl<T: Tracer> Fill<'_, T> {
             let Some(receiver) = Receiver::on_level_set(scene, p, isovalue, side) else { continue };
             let index = (node as u64 * 2 + stand_in as u64) * 2 + side.index() as u64;
             let key = Stage::Cache.key(settings.seed, index);
-            let direct = direct_irradiance(scene, self.tracer, &receiver, settings.node_shadow_rays, key);
+            let direct = direct_irradiance(scene, tracer, &receiver, settings.node_shadow_rays, key);
             *traced += direct.rays;
             let indirect = map.irradiance(&receiver, scratch).mean;
             sum += reflected(DVec3::ONE, direct.mean + indirect);

@@ -1,7 +1,7 @@
 //! What flats show, as textures: direct light of every texel, and the density of photons of later landings on that part
 //! of it that light reaches.
 
-use super::CacheSettings;
+use super::Filler;
 use super::binned::{Binned, GATHERED, SHOWN, Width};
 use super::openings::{Hidden, Open, Solid, is_open};
 use crate::brdf::reflected;
@@ -11,11 +11,10 @@ use crate::neighbourhood::neighbourhood;
 use crate::photon::FlatPhoton;
 use crate::progress::Tick;
 use crate::rng::Stage;
-use crate::scene::Scene;
 use crate::tracer::Tracer;
 use glam::DVec3;
 use rayon::prelude::*;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::Ordering;
 
 /// Factor on the shadow rays of texels beside which a luminaire is seen in part: pictures show their noise, which
 /// gathers average.
@@ -34,14 +33,12 @@ pub(super) struct Filled {
 
 /// Direct light of texels and photons of later landings, on so many times the flat's area.
 pub(super) fn fill_flat<T: Tracer>(
-    scene: &Scene,
-    tracer: &T,
+    filler: &Filler<'_, T>,
     number: usize,
     photons: impl Iterator<Item = FlatPhoton>,
     areas: f64,
-    settings: &CacheSettings,
-    (rays, tick): (&AtomicU64, Tick),
 ) -> Filled {
+    let Filler { scene, settings, .. } = *filler;
     let Some(flat) = flat::flat(scene, number).filter(|f| !f.albedo.black()) else { return Filled::default() };
     let dims = flat.resolution(settings.flat_resolution, settings.isovalue_resolution);
     let mut parts = flat.texels(dims);
@@ -54,7 +51,7 @@ pub(super) fn fill_flat<T: Tracer>(
     // Where no solid stands, none holds photons.
     let solid = solid.filter(|_| open.is_some());
     let isovalues = settings.axis.centres(dims[2]);
-    let raster = Raster { scene, tracer, number, flat: &flat, settings, rays, tick, dims, isovalues, parts, open };
+    let raster = Raster { filler, number, flat: &flat, dims, isovalues, parts, open };
     let binned = raster.binned(photons, solid.as_ref(), areas);
     let known = raster.direct();
     let within = raster.within(&known);
@@ -67,13 +64,9 @@ pub(super) fn fill_flat<T: Tracer>(
 
 /// A flat's texels: dims[0] × dims[1] parts of it at each of dims[2] isovalues. Texel i is part i mod their number.
 struct Raster<'a, T> {
-    scene: &'a Scene,
-    tracer: &'a T,
+    filler: &'a Filler<'a, T>,
     number: usize,
     flat: &'a Flat,
-    settings: &'a CacheSettings,
-    rays: &'a AtomicU64,
-    tick: Tick<'a>,
     dims: [usize; 3],
     isovalues: Vec<f64>,
     parts: Vec<Texel>,
@@ -115,22 +108,23 @@ impl<T: Tracer> Raster<'_, T> {
 
     /// Direct irradiance of texel `i` at `at`, by at most `shadow_rays` a luminaire.
     fn estimate(&self, i: usize, at: [f64; 2], shadow_rays: u32) -> Estimate {
+        let Filler { scene, tracer, settings, rays, .. } = *self.filler;
         #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
         let receiver = Receiver {
-            position: self.scene.lattice().to_index(self.flat.at(at)).as_vec3(),
+            position: scene.lattice().to_index(self.flat.at(at)).as_vec3(),
             normal: self.flat.normal,
             isovalue: self.isovalue(i) as f32,
             departure: self.flat.departure,
         };
-        let key = Stage::Cache.key(self.settings.seed, !(((self.number as u64) << 40) | i as u64));
-        let direct = direct_irradiance(self.scene, self.tracer, &receiver, shadow_rays, key);
-        self.rays.fetch_add(direct.rays, Ordering::Relaxed);
+        let key = Stage::Cache.key(settings.seed, !(((self.number as u64) << 40) | i as u64));
+        let direct = direct_irradiance(scene, tracer, &receiver, shadow_rays, key);
+        rays.fetch_add(direct.rays, Ordering::Relaxed);
         direct
     }
 
     /// Shadow rays of most texels, and of those that see a luminaire in part or stand beside such.
     fn shadow_rays(&self) -> [u32; 2] {
-        let few = self.settings.flat_shadow_rays;
+        let few = self.filler.settings.flat_shadow_rays;
         [few, PENUMBRA * few.max(LEAST_FEW)]
     }
 
@@ -141,15 +135,15 @@ impl<T: Tracer> Raster<'_, T> {
             Some(open) if open.outer[i] => open.place(i, true),
             _ => Some(self.part(i).at),
         };
-        let estimate = |i: usize, rays: u32| Some(self.estimate(i, place(i).filter(|_| (self.tick)(0))?, rays));
-        direct_light(self.dims, estimate, self.shadow_rays(), self.tick)
+        let estimate = |i: usize, rays: u32| Some(self.estimate(i, place(i).filter(|_| (self.filler.tick)(0))?, rays));
+        direct_light(self.dims, estimate, self.shadow_rays(), self.filler.tick)
     }
 
     /// The same within the solids that stand on a wall; `None` if there are none.
     fn within(&self, known: &[Option<DVec3>]) -> Option<WithinSolids> {
-        let open = self.open.as_ref().filter(|_| self.number < self.scene.polygons().len())?;
+        let open = self.open.as_ref().filter(|_| self.number < self.filler.scene.polygons().len())?;
         let [few, many] = self.shadow_rays();
-        let solid = |i: usize| self.part(i).covered > 0.0 && open.shares[i] < 1.0 && (self.tick)(0);
+        let solid = |i: usize| self.part(i).covered > 0.0 && open.shares[i] < 1.0 && (self.filler.tick)(0);
         let own = (0..known.len()).into_par_iter().with_min_len(256).map(|i| match solid(i) {
             true if self.outer(i) => open.place(i, false).map(|at| {
                 let roughly = self.estimate(i, at, few);
@@ -166,7 +160,7 @@ impl<T: Tracer> Raster<'_, T> {
     /// Later landings by texel, those outside of solids and those within, as irradiance on the part of it that is so.
     fn binned(&self, photons: impl Iterator<Item = FlatPhoton>, solid: Option<&Solid>, areas: f64) -> [Binned; 2] {
         let texels = self.isovalues.len() * self.parts.len();
-        let bins = FlatTexture { axis: self.settings.axis, ..FlatTexture::black(self.dims) };
+        let bins = FlatTexture { axis: self.filler.settings.axis, ..FlatTexture::black(self.dims) };
         let mut powers = [(); 2].map(|()| vec![DVec3::ZERO; texels]);
         let mut counts = [0u64; 2];
         for p in photons.filter(|p| p.bounces > 0) {
@@ -176,11 +170,10 @@ impl<T: Tracer> Raster<'_, T> {
             counts[n] += 1;
         }
         let texel = areas * self.flat.area() / self.parts.len() as f64;
-        let edges = self.settings.axis.edges(self.dims[2]);
+        let edges = self.filler.settings.axis.edges(self.dims[2]);
         let sizes: Vec<f64> = edges.windows(2).map(|c| texel * (c[1] - c[0])).collect();
-        let mut within = [false, true].into_iter();
-        powers.map(|powers| {
-            let within = within.next().expect("two of them");
+        let [outer, inner] = powers;
+        [(outer, false), (inner, true)].map(|(powers, within)| {
             let density = |(i, p): (usize, DVec3)| p / sizes[i / self.parts.len()];
             let share = |i: usize| if within { 1.0 - self.share(i) } else { self.share(i) };
             Binned {
@@ -219,7 +212,7 @@ impl<T: Tracer> Raster<'_, T> {
         let all = 0..self.isovalues.len() * self.parts.len();
         let texels = all.map(|i| reflected(self.flat.albedo.at(self.isovalue(i)), irradiance(i)));
         let texels = texels.map(|l| l.as_vec3().to_array()).collect();
-        FlatTexture { dims: self.dims, axis: self.settings.axis, texels }
+        FlatTexture { dims: self.dims, axis: self.filler.settings.axis, texels }
     }
 }
 
@@ -293,14 +286,16 @@ fn widened(image: &[Option<DVec3>], dims: [usize; 3], outer: &(dyn Fn(usize) -> 
 
 #[cfg(test)]
 mod tests {
+    use super::super::CacheSettings;
     use super::*;
     use crate::field::{Field, Sweep};
     use crate::flattened::{FlattenedHit, FlattenedRay, Side};
     use crate::isovalue_axis::IsovalueAxis;
     use crate::rng::Rng;
-    use crate::scene::{Boundary, Surface, cornell_box};
+    use crate::scene::{Boundary, Scene, Surface, cornell_box};
     use crate::volume::{Lattice, Samples, Volume};
     use glam::Vec3;
+    use std::sync::atomic::AtomicU64;
 
     const SETTINGS: CacheSettings = CacheSettings {
         node_shadow_rays: 1,
@@ -320,6 +315,17 @@ mod tests {
         };
         let volume = Volume::new("h", lattice.clone(), Samples::F32((0..lattice.len()).map(h).collect())).unwrap();
         Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap()
+    }
+
+    fn filled<T: Tracer>(
+        scene: &Scene,
+        tracer: &T,
+        number: usize,
+        photons: impl Iterator<Item = FlatPhoton>,
+        settings: &CacheSettings,
+    ) -> Filled {
+        let filler = Filler { scene, tracer, settings, rays: &AtomicU64::new(0), tick: &|_| true };
+        fill_flat(&filler, number, photons, 1.0)
     }
 
     struct Nothing;
@@ -353,10 +359,7 @@ mod tests {
             let mut rng = Rng::stream(1, Stage::Test, i);
             FlatPhoton { flat: ceiling, uvc: [(); 3].map(|()| rng.unit() as f32), power, bounces: 1 }
         });
-        let texture = fill_flat(&scene, &Nothing, number, photons, 1.0, &SETTINGS, (&AtomicU64::new(0), &|_| true))
-            .gathered
-            .unwrap()
-            .outside;
+        let texture = filled(&scene, &Nothing, number, photons, &SETTINGS).gathered.unwrap().outside;
         let (hidden, expected) = (Hidden::new(&scene, number, &flat), reflected(flat.albedo.at(0.5), DVec3::ONE).x);
         let mut shown = [crate::stats::Moments::default(); 2];
         let mut most = 0f64;
@@ -394,7 +397,7 @@ mod tests {
         let [few, many] = [8, 4096].map(|flat_shadow_rays| {
             let settings = CacheSettings { flat_shadow_rays, ..SETTINGS };
             let nothing = std::iter::empty();
-            let filled = fill_flat(&scene, &Edge, floor, nothing, 1.0, &settings, (&AtomicU64::new(0), &|_| true));
+            let filled = filled(&scene, &Edge, floor, nothing, &settings);
             filled.shown.unwrap().outside.texels
         });
         let sum = |square: &dyn Fn(usize) -> f32| (0..many.len()).map(square).sum::<f32>();
@@ -428,10 +431,7 @@ mod tests {
             .collect();
         assert!(photons.len() > 100_000 && photons.len() < 300_000, "{}", photons.len());
         let fill = |photons: &[FlatPhoton]| {
-            fill_flat(&scene, &Nothing, floor, photons.iter().copied(), 1.0, &SETTINGS, (&AtomicU64::new(0), &|_| true))
-                .gathered
-                .unwrap()
-                .outside
+            filled(&scene, &Nothing, floor, photons.iter().copied(), &SETTINGS).gathered.unwrap().outside
         };
         let texture = fill(&photons);
         let expected = reflected(flat.albedo.at(0.5), DVec3::splat(irradiance)).x;
@@ -505,9 +505,7 @@ mod tests {
             })
             .collect();
         let tracer = Outside(&scene.field);
-        let fill = |scene: &Scene| {
-            fill_flat(scene, &tracer, floor, photons.iter().copied(), 1.0, &SETTINGS, (&AtomicU64::new(0), &|_| true))
-        };
+        let fill = |scene: &Scene| filled(scene, &tracer, floor, photons.iter().copied(), &SETTINGS);
         let filled = fill(&scene).gathered.unwrap();
         assert_eq!(fill(&one).gathered.unwrap(), filled, "whatever else is stored");
         // Within 0.03 of the surface, and farther off: from within, and from outside.
@@ -551,7 +549,7 @@ mod tests {
             };
             let photons = (0..count).map(|i| place(1, i)).filter(|&p| depth(p) >= 0.0);
             let photons = photons.map(|p| FlatPhoton { flat: 2, uvc: p.map(|x| x as f32), power, bounces: 1 });
-            let filled = fill_flat(&scene, &Nothing, number, photons, 1.0, &SETTINGS, (&AtomicU64::new(0), &|_| true));
+            let filled = filled(&scene, &Nothing, number, photons, &SETTINGS);
             let FlatLight { outside: texture, within } = filled.gathered.unwrap();
             assert_eq!(within, Within::Same, "no light is within");
             let expected = reflected(flat.albedo.at(0.5), DVec3::splat(irradiance)).x;
