@@ -251,6 +251,14 @@ fn one_frame(path: &Path) -> Result<()> {
     ))
 }
 
+/// Fails if an `--exposure` is no brightness.
+fn check_exposure(exposure: f64) -> Result<()> {
+    if exposure > 0.0 && exposure.is_finite() {
+        return Ok(());
+    }
+    Err(Error::Invalid(format!("--exposure {exposure}: must be a positive finite number")))
+}
+
 fn expect_extension(path: &Path, known: &[&str]) -> Result<()> {
     let found = path.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
     if known.contains(&found.as_str()) {

@@ -1,7 +1,7 @@
 //! `isolume compare`: a bake against one or two references of an isosurface, or all of its isosurfaces against paths.
 
 use super::final_gather::{FinalGatherOptions, light};
-use super::{device, expect_extension, outputs};
+use super::{check_exposure, device, expect_extension, outputs};
 use crate::accuracy::{Accuracy, ReferenceMesh, Survey, SurveySettings, belongs, compare, survey};
 use crate::digits::brief_span;
 use crate::embree::GraphTracer;
@@ -69,9 +69,7 @@ pub(super) struct Compare {
 impl Compare {
     pub(super) fn run(self, progress: Progress) -> Result<()> {
         let rays = self.rays.settings()?;
-        if !(self.exposure > 0.0 && self.exposure.is_finite()) {
-            return Err(Error::Invalid(format!("--exposure {}: must be a positive finite number", self.exposure)));
-        }
+        check_exposure(self.exposure)?;
         if self.references.is_empty() {
             return self.everywhere(rays, progress);
         }

@@ -3,7 +3,7 @@
 use super::extract::open_bake;
 use super::final_gather::FinalGatherOptions;
 use super::reference::picture;
-use super::{device, expect_extension, outputs};
+use super::{check_exposure, device, expect_extension, outputs};
 use crate::digits::Shortest;
 use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
@@ -187,10 +187,7 @@ impl Render {
         if !(1..=1 << 16).contains(&self.samples) {
             return Err(Error::Invalid("--samples: 1 to 65536 rays per pixel".into()));
         }
-        if !(self.exposure > 0.0 && self.exposure.is_finite()) {
-            return Err(Error::Invalid(format!("--exposure {}: must be a positive finite number", self.exposure)));
-        }
-        Ok(())
+        check_exposure(self.exposure)
     }
 
     fn read(&self, gather: Option<FinalGatherSettings>) -> Result<Source> {
