@@ -15,7 +15,7 @@ pub use floor::InterpolationFloor;
 pub use survey::{Part, Survey, SurveySettings, survey};
 
 use crate::error::{Error, Result};
-use crate::export::ply::PlyMesh;
+use crate::export::ply::{PlyMesh, RADIANCE, SAMPLED, VARIANCE};
 use crate::surface_mesh::vertex_areas;
 use glam::DVec3;
 use serde::Serialize;
@@ -49,8 +49,8 @@ impl ReferenceMesh {
         let missing = |what: &str| Error::Invalid(format!("has no {what}; make it with `isolume reference`"));
         let radiance =
             triple(RADIANCE).ok_or_else(|| missing("vertex properties radiance_r, radiance_g, radiance_b"))?;
-        let flags = mesh.property("sampled").map_or_else(|| vec![1.0; radiance.len()], <[f64]>::to_vec);
-        finite(["sampled"], flags.iter().map(|&flag| [flag]))?;
+        let flags = mesh.property(SAMPLED).map_or_else(|| vec![1.0; radiance.len()], <[f64]>::to_vec);
+        finite([SAMPLED], flags.iter().map(|&flag| [flag]))?;
         let read = Self {
             positions: triple(POSITION).ok_or_else(|| missing("positions"))?,
             triangles: mesh.triangles.clone(),
@@ -84,10 +84,8 @@ impl ReferenceMesh {
     }
 }
 
-/// Vertex properties of references.
+/// The vertex properties of positions.
 const POSITION: [&str; 3] = ["x", "y", "z"];
-const RADIANCE: [&str; 3] = ["radiance_r", "radiance_g", "radiance_b"];
-const VARIANCE: [&str; 3] = ["variance_r", "variance_g", "variance_b"];
 
 /// Refuses values that are no finite numbers: clamped to what is displayed they would be black.
 fn finite<const N: usize>(names: [&str; N], values: impl Iterator<Item = [f64; N]>) -> Result<()> {

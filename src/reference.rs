@@ -121,15 +121,9 @@ impl Reference {
         let radiance = [0, 1, 2].map(|c| channel(&self.radiance, c));
         let variance = [0, 1, 2].map(|c| channel(&self.variance, c));
         let sampled: Vec<f32> = self.sampled.iter().map(|&s| if s { 1.0 } else { 0.0 }).collect();
-        let properties: Vec<(&str, &[f32])> = vec![
-            ("radiance_r", &radiance[0]),
-            ("radiance_g", &radiance[1]),
-            ("radiance_b", &radiance[2]),
-            ("variance_r", &variance[0]),
-            ("variance_g", &variance[1]),
-            ("variance_b", &variance[2]),
-            ("sampled", &sampled),
-        ];
+        let names = [&ply::RADIANCE[..], &ply::VARIANCE, &[ply::SAMPLED]].concat();
+        let values = radiance.iter().chain(&variance).chain([&sampled]).map(Vec::as_slice);
+        let properties: Vec<(&str, &[f32])> = names.into_iter().zip(values).collect();
         ply::write_with_comments(path, &mesh.export(&properties), &[comment])
     }
 }

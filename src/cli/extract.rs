@@ -95,10 +95,8 @@ impl Extract {
         let radiance = found.as_ref().map(|f| &f.radiance);
         let channels: Option<[Vec<f32>; 3]> = radiance.map(|r| [0, 1, 2].map(|c| channel(r, c)));
         let colours = radiance.zip(baked.as_ref()).map(|(r, b)| display_colours(r, b.exposure));
-        let mut properties: Vec<(&str, &[f32])> = match &channels {
-            Some([r, g, b]) => vec![("radiance_r", r), ("radiance_g", g), ("radiance_b", b)],
-            None => Vec::new(),
-        };
+        let values = channels.iter().flatten().map(Vec::as_slice);
+        let mut properties: Vec<(&str, &[f32])> = ply::RADIANCE.into_iter().zip(values).collect();
         let std_error = found.as_ref().and_then(|f| f.std_error.as_ref());
         properties.extend(std_error.map(|std_error| ("std_error", &std_error[..])));
         unless_interrupted()?;

@@ -15,6 +15,15 @@ use std::path::Path;
 /// Names of vertex properties with a meaning of their own.
 const RESERVED: [&str; 9] = ["x", "y", "z", "nx", "ny", "nz", "red", "green", "blue"];
 
+/// The vertex properties of radiance, linear: red, green, blue.
+pub const RADIANCE: [&str; 3] = ["radiance_r", "radiance_g", "radiance_b"];
+
+/// The vertex properties of the variance of a reference's radiance.
+pub const VARIANCE: [&str; 3] = ["variance_r", "variance_g", "variance_b"];
+
+/// The vertex property that is 1 where a reference was computed, else 0.
+pub const SAMPLED: &str = "sampled";
+
 /// Writes `mesh`: `x y z`, `nx ny nz`, the named properties (all float, but see above), then `red green blue` (uchar).
 ///
 /// # Errors
@@ -112,7 +121,7 @@ impl PlyMesh {
         self.properties.iter().find(|(n, _)| n == name).map(|(_, values)| values.as_slice())
     }
 
-    /// Three vertex properties side by side, such as `["x", "y", "z"]` or `["radiance_r", "radiance_g", "radiance_b"]`.
+    /// Three vertex properties side by side, such as `["x", "y", "z"]` or [`RADIANCE`].
     pub fn triple(&self, names: [&str; 3]) -> Option<Vec<[f64; 3]>> {
         let [a, b, c] = names.map(|name| self.property(name));
         Some(a?.iter().zip(b?).zip(c?).map(|((a, b), c)| [*a, *b, *c]).collect())
