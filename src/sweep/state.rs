@@ -225,11 +225,10 @@ impl State {
             let mut settling = Settling::new([0.0; 3]);
             (settling.passes, settling.since) = (from.count()?, from.count()?);
             for three in settling.reals() {
-                *three = from.three()?;
+                *three = from.three_of(Reader::real)?;
             }
             let (corrected, defects) = (from.count()? == 1, of(from.count()?)?);
-            let mut three = || Some([from.halves(places)?, from.halves(places)?, from.halves(places)?]);
-            let defect = (0..defects).map(|_| three()).collect::<Option<_>>()?;
+            let defect = (0..defects).map(|_| from.three_of(|from| from.halves(places))).collect::<Option<_>>()?;
             let mut textures = Vec::new();
             for t in flats.textures.iter().flatten() {
                 let radiance = from.numbers(t.radiance.len())?;
@@ -315,8 +314,8 @@ impl Reader<'_> {
         Some(f64::from_le_bytes(*head))
     }
 
-    fn three(&mut self) -> Option<[f64; 3]> {
-        Some([self.real()?, self.real()?, self.real()?])
+    fn three_of<T>(&mut self, each: impl Fn(&mut Self) -> Option<T>) -> Option<[T; 3]> {
+        Some([each(self)?, each(self)?, each(self)?])
     }
 
     fn numbers(&mut self, n: usize) -> Option<Vec<f32>> {
@@ -346,20 +345,20 @@ impl Reader<'_> {
     }
 
     fn four_halves(&mut self, n: usize) -> Option<Vec<Half4>> {
-        let [r, g, b] = [self.halves(n)?, self.halves(n)?, self.halves(n)?];
+        let [r, g, b] = self.three_of(|from| from.halves(n))?;
         Some(r.into_iter().zip(g).zip(b).map(|((r, g), b)| [r, g, b, 0]).collect())
     }
 
     fn half_planes(&mut self, sides: usize, places: usize) -> Option<Vec<HalfPlanes>> {
         let mut side = || {
             let [unit] = self.numbers(1)?.try_into().ok()?;
-            Some(HalfPlanes { planes: [self.halves(places)?, self.halves(places)?, self.halves(places)?], unit })
+            Some(HalfPlanes { planes: self.three_of(|from| from.halves(places))?, unit })
         };
         (0..sides).map(|_| side()).collect()
     }
 
     fn planes(&mut self, sides: usize, places: usize) -> Option<Vec<Planes>> {
-        (0..sides).map(|_| Some([self.numbers(places)?, self.numbers(places)?, self.numbers(places)?])).collect()
+        (0..sides).map(|_| self.three_of(|from| from.numbers(places))).collect()
     }
 }
 
