@@ -128,7 +128,7 @@ impl<'a> FaceWalls<'a> {
             let nodes = dims[0] * dims[1] * dims[2] / dims[face / 2];
             let wall = |at: usize| {
                 let [i, j, k] = node(dims, face, at);
-                let lit = geometry.lit(i + dims[0] * (j + dims[1] * k));
+                let lit = geometry.lit(lattice.offset(i, j, k));
                 let x = lattice.to_world(DVec3::new(i as f64, j as f64, k as f64));
                 // Behind a luminaire that covers the wall it is not the wall that is seen.
                 let wall = walls.iter().find(|(_, p)| lit && p.is_nearer(x, near) && !scene.covers(x));
@@ -149,7 +149,7 @@ impl<'a> FaceWalls<'a> {
             let shown = |(at, &number): (usize, &u16)| {
                 let Some(wall) = self.scene.polygons().get(usize::from(number)) else { return Half4::default() };
                 let [i, j, k] = node(dims, face, at);
-                let c = geometry.h[i + dims[0] * (j + dims[1] * k)];
+                let c = geometry.h[lattice.offset(i, j, k)];
                 let uv = wall.texture(lattice.to_world(DVec3::new(i as f64, j as f64, k as f64)));
                 let texels = flats.texels(flats.number(u32::from(number), side), uv.map(|x| x.clamp(0.0, 1.0) as f32));
                 let shows = texels.into_iter().flatten().map(|(start, w)| stands.end(start, c).map(|b| w * b));
