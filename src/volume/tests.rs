@@ -1,4 +1,5 @@
 use super::*;
+use glam::DVec3;
 
 #[test]
 fn files_are_told_apart_by_their_extension() {
