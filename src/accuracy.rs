@@ -12,7 +12,7 @@ mod survey;
 pub use belongs::belongs;
 use clamped::clamped_variance;
 pub use floor::InterpolationFloor;
-pub use survey::{Part, Survey, SurveySettings, survey};
+pub use survey::{Part, Shown, Survey, SurveySettings, survey};
 
 use crate::error::{Error, Result};
 use crate::export::ply::{PlyMesh, RADIANCE, SAMPLED, VARIANCE};

@@ -96,20 +96,35 @@ const STRATA: u8 = 40;
 /// Points to choose from for each that is chosen.
 const CANDIDATES: u64 = 64;
 
-/// Compares `grid` (over `lattice`, of the outside) with paths through `scene`, of whose field it is: at points on
-/// isosurfaces what is `shown` there, given index coordinates of `lattice` and the point's number; at the grid's own
-/// what it holds. rgb = radiance × `exposure`, which is the bake's: that of `scene`, as it is lit, may leave out
-/// volumes that were baked with it. `tick(n)` reports n of 2 · points done; returning false stops early, with a result
-/// that is worth nothing.
+/// What a bake shows of the outside.
+#[derive(Clone, Copy)]
+pub struct Shown<'a> {
+    /// Its grid, and what that stands on.
+    pub grid: &'a IlluminationGrid,
+    /// The grid's lattice, over the volume's.
+    pub lattice: &'a Lattice,
+    /// Radiance on isosurfaces, given index coordinates of `lattice` and the point's number.
+    pub radiance: &'a (dyn Fn(DVec3, u64) -> DVec3 + Sync),
+    /// rgb = radiance × this. That of the scene, as it is lit, may leave out volumes that were baked with it.
+    pub exposure: f64,
+}
+
+impl std::fmt::Debug for Shown<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Shown").field("lattice", self.lattice).field("exposure", &self.exposure).finish_non_exhaustive()
+    }
+}
+
+/// Compares what is `shown` with paths through `scene`, of whose field it is: at points on isosurfaces, and at the
+/// grid's own what it holds. `tick(n)` reports n of 2 · points done; returning false stops early, with a result that is
+/// worth nothing.
 ///
 /// # Errors
 /// `Invalid` if no isosurface of the sweep is found.
 pub fn survey<T: Tracer>(
     scene: &Scene,
     tracer: &T,
-    (lattice, grid): (&Lattice, &IlluminationGrid),
-    shown: &(dyn Fn(DVec3, u64) -> DVec3 + Sync),
-    exposure: f64,
+    shown: Shown,
     settings: &SurveySettings,
     tick: Tick,
 ) -> Result<Survey> {
@@ -117,27 +132,21 @@ pub fn survey<T: Tracer>(
     if chosen.is_empty() {
         return Err(Error::Invalid("no isosurface of its sweep was found; bake a sweep that has some".into()));
     }
-    let side = scene.surface.outside;
+    let Shown { grid, lattice, radiance, exposure } = shown;
     let scale = lattice.far() / scene.lattice().far();
-    let rays = AtomicU64::new(0);
-    let compare = |p: DVec3, shown: [DVec3; 2], index: usize| {
-        #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
-        let receiver = Receiver::on_level_set(scene, p, scene.field.value(p) as f32, side)?;
-        let open = !scene.covers(scene.lattice().to_world(p)) && tick(0);
-        open.then(|| Deviation::new(&receiver, shown, exposure, settings, (scene, tracer), (index, &rays)))
-    };
+    let referee = Referee { scene, tracer, settings, exposure, rays: AtomicU64::new(0), tick };
     // On the isosurface, and at a point of the grid beside it.
     let found: Vec<[Option<Deviation>; 2]> = chosen
         .par_iter()
         .enumerate()
         .with_max_len(16)
         .map(|(i, &p)| {
-            let shown = [shown(p * scale, i as u64), grid.interpolate(lattice, p * scale)];
-            let between = compare(p, shown, 2 * i);
+            let between =
+                referee.judge(p, [radiance(p * scale, i as u64), grid.interpolate(lattice, p * scale)], 2 * i);
             tick(1);
             let at = beside(lattice, grid, p * scale, &mut stream(settings, i as u64)).and_then(|o| {
                 let texture = DVec3::from_array(grid.radiance[o].map(f64::from));
-                compare(local_position(&scene.field, lattice, o), [texture; 2], 2 * i + 1)
+                referee.judge(local_position(&scene.field, lattice, o), [texture; 2], 2 * i + 1)
             });
             tick(1);
             [between, at]
@@ -157,21 +166,22 @@ pub fn survey<T: Tracer>(
             percent_rms: percent(mean_square(&own).0),
         }
     });
+    let mean = |of: fn(&Deviation) -> f64| all.iter().map(of).sum::<f64>() / (all.len() as f64).max(1.0);
     Ok(Survey {
         points: all.len(),
         paths: settings.paths,
         percent_rms: percent(square),
-        percent_rms_texture: percent(all.iter().map(|d| d.texture_square).sum::<f64>() / (all.len() as f64).max(1.0)),
+        percent_rms_texture: percent(mean(|d| d.texture_square)),
         percent_rms_sqrt3: percent(square / 3.0),
         confidence: confidence.map(percent),
         grid_points: at_points.len(),
         percent_rms_grid_points: of_grid_points.map(|(square, _)| percent(square)),
         confidence_grid_points: of_grid_points.map(|(_, confidence)| confidence.map(percent)),
-        bias: 100.0 * all.iter().map(|d| d.bias).sum::<f64>() / (all.len() as f64).max(1.0),
+        bias: 100.0 * mean(|d| d.bias),
         parts: parts.collect(),
-        clamped: all.iter().filter(|d| d.clamped).count() as f64 / (all.len() as f64).max(1.0),
+        clamped: mean(|d| f64::from(u8::from(d.clamped))),
         left_out: chosen.len() - all.len(),
-        rays: rays.into_inner(),
+        rays: referee.rays.into_inner(),
     })
 }
 
@@ -189,25 +199,40 @@ struct Deviation {
     clamped: bool,
 }
 
-impl Deviation {
-    fn new<T: Tracer>(
-        at: &Receiver,
-        shown: [DVec3; 2],
-        exposure: f64,
-        settings: &SurveySettings,
-        (scene, tracer): (&Scene, &T),
-        (index, rays): (usize, &AtomicU64),
-    ) -> Self {
-        let mut paths = PathTracer::new(scene, tracer);
+/// Paths that points are compared with.
+struct Referee<'a, T> {
+    scene: &'a Scene,
+    tracer: &'a T,
+    settings: &'a SurveySettings,
+    exposure: f64,
+    rays: AtomicU64,
+    tick: Tick<'a>,
+}
+
+impl<T: Tracer> Referee<'_, T> {
+    /// What is shown, and what the texture holds, at local `p`, by paths of their own for every `index`. `None` where
+    /// ∇h vanishes, where a luminaire covers the place, and when time is up.
+    fn judge(&self, p: DVec3, shown: [DVec3; 2], index: usize) -> Option<Deviation> {
+        let Self { scene, settings, exposure, .. } = *self;
+        #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
+        let at = Receiver::on_level_set(scene, p, scene.field.value(p) as f32, scene.surface.outside)?;
+        if scene.covers(scene.lattice().to_world(p)) || !(self.tick)(0) {
+            return None;
+        }
+        let mut paths = PathTracer::new(scene, self.tracer);
         let found = [1, 2].map(|n| {
-            display(paths.outgoing(at, settings.paths, Stage::Path.key(seed(settings, n), index as u64)), exposure)
+            display(paths.outgoing(&at, settings.paths, Stage::Path.key(seed(settings, n), index as u64)), exposure)
         });
-        rays.fetch_add(paths.rays, Ordering::Relaxed);
+        self.rays.fetch_add(paths.rays, Ordering::Relaxed);
         let off = |shown: DVec3| found.map(|r| display(shown, exposure) - r);
         let ([a, b], [c, d]) = (off(shown[0]), off(shown[1]));
-        let bias = (a + b).element_sum() / 6.0;
-        let clamped = found.into_iter().chain([display(shown[0], exposure)]).all(|c| c == DVec3::ONE);
-        Self { isovalue: f64::from(at.isovalue), square: a.dot(b), texture_square: c.dot(d), bias, clamped }
+        Some(Deviation {
+            isovalue: f64::from(at.isovalue),
+            square: a.dot(b),
+            texture_square: c.dot(d),
+            bias: (a + b).element_sum() / 6.0,
+            clamped: found.into_iter().chain([display(shown[0], exposure)]).all(|c| c == DVec3::ONE),
+        })
     }
 }
 
@@ -318,8 +343,9 @@ mod tests {
         let device = Device::new(0).unwrap();
         let tracer = GraphTracer::new(&device, scene).unwrap();
         let settings = SurveySettings { points, paths: 1, seed: 3 };
-        let shown = |p, _| grid.interpolate(lattice, p);
-        survey(scene, &tracer, (lattice, &grid), &shown, scene.exposure(), &settings, &|_| true).unwrap()
+        let radiance = |p, _| grid.interpolate(lattice, p);
+        let shown = Shown { grid: &grid, lattice, radiance: &radiance, exposure: scene.exposure() };
+        survey(scene, &tracer, shown, &settings, &|_| true).unwrap()
     }
 
     #[test]

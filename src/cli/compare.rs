@@ -2,7 +2,7 @@
 
 use super::final_gather::{FinalGatherOptions, light};
 use super::{check_exposure, device, expect_extension, outputs};
-use crate::accuracy::{Accuracy, ReferenceMesh, Survey, SurveySettings, belongs, compare, survey};
+use crate::accuracy::{Accuracy, ReferenceMesh, Shown, Survey, SurveySettings, belongs, compare, survey};
 use crate::digits::brief_span;
 use crate::embree::GraphTracer;
 use crate::error::{Error, Result};
@@ -170,7 +170,7 @@ impl Compare {
         let gather = rays.zip(within.as_ref()).map(|(rays, tracer)| FinalGather::new(&baked, tracer, rays));
         let gather = gather.transpose().map_err(in_file)?;
         #[allow(clippy::cast_possible_truncation, reason = "isovalues are f32")]
-        let shown = |p: DVec3, index| {
+        let radiance = |p: DVec3, index| {
             let isovalue = || baked.scene.field.value(p) as f32;
             let light = gather
                 .as_ref()
@@ -179,7 +179,8 @@ impl Compare {
         };
         let stage = progress.stage("paths", 2 * self.points as u64);
         let exposure = baked.exposure * self.exposure;
-        let found = survey(&scene, &tracer, (baked.lattice(), grid), &shown, exposure, &settings, &|n| stage.tick(n));
+        let shown = Shown { grid, lattice: baked.lattice(), radiance: &radiance, exposure };
+        let found = survey(&scene, &tracer, shown, &settings, &|n| stage.tick(n));
         stage.end()?;
         let found = found.map_err(in_file)?;
         warn_of_clamped(found.clamped, "points");

@@ -2,7 +2,7 @@
 
 use super::{Folder, QUICK, isolume, ok, refused, text};
 use glam::DVec3;
-use isolume::accuracy::SurveySettings;
+use isolume::accuracy::{Shown, SurveySettings};
 use isolume::embree::{Device, GraphTracer};
 use isolume::export::bake_file::BakedVolume;
 use isolume::export::ply::{self, PlyMesh};
@@ -178,17 +178,9 @@ fn all_isosurfaces_are_compared_with_paths() {
     let mut grid = baked.sides[0].1.clone();
     grid.radiance.as_flattened_mut().iter_mut().for_each(|x| *x *= 0.9);
     let settings = SurveySettings { points: 6000, paths: 16, seed: 1 };
-    let shown = |p, _| grid.interpolate(baked.lattice(), p);
-    let dim = isolume::accuracy::survey(
-        &scene,
-        &tracer,
-        (baked.lattice(), &grid),
-        &shown,
-        baked.exposure,
-        &settings,
-        &|_| true,
-    );
-    let dim = dim.unwrap();
+    let radiance = |p, _| grid.interpolate(baked.lattice(), p);
+    let shown = Shown { grid: &grid, lattice: baked.lattice(), radiance: &radiance, exposure: baked.exposure };
+    let dim = isolume::accuracy::survey(&scene, &tracer, shown, &settings, &|_| true).unwrap();
     let missing = number(&found, "bias") - dim.bias;
     assert!((1.0..8.0).contains(&missing) && dim.percent_rms > number(&found, "percent_rms") + 1.0, "{dim:?}");
     let said = text(&ok(dir, &["compare", "lit.vti", "-q"]).stdout);

@@ -1,7 +1,7 @@
 //! `bake --split`: light in two parts, of which direct light is exact between grid points.
 
 use super::{Folder, ok, refused, text};
-use isolume::accuracy::{Survey, SurveySettings, survey};
+use isolume::accuracy::{Shown, Survey, SurveySettings, survey};
 use isolume::embree::{Device, GraphTracer};
 use isolume::export::bake_file::BakedVolume;
 use isolume::illumination_grid::IlluminationGrid;
@@ -21,8 +21,9 @@ fn surveyed(baked: &BakedVolume, grid: &IlluminationGrid) -> Survey {
     let (device, scene) = (Device::new(0).unwrap(), baked.source().unwrap().unwrap());
     let tracer = GraphTracer::new(&device, &scene).unwrap();
     let settings = SurveySettings { points: 20_000, paths: 8, seed: 1 };
-    let shown = |p, _| grid.radiance_at(&baked.scene, baked.lattice(), p, baked.scene.surface.outside);
-    survey(&scene, &tracer, (baked.lattice(), grid), &shown, baked.exposure, &settings, &|_| true).unwrap()
+    let radiance = |p, _| grid.radiance_at(&baked.scene, baked.lattice(), p, baked.scene.surface.outside);
+    let shown = Shown { grid, lattice: baked.lattice(), radiance: &radiance, exposure: baked.exposure };
+    survey(&scene, &tracer, shown, &settings, &|_| true).unwrap()
 }
 
 /// By either engine, on the volume's own grid, on both sides of a finer one, and where some grid points are fitted: at
