@@ -81,7 +81,7 @@ fn main() {
     let receivers: Vec<Receiver> = (0..scene.lattice().len())
         .step_by(STRIDE)
         .filter_map(|o| {
-            let p = DVec3::from_array(scene.lattice().ijk(o).map(|i| i as f64));
+            let p = scene.lattice().point(o);
             let isovalue = scene.field.value(p);
             let normal = scene.normal(p, Side::Lower).filter(|_| (0.0..=1.0).contains(&isovalue))?;
             let departure = Departure::Surface(Side::Lower);

@@ -81,7 +81,7 @@ fn main() {
             target: Some(id),
             ..FlattenedRay::free(r.position, direction, r.isovalue)
         };
-        f64::from(u8::from(!tracer.occluded(&ray)))
+        f64::from(!tracer.occluded(&ray))
     };
     let rays = 32u32;
     let random = |r: &Receiver, seed, i| {

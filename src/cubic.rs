@@ -145,7 +145,7 @@ mod tests {
         for _ in 0..100_000 {
             let mut c = [0.0; 4];
             for x in &mut c {
-                *x = (rng.unit() - 0.5) * 10f64.powf(20.0 * rng.unit() - 10.0) * f64::from(u8::from(rng.unit() < 0.8));
+                *x = (rng.unit() - 0.5) * 10f64.powf(20.0 * rng.unit() - 10.0) * f64::from(rng.unit() < 0.8);
             }
             let t = Cubic { c }.first_crossing(1.5, true, false).expect("states differ");
             assert!((0.0..=1.5).contains(&t), "{c:?}: {t}");

@@ -241,7 +241,7 @@ impl Field {
     /// Whether a cell around sample `o` has finite ones only: elsewhere no level set passes through it.
     #[inline]
     pub fn is_in_whole_cell(&self, o: usize) -> bool {
-        !self.gaps || self.value(DVec3::from_array(self.lattice.ijk(o).map(|i| i as f64))).is_finite()
+        !self.gaps || self.value(self.lattice.point(o)).is_finite()
     }
 
     /// Whether all cells that hold `p` have finite samples only.
@@ -527,7 +527,7 @@ mod tests {
         let other = fine.coarsened([4, 3, 5]).unwrap();
         assert_eq!(other.lattice().dims(), [3, 3, 3]);
         for o in 0..27 {
-            let p = DVec3::from_array(other.lattice().ijk(o).map(|i| i as f64)) * DVec3::new(4.0, 3.0, 5.0);
+            let p = other.lattice().point(o) * DVec3::new(4.0, 3.0, 5.0);
             assert_eq!(f64::from(other.samples()[o]), fine.value(p));
         }
         assert_eq!(f.coarsened([1; 3]).unwrap().samples(), f.samples());

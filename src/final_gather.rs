@@ -277,7 +277,7 @@ mod tests {
     /// Spheres around the origin of [−1, 1]³, cells of 0.05, that are lit from within or from without.
     fn spheres(outside: Side, luminaires: Vec<Polygon>) -> Scene {
         let lattice = Lattice::aligned([41; 3], DVec3::splat(-1.0), DVec3::splat(0.05)).unwrap();
-        let place = |o: usize| lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)));
+        let place = |o: usize| lattice.to_world(lattice.point(o));
         let samples = (0..lattice.len()).map(|o| place(o).length()).collect();
         let volume = Volume::new("spheres", lattice.clone(), Samples::F64(samples)).unwrap();
         let field = Field::new(&volume, Sweep::new(0.2, 0.9).unwrap()).unwrap();
@@ -442,7 +442,7 @@ mod tests {
 
     impl KnownLight for Inside {
         fn radiance(&self, _: &Scene, landed: SurfacePoint, _: &mut u64) -> Option<DVec3> {
-            Some(DVec3::splat(f64::from(u8::from(landed.within))))
+            Some(DVec3::splat(f64::from(landed.within)))
         }
     }
 

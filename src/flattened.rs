@@ -17,6 +17,9 @@ pub enum Side {
 }
 
 impl Side {
+    /// The lower side, then the higher one.
+    pub const BOTH: [Self; 2] = [Self::Lower, Self::Higher];
+
     /// The other side.
     #[inline]
     pub fn opposite(self) -> Self {

@@ -306,7 +306,7 @@ mod tests {
         };
         let tracer = Floor(floor);
         let cache = RadianceCache::new(&scene, &tracer, &photons, &settings, &|_| true);
-        let light = [Side::Lower, Side::Higher].map(|side| {
+        let light = Side::BOTH.map(|side| {
             let position = DVec3::new(8.0 * 0.47, 4.0, 0.05);
             let normal = scene.normal(position, side).unwrap();
             let departure = Departure::Surface(side);

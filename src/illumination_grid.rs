@@ -229,7 +229,7 @@ pub(crate) fn from_nearest(
             if masks[o] == Mask::Empty {
                 continue;
             }
-            let place = (step * DVec3::from_array(lattice.ijk(o).map(|i| i as f64))).as_vec3();
+            let place = (step * lattice.point(o)).as_vec3();
             grid.nearest(place, neighbours, f32::INFINITY, |_| true, &mut found);
             (radiance[n], std_error[n]) = value(o, place, found.found());
         }
@@ -308,7 +308,7 @@ mod tests {
             let grid = shepard(&field, field.lattice(), &masks, &samples, 12, &|_| true);
             let mut error = 0f64;
             for (o, rgb) in grid.radiance.iter().enumerate() {
-                let p = DVec3::from_array(field.lattice().ijk(o).map(|i| i as f64));
+                let p = field.lattice().point(o);
                 assert!((rgb[0] - 7.0).abs() < 1e-5);
                 error = error.max((f64::from(rgb[1]) - f(p)).abs());
             }

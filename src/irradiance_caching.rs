@@ -156,7 +156,7 @@ impl<'a> Around<'a> {
     fn facing(&self, normal: Vec3) -> impl Fn(&Known) -> f32 {
         let faces = move |k: &Known| k.normal.dot(normal) >= CONE;
         let few = self.each().filter(|(.., k)| faces(k)).take(FEW).count() < FEW;
-        move |k| f32::from(u8::from(few || faces(k)))
+        move |k| f32::from(few || faces(k))
     }
 
     /// Standard error at a point with unit `normal`, as if all of the samples' were of indirect light. \[Loader99\]
@@ -193,7 +193,7 @@ mod tests {
     /// Level sets of `distance` 0.25 to 5 from the middle under a square luminaire.
     fn scene(distance: impl Fn(DVec3) -> f64) -> Scene {
         let lattice = Lattice::aligned([13; 3], DVec3::splat(-6.0), DVec3::ONE).unwrap();
-        let at = |o: usize| DVec3::from_array(lattice.ijk(o).map(|i| i as f64 - 6.0));
+        let at = |o: usize| lattice.point(o) - 6.0;
         let samples = (0..lattice.len()).map(|o| -distance(at(o)) as f32).collect();
         let volume = Volume::new("x", lattice, Samples::F32(samples)).unwrap();
         let field = Field::new(&volume, Sweep::new(-5.0, -0.25).unwrap()).unwrap();

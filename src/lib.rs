@@ -14,7 +14,7 @@
 //!
 //! // Distances from the middle of a cube, and the spheres between 0.2 and 0.4 of them.
 //! let lattice = Lattice::aligned([17; 3], DVec3::ZERO, DVec3::splat(1.0 / 16.0))?;
-//! let at = |i: usize| lattice.to_world(DVec3::from_array(lattice.ijk(i).map(|i| i as f64)));
+//! let at = |i: usize| lattice.to_world(lattice.point(i));
 //! let samples = (0..lattice.len()).map(|i| at(i).distance(DVec3::splat(0.5)) as f32).collect();
 //! let volume = Volume::new("distance", lattice.clone(), Samples::F32(samples))?;
 //! let field = Field::new(&volume, Sweep::new(0.2, 0.4)?)?;

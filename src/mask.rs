@@ -25,7 +25,7 @@ pub enum Mask {
 /// Lattice point `o` in the local frame of the field.
 #[inline]
 pub fn local_position(field: &Field, lattice: &Lattice, o: usize) -> DVec3 {
-    let p = DVec3::from_array(lattice.ijk(o).map(|i| i as f64));
+    let p = lattice.point(o);
     if lattice == field.lattice() { p } else { p * (field.lattice().far() / lattice.far()) }
 }
 
@@ -375,7 +375,7 @@ mod tests {
     #[test]
     fn points_are_unknown_where_the_sweep_holds_none() {
         let lattice = Lattice::aligned([20; 3], DVec3::splat(-0.5), DVec3::splat(1.0 / 19.0)).unwrap();
-        let place = |o: usize| lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)));
+        let place = |o: usize| lattice.to_world(lattice.point(o));
         let samples = Samples::F64((0..lattice.len()).map(|o| 1.0 - place(o).length()).collect());
         let volume = Volume::new("ball", lattice.clone(), samples).unwrap();
         let share = |hi: f64| {

@@ -199,7 +199,7 @@ impl RadianceCache {
         let filler = &Filler { scene, tracer, settings, rays: &rays, tick };
         let fill = Fill { filler, filled: &filled, stored: &stored };
         let mut light = Nodes::default();
-        let sides = [Side::Lower, Side::Higher].map(|side| {
+        let sides = Side::BOTH.map(|side| {
             let before = old.as_mut().and_then(|old| old.filled[side.index()].take());
             let before = old.as_ref().zip(before.as_deref()).map(|(old, values)| (&old.stored, values));
             let filled = fill.side(side, source.map(side)?, before, saved[side.index()]);
@@ -443,7 +443,7 @@ mod tests {
             Scene::new(field, Surface { albedo: DVec3::ONE.into(), ..Surface::default() }, Boundary::Open, vec![]);
         let scene = scene.unwrap();
         let light = |p: DVec3| 1.0 + p.dot(DVec3::new(0.1, 0.3, 0.7));
-        let at = |o: usize| DVec3::from_array(lattice.ijk(o).map(|i| i as f64));
+        let at = |o: usize| lattice.point(o);
         let nodes: Vec<_> = (0..lattice.len()).map(|o| [light(at(o)) as f32; 3]).collect();
         let stored = NodeSet::all(nodes.len());
         let field = FieldNodes { stored, filled: Nodes::default(), sides: [Some(nodes), None] };

@@ -204,7 +204,7 @@ fn local(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit, direction: DVec3)
             let polygon = &scene.polygons()[id as usize];
             if polygon.emission != DVec3::ZERO {
                 let white = scene.sees_front(ray, id) && luminance(polygon.emission) > 0.0;
-                return DVec3::splat(f64::from(u8::from(white)));
+                return DVec3::splat(f64::from(white));
             }
             (polygon.albedo, Some(polygon.normal()))
         }

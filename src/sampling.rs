@@ -217,7 +217,7 @@ mod tests {
         for i in 0..FINE.pow(3) {
             let at = [i % FINE, i / FINE % FINE, i / FINE / FINE].map(|i| (i as f64 + 0.5) / FINE as f64);
             let p = far * DVec3::from_array(at);
-            share[block(p)] += f64::from(u8::from((0.0..=1.0).contains(&field.value(p))));
+            share[block(p)] += f64::from((0.0..=1.0).contains(&field.value(p)));
         }
         let total: f64 = share.iter().sum();
         assert!(total > 0.2 * FINE.pow(3) as f64 && total < 0.6 * FINE.pow(3) as f64);

@@ -298,7 +298,7 @@ mod tests {
         let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
         let field = Field::new(&volume, Sweep::new(0.0, 15.0).unwrap()).unwrap();
         let scene = Scene::new(field, Surface::default(), Boundary::Open, Vec::new()).unwrap();
-        let place = |o: usize| DVec3::from_array(lattice.ijk(o).map(|i| i as f64));
+        let place = |o: usize| lattice.point(o);
         let halves: Vec<[Vec3; 2]> = (0..lattice.len())
             .map(|o| {
                 let mut rng = Rng::stream(1, Stage::Test, o as u64);

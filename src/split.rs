@@ -91,7 +91,7 @@ mod tests {
     /// right.
     fn scene() -> Scene {
         let lattice = Lattice::aligned([21; 3], DVec3::splat(-1.0), DVec3::splat(0.1)).unwrap();
-        let radius = |o: usize| lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64))).length();
+        let radius = |o: usize| lattice.to_world(lattice.point(o)).length();
         let samples = (0..lattice.len()).map(|o| 1.0 - radius(o)).collect();
         let volume = Volume::new("spheres", lattice.clone(), Samples::F64(samples)).unwrap();
         let field = Field::new(&volume, Sweep::new(0.1, 0.9).unwrap()).unwrap();

@@ -304,7 +304,7 @@ pub fn sweep_resumable(
     sums.iter_mut().flatten().flatten().for_each(|x| *x /= replicates as f32);
     let flats = flats.export(&sums, &sides, scene.surface.outside);
     let mut sides = total.finish(&rows, &Deblur { dims, lit: |at| lit[at] }, settings.direct);
-    let world = |o: usize| scene.lattice().to_world(DVec3::from_array(scene.lattice().ijk(o).map(|i| i as f64)));
+    let world = |o: usize| scene.lattice().to_world(scene.lattice().point(o));
     let dark = slits.hidden.iter().map(|hidden| hidden.0).filter(|&o| scene.covers(world(o)));
     for o in dark {
         for side in &mut sides {

@@ -20,7 +20,7 @@ fn field(steep: bool, size: usize) -> Field {
     }
     let lattice = Lattice::aligned([size; 3], glam::DVec3::ZERO, glam::DVec3::splat(1.0 / (size - 1) as f64)).unwrap();
     let value = |o: usize| {
-        let p = lattice.to_world(glam::DVec3::from_array(lattice.ijk(o).map(|i| i as f64)));
+        let p = lattice.to_world(lattice.point(o));
         let slope = 40.0 + 20.0 * (7.0 * p.x).sin() * (5.0 * p.y).cos();
         let inside = (p - glam::DVec3::new(0.5, 0.45, 0.4)).length() < 0.3;
         (if inside { 500.0 } else { slope * p.z }) as f32

@@ -37,8 +37,7 @@ struct Case {
 impl Case {
     fn new() -> Self {
         let lattice = lattice();
-        let world: Vec<DVec3> =
-            (0..lattice.len()).map(|o| lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)))).collect();
+        let world: Vec<DVec3> = (0..lattice.len()).map(|o| lattice.to_world(lattice.point(o))).collect();
         let middle = lattice.to_world(0.5 * lattice.far());
         let values: Vec<f32> = world.iter().map(|&x| (x - middle).length() as f32).collect();
         let radiance = world.iter().flat_map(|x| x.as_vec3().to_array()).collect();

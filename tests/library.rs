@@ -21,7 +21,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 /// Balls h = distance from the middle of the unit cube, in `n`³ samples, and the default box.
 fn scene(n: usize) -> Scene {
     let lattice = Lattice::aligned([n; 3], DVec3::ZERO, DVec3::splat(1.0 / (n - 1) as f64)).unwrap();
-    let at = |i: usize| lattice.to_world(DVec3::from_array(lattice.ijk(i).map(|i| i as f64)));
+    let at = |i: usize| lattice.to_world(lattice.point(i));
     let samples = (0..lattice.len()).map(|i| at(i).distance(DVec3::splat(0.5)) as f32).collect();
     let volume = Volume::new("balls", lattice.clone(), Samples::F32(samples)).unwrap();
     let field = Field::new(&volume, Sweep::new(0.2, 0.4).unwrap()).unwrap();

@@ -32,9 +32,7 @@ fn device() -> Device {
 /// h = |x|² on [−1, 1]³, n³ samples, in the sweep [0, 1]: balls of radius √c, inside where h < c.
 fn balls(n: usize, surface: Surface, polygons: Vec<Polygon>) -> Scene {
     let lattice = Lattice::aligned([n; 3], DVec3::splat(-1.0), DVec3::splat(2.0 / (n - 1) as f64)).unwrap();
-    let samples = (0..lattice.len())
-        .map(|o| lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64))).length_squared() as f32)
-        .collect();
+    let samples = (0..lattice.len()).map(|o| lattice.to_world(lattice.point(o)).length_squared() as f32).collect();
     let volume = Volume::new("balls", lattice, Samples::F32(samples)).unwrap();
     let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
     Scene::new(field, surface, Boundary::Open, polygons).unwrap()

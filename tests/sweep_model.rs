@@ -18,10 +18,7 @@ use rayon::prelude::*;
 use std::f64::consts::PI;
 
 fn field(lattice: Lattice, range: (f64, f64), f: impl Fn(DVec3) -> f64 + Sync) -> Field {
-    let samples = (0..lattice.len())
-        .into_par_iter()
-        .map(|o| f(lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|x| x as f64)))))
-        .collect();
+    let samples = (0..lattice.len()).into_par_iter().map(|o| f(lattice.to_world(lattice.point(o)))).collect();
     let volume = Volume::new("test", lattice, Samples::F64(samples)).unwrap();
     Field::new(&volume, Sweep::new(range.0, range.1).unwrap()).unwrap()
 }
@@ -255,7 +252,7 @@ fn oblique_axes_change_nothing() {
     let errors: Vec<f64> = some
         .par_iter()
         .map(|&o| {
-            let p = DVec3::from_array(scene.lattice().ijk(o).map(|x| x as f64));
+            let p = scene.lattice().point(o);
             let frame = Frame::new(scene.normal(p, Side::Lower).unwrap());
             let set = Sobol::set(3, Stage::Test, o as u64);
             let hits = (0..1024u32).filter(|&i| {
@@ -295,7 +292,7 @@ fn standard_errors_are_what_they_say() {
         let variance = 17.0 / 16.0 * f64::from(got.sides[0].std_error[o]).powi(2);
         squared += error2;
         said += variance;
-        within += f64::from(u8::from(error2 <= 2.365 * 2.365 * variance));
+        within += f64::from(error2 <= 2.365 * 2.365 * variance);
         count += 1.0;
     }
     println!("error² {squared:.4e}, claimed {said:.4e}, {:.3} within 95 % limits, {count} nodes", within / count);
@@ -479,7 +476,7 @@ fn walls_and_caps_are_lit_if_the_inside_is_stored() {
         let surface = Surface { outside, ..Surface::default() };
         run(&Scene::new(f, surface, Boundary::Capped, walls).unwrap(), SweepSettings { max_bounces: 3, ..ONE_BOUNCE })
     };
-    let [lower, higher] = [Side::Lower, Side::Higher].map(lit);
+    let [lower, higher] = Side::BOTH.map(lit);
     assert_eq!(higher.sides[0].side, Side::Higher);
     assert!(higher.sides[0].irradiance.iter().flatten().all(|x| *x == 0.0));
     // Walls and caps.
@@ -504,7 +501,7 @@ fn walls_do_not_see_through_capped_solids_with_a_hole() {
         // Above the sweep but in one corner.
         let f = field(cube(17, 0.0, 1.0), (0.2, 0.8), |x| {
             let in_hole = hole && x.x < 0.2 && (x.y - 0.5).abs() < 0.2 && (x.z - 0.5).abs() < 0.2;
-            if in_hole { f64::NAN } else { f64::from(u8::from(x.min_element() < 0.99)) }
+            if in_hole { f64::NAN } else { f64::from(x.min_element() < 0.99) }
         });
         let walls = closed_box(f.lattice(), 0.3, 0.5, 1.0);
         let black = Surface { albedo: DVec3::ZERO.into(), ..Surface::default() };

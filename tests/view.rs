@@ -364,7 +364,7 @@ fn axes_caps_and_sides_are_where_render_has_them() {
     let axes = DMat3::from_cols(DVec3::new(0.0, 0.2, -1.0), DVec3::new(2.0, 0.0, 0.3), DVec3::new(0.1, -0.9, 0.0));
     let lattice = Lattice::new(dims, DVec3::new(1000.0, -2000.0, 500.0), axes).unwrap();
     let samples = (0..lattice.len()).map(|o| {
-        let p = DVec3::from_array(lattice.ijk(o).map(|i| i as f64)) / DVec3::new(24.0, 16.0, 32.0);
+        let p = lattice.point(o) / DVec3::new(24.0, 16.0, 32.0);
         let bump = |m: DVec3, s: f64| (-(p - m).length_squared() / (2.0 * s * s)).exp();
         (100.0 * bump(DVec3::new(0.6, 0.15, 0.5), 0.2) + 80.0 * bump(DVec3::new(0.3, 0.7, 0.3), 0.12)) as f32
     });
@@ -388,7 +388,7 @@ fn walls_within_solids_are_as_render_has_them() {
     let dir = dir.path();
     let lattice = Lattice::aligned([25; 3], DVec3::ZERO, DVec3::splat(1.0 / 24.0)).unwrap();
     let samples = (0..lattice.len()).map(|o| {
-        let x = lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)));
+        let x = lattice.to_world(lattice.point(o));
         ((9.0 * x.x + 1.5 * x.y).sin() * (6.0 * x.y - 2.5 * x.z).cos() + (5.5 * x.z).sin()) as f32
     });
     Volume::new("waves", lattice.clone(), Samples::F32(samples.collect())).unwrap().write(dir.join("b.nrrd")).unwrap();
@@ -418,7 +418,7 @@ fn split_light_is_what_render_draws() {
     let axes = DMat3::from_cols(DVec3::new(0.0, 0.2, -1.0), DVec3::new(2.0, 0.0, 0.3), DVec3::new(0.1, -0.9, 0.0));
     let lattice = Lattice::new([11, 7, 13], DVec3::new(1000.0, -2000.0, 500.0), 2.0 * axes).unwrap();
     let samples = (0..lattice.len()).map(|o| {
-        let p = DVec3::from_array(lattice.ijk(o).map(|i| i as f64)) / DVec3::new(10.0, 6.0, 12.0);
+        let p = lattice.point(o) / DVec3::new(10.0, 6.0, 12.0);
         let bump = |m: DVec3, s: f64| (-(p - m).length_squared() / (2.0 * s * s)).exp();
         (100.0 * bump(DVec3::new(0.6, 0.15, 0.5), 0.2) + 80.0 * bump(DVec3::new(0.3, 0.7, 0.3), 0.12)) as f32
     });
@@ -460,7 +460,7 @@ fn walls_of_crowded_isovalues_are_as_bright_as_render_has_them() {
     let dir = dir.path();
     let lattice = Lattice::aligned([33; 3], DVec3::splat(-0.5), DVec3::splat(1.0 / 32.0)).unwrap();
     let samples = (0..lattice.len()).map(|o| {
-        let x = lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)));
+        let x = lattice.to_world(lattice.point(o));
         (-15.0 * (x - DVec3::new(0.013, -0.02, -0.007)).length()).exp()
     });
     let volume = Volume::new("density", lattice.clone(), Samples::F64(samples.collect())).unwrap();
@@ -488,7 +488,7 @@ fn isovalues_over_decades_are_where_render_has_them() {
     let dir = dir.path();
     let lattice = Lattice::aligned([40; 3], DVec3::splat(-0.5), DVec3::splat(1.0 / 39.0)).unwrap();
     let samples = (0..lattice.len()).map(|o| {
-        let x = lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)));
+        let x = lattice.to_world(lattice.point(o));
         let blob = |centre: DVec3, steepness: f64| (-steepness * (x - centre).length()).exp();
         100.0 * (blob(DVec3::new(0.1, 0.05, -0.1), 28.0) + 0.7 * blob(DVec3::new(-0.15, -0.05, 0.1), 24.0))
     });
@@ -516,7 +516,7 @@ fn gaps_are_open_where_render_has_them() {
         let dir = Folder::new();
         let dir = dir.path();
         let samples = (0..lattice.len()).map(|o| {
-            let p = DVec3::from_array(lattice.ijk(o).map(|i| i as f64));
+            let p = lattice.point(o);
             if p.y < f64::from(gap) { f64::NAN } else { 1.0 - (p / 12.0 - 1.0).length() }
         });
         let volume = Volume::new("ball", lattice.clone(), Samples::F64(samples.collect())).unwrap();

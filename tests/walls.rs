@@ -24,7 +24,7 @@ fn waves() -> Scene {
 fn waves_but(changed: impl Fn([usize; 3], f64) -> f64) -> Scene {
     let lattice = Lattice::aligned([41; 3], DVec3::ZERO, DVec3::splat(1.0 / 40.0)).unwrap();
     let samples = (0..lattice.len()).map(|o| {
-        let x = 0.5 * lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|x| x as f64)));
+        let x = 0.5 * lattice.to_world(lattice.point(o));
         changed(lattice.ijk(o), (17.0 * x.x + 3.0 * x.y).sin() * (13.0 * x.y - 5.0 * x.z).cos() + (11.0 * x.z).sin())
     });
     let volume = Volume::new("waves", lattice.clone(), Samples::F64(samples.collect())).unwrap();
@@ -72,7 +72,7 @@ fn errors_of(
     let grid = &baked.sides.iter().find(|(stored, _)| *stored == side).unwrap().1;
     let device = Device::new(0).unwrap();
     let tracer = GraphTracer::new(&device, scene).unwrap();
-    let place = |o: usize| DVec3::from_array(scene.lattice().ijk(o).map(|x| x as f64));
+    let place = |o: usize| scene.lattice().point(o);
     let points: Vec<usize> = (0..scene.lattice().len())
         .filter(|&o| (0.0..=1.0).contains(&scene.field.samples()[o]) && chosen(place(o)))
         .step_by(stride)
@@ -188,7 +188,7 @@ fn it_is_dark_behind_a_luminaire() {
         p.z == far.z && light.contains(x)
     };
     let points: Vec<usize> = (0..scene.lattice().len())
-        .filter(|&o| behind(DVec3::from_array(scene.lattice().ijk(o).map(|x| x as f64))))
+        .filter(|&o| behind(scene.lattice().point(o)))
         .filter(|&o| (0.0..=1.0).contains(&scene.field.samples()[o]))
         .collect();
     // What exact rays gather is smoothed over neighbours in front of the luminaire.
@@ -233,7 +233,7 @@ fn contacts_beside_a_hole_keep_their_light() {
 fn light_does_not_walk_along_narrow_tubes() {
     let lattice = Lattice::aligned([5, 175, 5], DVec3::ZERO, DVec3::ONE).unwrap();
     let samples = (0..lattice.len()).map(|o| {
-        let x = DVec3::from_array(lattice.ijk(o).map(|x| x as f64)) / lattice.far();
+        let x = lattice.point(o) / lattice.far();
         (-(x - DVec3::new(0.45, 0.5, 0.4)).length_squared() / 0.125).exp()
     });
     let volume = Volume::new("tube", lattice.clone(), Samples::F64(samples.collect())).unwrap();
@@ -247,7 +247,7 @@ fn light_does_not_walk_along_narrow_tubes() {
     let (side, grid) = &baked.sides[0];
     let mut sections = [[0.0; 2]; 12];
     for o in (0..lattice.len()).filter(|&o| grid.mask[o] == Mask::Valid) {
-        let p = DVec3::from_array(lattice.ijk(o).map(|x| x as f64));
+        let p = lattice.point(o);
         let Some(r) = Receiver::on_level_set(&scene, p, scene.field.samples()[o], *side) else { continue };
         let away = ((p.y - 87.0).abs() / 87.0 * 12.0).min(11.0) as usize;
         sections[away][0] += PathTracer::new(&scene, &tracer).outgoing(&r, 256, Stage::Path.key(3, o as u64)).y;
@@ -268,7 +268,7 @@ fn how_far_the_sweep_goes_changes_no_level_set() {
     let lattice = Lattice::aligned([33; 3], DVec3::splat(-0.5), DVec3::splat(1.0 / 32.0)).unwrap();
     let samples: Vec<f64> = (0..lattice.len())
         .map(|o| {
-            let x = lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|x| x as f64)));
+            let x = lattice.to_world(lattice.point(o));
             (-15.0 * (x - DVec3::new(0.013, -0.02, -0.007)).length()).exp()
         })
         .collect();
@@ -302,7 +302,7 @@ fn how_far_the_sweep_goes_changes_no_level_set() {
 fn no_light_seeps_along_walls() {
     let lattice = Lattice::aligned([25; 3], DVec3::ZERO, DVec3::splat(1.0 / 24.0)).unwrap();
     let height = |x: DVec3| x.x + 2.0 * x.y + 4.0 * x.z;
-    let world = |o: usize| lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|x| x as f64)));
+    let world = |o: usize| lattice.to_world(lattice.point(o));
     let samples = Samples::F64((0..lattice.len()).map(|o| height(world(o))).collect());
     let volume = Volume::new("planes", lattice.clone(), samples).unwrap();
     let sweep = Sweep::new(0.1, 6.9).unwrap();
@@ -339,7 +339,7 @@ fn brightest_by_side(scene: &Scene, bake: &Bake, most: f64) -> [[f32; 3]; 2] {
     for (side, grid) in &bake.sides {
         let of = |o: &usize| grid.mask[*o] == Mask::Valid && f64::from(scene.field.samples()[*o]) < most;
         for o in (0..grid.mask.len()).filter(of) {
-            let x = DVec3::from_array(lattice.ijk(o).map(|x| x as f64));
+            let x = lattice.point(o);
             let on_wall = usize::from(x.cmpeq(DVec3::ZERO).any() || x.cmpeq(far).any());
             brighter(&mut light[side.index()][on_wall], grid.radiance[o]);
         }

@@ -179,7 +179,7 @@ pub fn survey<T: Tracer>(
         confidence_grid_points: of_grid_points.map(|(_, confidence)| confidence.map(percent)),
         bias: 100.0 * mean(|d| d.bias),
         parts: parts.collect(),
-        clamped: mean(|d| f64::from(u8::from(d.clamped))),
+        clamped: mean(|d| f64::from(d.clamped)),
         left_out: chosen.len() - all.len(),
         rays: referee.rays.into_inner(),
     })
@@ -327,7 +327,7 @@ mod tests {
     }
 
     fn place(lattice: &Lattice, o: usize) -> DVec3 {
-        lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)))
+        lattice.to_world(lattice.point(o))
     }
 
     /// A survey of a grid that is off by `error` (of the place) in all channels.

@@ -72,8 +72,7 @@ pub(super) fn light(Job { number, scene, lattice, masks }: &Job, context: Contex
     // What the sweep knows is what rays from these points gather.
     let gathered = |side| swept.iter().find(|s| s.side == side && beside.len() + near.len() + contacts.len() > 0);
     let stored = RadianceCache::room(lattice.len(), |o| own[o] || masks[o] == Mask::Filled);
-    let nodes = [Side::Lower, Side::Higher]
-        .map(|side| Some(widened(lattice, &stored, (&own, masks), &gathered(side)?.irradiance)));
+    let nodes = Side::BOTH.map(|side| Some(widened(lattice, &stored, (&own, masks), &gathered(side)?.irradiance)));
     let cache = RadianceCache::from_parts(nodes, stored, lattice.dims(), flats);
     let mut sides = Vec::new();
     for mut s in swept {

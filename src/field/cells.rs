@@ -32,7 +32,7 @@ impl Field {
             let [lo, hi] = self.cell_range(cell).map(f64::from);
             match lo < hi {
                 true => ((hi.min(1.0) - lo.max(0.0)) / (hi - lo)).max(0.0),
-                false => f64::from(u8::from((0.0..=1.0).contains(&lo))),
+                false => f64::from((0.0..=1.0).contains(&lo)),
             }
         };
         // In parts of fixed size, added in their order.

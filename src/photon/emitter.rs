@@ -249,7 +249,7 @@ mod tests {
     #[test]
     fn sweeps_of_any_width_are_found_and_weighed() {
         let lattice = Lattice::aligned([24; 3], DVec3::ZERO, DVec3::splat(1.0 / 23.0)).unwrap();
-        let at = |o: usize| lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)));
+        let at = |o: usize| lattice.to_world(lattice.point(o));
         let samples = (0..lattice.len()).map(|o| at(o).distance(DVec3::splat(0.5)) as f32).collect();
         let volume = Volume::new("distance", lattice.clone(), Samples::F32(samples)).unwrap();
         for width in [0.1, 1e-2, 1e-4, 1e-5] {

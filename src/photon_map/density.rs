@@ -469,7 +469,7 @@ mod tests {
         let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
         let scene = Scene::new(field, Surface::default(), Boundary::Open, Vec::new()).unwrap();
         let mut rng = Rng::stream(8, Stage::Test, 0);
-        for side in [Side::Lower, Side::Higher] {
+        for side in Side::BOTH {
             let photons: Vec<SurfacePhoton> = landed(9, 16, 80_000, |_| true)
                 .into_iter()
                 .filter(|p| p.position.x < 8.0)

@@ -154,7 +154,7 @@ impl<'a> PhotonPoints<'a> {
             let half = own * slope;
             let share = match half > 0.0 {
                 true => ((h + half).min(hi) - (h - half).max(lo)) / (2.0 * half),
-                false => f64::from(u8::from((lo..=hi).contains(&h))),
+                false => f64::from((lo..=hi).contains(&h)),
             };
             if share > 0.0 && g.dot(normal.as_dvec3()) >= self.settings.cone * slope {
                 sum += (1.0 - b.length_squared()) * slope * share;

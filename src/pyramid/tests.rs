@@ -13,7 +13,7 @@ fn field(dims: [usize; 3], levels: f64) -> Field {
     let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::ONE).unwrap();
     let mut samples: Vec<f32> = (0..lattice.len())
         .map(|o| {
-            let x = DVec3::from_array(lattice.ijk(o).map(|i| i as f64));
+            let x = lattice.point(o);
             let wave = (0.31 * x.x).sin() + (0.23 * x.y + 0.1 * x.z).cos() + (0.17 * x.z).sin();
             ((wave / 6.0 + 0.5) * levels).round() as f32
         })

@@ -345,7 +345,7 @@ mod tests {
     fn what_lights_a_hidden_part_shines_nowhere_else() {
         let lattice = Lattice::aligned([17; 3], DVec3::ZERO, DVec3::splat(0.0625)).unwrap();
         // The solid is one corner, far away.
-        let samples = (0..lattice.len()).map(|o| f32::from(u8::from(o == 0))).collect();
+        let samples = (0..lattice.len()).map(|o| f32::from(o == 0)).collect();
         let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
         let field = Field::new(&volume, Sweep::new(0.1, 1.0).unwrap()).unwrap();
         let walls = cornell_box(field.lattice(), 0.0).unwrap();
@@ -534,7 +534,7 @@ mod tests {
     #[test]
     fn caps_are_lit_up_to_their_edges() {
         let field = wavy();
-        for outside in [Side::Lower, Side::Higher] {
+        for outside in Side::BOTH {
             let surface = Surface { outside, both_sides: true, ..Surface::default() };
             let scene = Scene::new(field.clone(), surface, Boundary::Capped, Vec::new()).unwrap();
             // z = 0.

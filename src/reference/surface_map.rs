@@ -119,7 +119,7 @@ impl MappedSurface {
     fn new(scene: &Scene, mesh: &SurfaceMesh, origin: DVec3, photons: &Photons) -> Self {
         let lattice = scene.lattice();
         let lower = |p: DVec3| scene.normal(p, Side::Lower).unwrap_or_default().as_vec3();
-        let sides = [Side::Lower, Side::Higher].map(|side| {
+        let sides = Side::BOTH.map(|side| {
             let items: Vec<_> = photons
                 .surface
                 .par_iter()

@@ -265,7 +265,7 @@ fn octants(scene: &Scene, bake: &Bake) -> [f64; 8] {
     let centre = lattice.to_world(0.5 * lattice.far());
     let grid = &bake.sides[0].1;
     for o in (0..lattice.len()).filter(|&o| grid.mask[o] == Mask::Valid) {
-        let x = lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64))) - centre;
+        let x = lattice.to_world(lattice.point(o)) - centre;
         let step = 1e-6 * lattice.spacing().max_element();
         // Nodes on the middle planes belong to neither side.
         if x.abs().min_element() > step {

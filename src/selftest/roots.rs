@@ -181,7 +181,7 @@ fn cell(family: usize, index: u64) -> (Cell, f32, DVec3, DVec3) {
             _ => {}
         }
     }
-    p[axis] = f64::from(u8::from(far));
+    p[axis] = f64::from(far);
     d[axis] = (0.05 + d[axis].abs()) * if far { -1.0 } else { 1.0 };
     // From an edge or a corner into the cell, not away from it at once.
     if leave(p, d).1 <= 0.0 {

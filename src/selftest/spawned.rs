@@ -70,7 +70,7 @@ fn entered(field: &Field, o: Vec3, d: Vec3) -> ([usize; 3], [f64; 3]) {
     for a in 0..3 {
         let p = f64::from(o[a]);
         let below = d[a] < 0.0 && p == p.floor();
-        cell[a] = (p.floor() - f64::from(u8::from(below))).clamp(0.0, cells[a] as f64 - 1.0) as usize;
+        cell[a] = (p.floor() - f64::from(below)).clamp(0.0, cells[a] as f64 - 1.0) as usize;
     }
     (cell, std::array::from_fn(|a| f64::from(o[a]) - cell[a] as f64))
 }

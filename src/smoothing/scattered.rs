@@ -196,7 +196,7 @@ mod tests {
                 // A point may have none.
                 for _ in 0..if o.is_multiple_of(5) { 0 } else { 4 } {
                     let offset = DVec3::from_array(std::array::from_fn(|_| 2.0 * rng.unit() - 1.0));
-                    let p = DVec3::from_array(lattice.ijk(o).map(|i| i as f64)) + offset;
+                    let p = lattice.point(o) + offset;
                     positions.push(p.clamp(DVec3::ZERO, lattice.far()).as_vec3());
                 }
                 starts.push(positions.len() as u32);

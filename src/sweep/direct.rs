@@ -94,8 +94,8 @@ impl Direct<'_> {
         let (lit, lattice) = (geometry.lit_rows(), scene.lattice());
         let [_, ny, _] = geometry.dims;
         // 0 gives no light to a side that nobody asks for.
-        let wanted = [Side::Lower, Side::Higher].map(|s| f32::from(u8::from(sides.contains(&s))));
-        let place = [Side::Lower, Side::Higher].map(|s| sides.iter().position(|x| *x == s).unwrap_or(0));
+        let wanted = Side::BOTH.map(|s| f32::from(sides.contains(&s)));
+        let place = Side::BOTH.map(|s| sides.iter().position(|x| *x == s).unwrap_or(0));
         let unit = unit(lattice, light);
         let per = sides.len();
         let mut sums = vec![[0f32; 2]; per * lit.len()];

@@ -44,8 +44,7 @@ impl Fans {
     pub(super) fn march(&mut self, (geometry, isa, sides): (&Geometry, Isa, &[Side]), y: DVec3, start: [f32; 2]) {
         self.source = y;
         self.far = geometry.dims.map(|n| (n - 1) as f64);
-        self.entering =
-            [start[0] == f32::NEG_INFINITY, start[1] == f32::INFINITY].map(|open| f32::from(u8::from(open)));
+        self.entering = [start[0] == f32::NEG_INFINITY, start[1] == f32::INFINITY].map(f32::from);
         self.fans = std::array::from_fn(|f| Fan::new(geometry.dims, y, f % 3, f >= 3));
         self.turn = self.turn.wrapping_add(TURN);
         if self.turn == 0 {
@@ -161,7 +160,7 @@ pub(super) mod tests {
     #[test]
     fn lines_know_where_they_enter() {
         let field = noise([17, 12, 14], 8, None);
-        let (geometry, isa, sides) = (Geometry::new(&field), Isa::current(), [Side::Lower, Side::Higher]);
+        let (geometry, isa, sides) = (Geometry::new(&field), Isa::current(), Side::BOTH);
         let (far, in_sweep) = (field.lattice().far(), |h: f32| (0.0..=1.0).contains(&h));
         let mut fans = Fans::default();
         let (mut known, mut entries) = ([0; 2], 0);
@@ -230,7 +229,7 @@ pub(super) mod tests {
     #[test]
     fn fans_of_far_points_are_no_larger_than_the_lattice() {
         let field = noise([17, 12, 14], 8, Some(18));
-        let (geometry, isa, sides) = (Geometry::new(&field), Isa::current(), [Side::Lower, Side::Higher]);
+        let (geometry, isa, sides) = (Geometry::new(&field), Isa::current(), Side::BOTH);
         let middle = DVec3::new(8.0, 5.5, 6.5);
         let (mut known, mut lit) = (0, 0);
         for to in [DVec3::Z, DVec3::new(0.3, -0.2, 1.0), DVec3::new(-1.0, 0.9, 0.0), DVec3::new(1.0, 1.0, -1.0)] {
@@ -275,7 +274,7 @@ pub(super) mod tests {
     fn fans_of_other_points_leave_nothing() {
         let (field, small) = (noise([17, 12, 14], 8, Some(18)), noise([3, 3, 3], 3, Some(4)));
         let (geometry, small) = (Geometry::new(&field), Geometry::new(&small));
-        let (isa, sides) = (Isa::current(), [Side::Lower, Side::Higher]);
+        let (isa, sides) = (Isa::current(), Side::BOTH);
         let mut rng = Rng::stream(4, Stage::Test, 0);
         let mut fans = Fans::default();
         let mut partial = 0;

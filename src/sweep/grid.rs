@@ -98,7 +98,7 @@ impl<'a> Geometry<'a> {
         });
         drop(normals);
         let fine = |n: usize| (n.div_ceil(64), 1);
-        let awake = [Side::Lower, Side::Higher].map(|side| {
+        let awake = Side::BOTH.map(|side| {
             let reaches = |at: usize| if side == Side::Lower { !(h[at] < 0.0) } else { !(h[at] > 1.0) };
             [
                 Blocks::along(nx, ny * nz, fine(nx), reaches).joined(ny),

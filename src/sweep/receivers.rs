@@ -315,7 +315,7 @@ mod tests {
             Scene::new(field.clone(), Surface::default(), Boundary::Open, cornell_box(field.lattice(), 0.1).unwrap())
                 .unwrap();
         let geometry = Geometry::new(&field);
-        let both = [Side::Lower, Side::Higher];
+        let both = Side::BOTH;
         let mut fans = Fans::default();
         fans.march((&geometry, Isa::PLAIN, &both), DVec3::new(21.3, 12.7, 6.2), [f32::NEG_INFINITY, f32::INFINITY]);
         let blockers = Blockers::new(&scene, 0, &[]);

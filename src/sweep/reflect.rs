@@ -352,7 +352,7 @@ mod tests {
             let node: Vec<usize> = (0..3)
                 .map(|a| {
                     let line = x[a] + if a == across { 0.0 } else { rng.unit() - rng.unit() };
-                    let linear = line.floor() + f64::from(u8::from(rng.unit() < line.fract()));
+                    let linear = line.floor() + f64::from(rng.unit() < line.fract());
                     (if a == across { line.round() } else { linear }) as usize
                 })
                 .collect();
@@ -372,7 +372,7 @@ mod tests {
             let read = |row: Option<usize>| row.filter(|r| *r < 4).map_or(Vec::new(), |r| x[10 * r..][..10].to_vec());
             [read(Some(row)), read(row.checked_sub(1)), read(Some(row + 1)), Vec::new(), Vec::new()]
         };
-        let is: Vec<f32> = shown.iter().map(|shown| f32::from(u8::from(*shown))).collect();
+        let is: Vec<f32> = shown.iter().map(|shown| f32::from(*shown)).collect();
         for row in 0..4 {
             let mut sharp = rows(&light, row);
             sharpen(&mut sharp, &rows(&is, row), &mut Vec::new(), SHARPENING);

@@ -239,7 +239,7 @@ mod tests {
 
     fn field(dims: [usize; 3], h: impl FnMut(DVec3) -> f64) -> Field {
         let lattice = Lattice::aligned(dims, DVec3::ZERO, DVec3::ONE).unwrap();
-        let place = |o| DVec3::from_array(lattice.ijk(o).map(|i| i as f64));
+        let place = |o| lattice.point(o);
         let samples = (0..lattice.len()).map(place).map(h).collect();
         let volume = Volume::new("known", lattice, Samples::F64(samples)).unwrap();
         Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap()

@@ -45,7 +45,7 @@ mod tests {
             let left = scene.polygons().iter().position(|p| p.name == "x_min").unwrap();
             (Flats::new(&scene, sides, 8, 8), left)
         };
-        let both = [Side::Lower, Side::Higher];
+        let both = Side::BOTH;
         // Walls in the volume's faces, one of them by a box that a modeller wrote with six digits.
         for (margin, gap) in [(0.0, false), (0.0, true), (1e-5, false)] {
             let (apart, left) = flats(&both, margin, gap);

@@ -406,7 +406,7 @@ mod tests {
             packed: Vec::new(),
         };
         let read = |lit: usize, before: usize, defects: usize| {
-            let (sides, size) = ([Side::Lower, Side::Higher], [4, 3]);
+            let (sides, size) = (Side::BOTH, [4, 3]);
             let of = |count: usize| Reflected { b: vec![vec![[1, 2, 3, 0]; size[0]]; count], unit: 1.0 };
             let defect = (0..defects).map(|_| [0, 1, 2].map(|_| vec![0; size[1]])).collect();
             let settling = Settling::new([1.0; 3]);

@@ -132,6 +132,12 @@ impl Lattice {
         [offset % nx, offset / nx % ny, offset / (nx * ny)]
     }
 
+    /// Index coordinates of the sample at a position in memory.
+    #[inline]
+    pub fn point(&self, offset: usize) -> DVec3 {
+        DVec3::from_array(self.ijk(offset).map(|i| i as f64))
+    }
+
     /// Index coordinates to world coordinates.
     #[inline]
     pub fn to_world(&self, p: DVec3) -> DVec3 {

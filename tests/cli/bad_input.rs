@@ -378,7 +378,7 @@ fn scene_flags_are_refused_where_the_input_is_a_bake() {
 fn a_sweep_that_is_too_thin_is_refused_beforehand() {
     let dir = Folder::new();
     let lattice = Lattice::aligned([20; 3], glam::DVec3::splat(-0.5), glam::DVec3::splat(1.0 / 19.0)).unwrap();
-    let radius = |o: usize| lattice.to_world(glam::DVec3::from_array(lattice.ijk(o).map(|i| i as f64))).length();
+    let radius = |o: usize| lattice.to_world(lattice.point(o)).length();
     let samples = Samples::F64((0..lattice.len()).map(|o| 1.0 - radius(o)).collect());
     Volume::new("ball", lattice.clone(), samples).unwrap().write(dir.path().join("ball.nrrd")).unwrap();
     for engine in ["sweep", "photon"] {

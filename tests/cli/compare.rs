@@ -15,7 +15,7 @@ const RANGE: [&str; 3] = ["--isovalues", "3.6", "95"];
 /// h = 60 |x − (½, ½, ½)| on a cube of this edge, where x runs over the unit cube.
 fn cone(edge: f64) -> Volume {
     let lattice = Lattice::aligned([15; 3], DVec3::ZERO, DVec3::splat(edge / 14.0)).unwrap();
-    let at = |o: usize| (DVec3::from_array(lattice.ijk(o).map(|i| i as f64)) / 14.0 - 0.5).length();
+    let at = |o: usize| (lattice.point(o) / 14.0 - 0.5).length();
     let samples = (0..lattice.len()).map(|o| 60.0 * at(o) as f32).collect();
     Volume::new("cone", lattice, Samples::F32(samples)).unwrap()
 }
@@ -227,7 +227,7 @@ fn cubic_grids_suit_long_voxels() {
     let lattice = Lattice::aligned([21, 21, 6], DVec3::ZERO, DVec3::new(0.05, 0.05, 0.2)).unwrap();
     let bumps =
         |p: DVec3| [1.0, 2.0].map(|f| (3.0 * f * p.x + f).sin() * (4.0 * p.y).cos() + (8.0 * p.z / f).sin() + 1.0);
-    let at = |o: usize| bumps(lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)))).iter().sum();
+    let at = |o: usize| bumps(lattice.to_world(lattice.point(o))).iter().sum();
     let samples = Samples::F64((0..lattice.len()).map(at).collect());
     Volume::new("slices", lattice.clone(), samples).unwrap().write(dir.join("slices.nrrd")).unwrap();
     let bake = |grid: &[&str]| {

@@ -43,7 +43,7 @@ fn pictures_by_rays_are_as_paths_have_them() {
     // Its solid ends in a cap towards the camera, with a hole.
     let lattice = Lattice::aligned([13; 3], DVec3::ZERO, DVec3::splat(1.0 / 12.0)).unwrap();
     let falling = (0..lattice.len()).map(|o| {
-        let x = lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)));
+        let x = lattice.to_world(lattice.point(o));
         1.0 - x.y - 1.5 * (0.35 - x.with_y(0.5).distance(DVec3::splat(0.5))).max(0.0)
     });
     let volume = Volume::new("falling", lattice.clone(), Samples::F64(falling.collect())).unwrap();

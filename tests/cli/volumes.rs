@@ -266,7 +266,7 @@ fn info_of_a_damaged_bake_is_that_of_its_volume() {
 fn gaussian() -> (Lattice, Vec<f64>) {
     let lattice = Lattice::aligned([24; 3], DVec3::ZERO, DVec3::ONE).unwrap();
     let value = |o: usize| {
-        let p = DVec3::from_array(lattice.ijk(o).map(|i| i as f64)) - 11.5;
+        let p = lattice.point(o) - 11.5;
         (-p.length_squared() / 5.0).exp()
     };
     let values = (0..lattice.len()).map(value).collect();

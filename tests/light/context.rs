@@ -143,7 +143,7 @@ fn light_to_and_from_context_agrees_with_paths() {
     let mut family = Family::new("context", 0.02);
     let mut bins = [[Moments::default(); 2]; 4];
     for (o, _, h, ..) in valid(&bake, &scene).into_iter().step_by(7) {
-        let position = DVec3::from_array(scene.lattice().ijk(o).map(|i| i as f64));
+        let position = scene.lattice().point(o);
         let Some(normal) = scene.normal(position, Side::Lower) else { continue };
         let (position, isovalue) = (position.as_vec3(), h as f32);
         let receiver = Receiver { position, normal, isovalue, departure: Departure::Surface(Side::Lower) };

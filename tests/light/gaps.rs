@@ -17,7 +17,7 @@ fn bumps_with_a_gap(turned: bool) -> Scene {
     let whole = bumps(lattice.clone());
     let sweep = whole.field.sweep();
     let value = |o: usize| {
-        let place = DVec3::from_array(lattice.ijk(o).map(|i| i as f64));
+        let place = lattice.point(o);
         let gap = (place - DVec3::new(12.0, 11.0, 10.0)).length() < 3.5;
         if gap { f64::NAN } else { sweep.from_unit(f64::from(whole.field.samples()[o])) }
     };
@@ -60,7 +60,7 @@ fn points_beside_a_gap_are_lit_on_all_its_sides() {
         let scale = scene.lattice().far() / one.lattice.far();
         let (mut squares, mut light, mut count) = (0.0, 0.0, 0);
         for o in 0..one.lattice.len() {
-            let p = DVec3::from_array(one.lattice.ijk(o).map(|i| i as f64)) * scale;
+            let p = one.lattice.point(o) * scale;
             let turned = one.lattice.len() - 1 - o;
             assert_eq!(a.mask[o], b.mask[turned], "{name}: {p}");
             let value = scene.field.value(p);
@@ -109,7 +109,7 @@ fn lines_go_through_gaps_as_paths_do() {
         let settings = BakeSettings::new(&BakeOptions { engine: Some(Engine::Sweep), ..options }, &scene).unwrap();
         let baked = run(&scene, &settings);
         let lattice = scene.lattice();
-        let place = |o: usize| DVec3::from_array(lattice.ijk(o).map(|x| x as f64));
+        let place = |o: usize| lattice.point(o);
         let points: Vec<usize> = (0..lattice.len())
             .filter(|&o| {
                 let value = scene.field.value(place(o));

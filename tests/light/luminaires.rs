@@ -243,7 +243,7 @@ fn paths_among_white_surfaces_end() {
 #[test]
 fn plateaus_emit_nothing() {
     let steps = field(lattice([12; 3], DVec3::ZERO, DVec3::ONE), 0.0, 1.0, |x| if x.x > 0.5 { 1.0 } else { 0.0 });
-    for outside in [Side::Lower, Side::Higher] {
+    for outside in Side::BOTH {
         let surface = Surface { emission: DVec3::ONE, ..grey(0.5, outside) };
         let scene = scene(steps.clone(), surface, Vec::new());
         let photons = photons(&scene, &emission(1 << 12, 1));

@@ -115,7 +115,7 @@ fn rough_light_is_not_dense() {
         let mut scratch = Neighbours::default();
         let mut greatest: f64 = 0.0;
         for o in (0..scene.lattice().len()).filter(|&o| (0.0..=1.0).contains(&scene.field.samples()[o])) {
-            let position = DVec3::from_array(scene.lattice().ijk(o).map(|i| i as f64));
+            let position = scene.lattice().point(o);
             let Some(normal) = scene.normal(position, Side::Lower) else { continue };
             let departure = Departure::Surface(Side::Lower);
             let isovalue = scene.field.samples()[o];

@@ -26,7 +26,7 @@ pub(crate) fn lattice(dims: [usize; 3], lo: DVec3, hi: DVec3) -> Lattice {
 
 /// World position of lattice point `o`.
 pub(crate) fn world(lattice: &Lattice, o: usize) -> DVec3 {
-    lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|i| i as f64)))
+    lattice.to_world(lattice.point(o))
 }
 
 /// h at the points of `lattice`, swept from `lo` to `hi`.
@@ -194,7 +194,7 @@ pub(crate) fn against_paths(scene: &Scene, side: Side, radiance: &[[f32; 3]], po
     let light: Vec<[f64; 2]> = points
         .par_iter()
         .map(|&o| {
-            let place = DVec3::from_array(scene.lattice().ijk(o).map(|i| i as f64));
+            let place = scene.lattice().point(o);
             let receiver = Receiver::on_level_set(scene, place, scene.field.samples()[o], side).unwrap();
             let exact = PathTracer::new(scene, &tracer).outgoing(&receiver, 512, Stage::Path.key(5, o as u64));
             [f64::from(radiance[o][1]), exact.y]

@@ -145,7 +145,7 @@ fn bright_rooms_are_as_bright_as_they_should_be() {
     let tracer = GraphTracer::new(&device, &scene).unwrap();
     let some: Vec<usize> = nodes(&scene, 2).into_iter().step_by(31).collect();
     let paths = |o: usize| {
-        let place = DVec3::from_array(scene.lattice().ijk(o).map(|x| x as f64));
+        let place = scene.lattice().point(o);
         let receiver = Receiver::on_level_set(&scene, place, scene.field.samples()[o], Side::Lower).unwrap();
         PathTracer::new(&scene, &tracer).outgoing(&receiver, 1024, Stage::Path.key(5, o as u64)).y
     };

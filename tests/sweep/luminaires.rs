@@ -31,7 +31,7 @@ fn direct_light_agrees_with_exact_shadow_rays() {
         .into_par_iter()
         .step_by(37)
         .map(|o| {
-            let p = DVec3::from_array(scene.lattice().ijk(o).map(|x| x as f64));
+            let p = scene.lattice().point(o);
             let (x, n) = (scene.lattice().to_world(p), scene.normal(p, Side::Lower).unwrap());
             let (mut lit, mut all) = (0.0, 0.0);
             for i in 0..256 {
@@ -78,7 +78,7 @@ fn level_sets_cut_open_hide_a_luminaire_outside() {
     let device = Device::new(1).unwrap();
     let tracer = GraphTracer::new(&device, &scene).unwrap();
     let got = run(&scene, SweepSettings { light_points: 256, max_bounces: 0, ..ONE_BOUNCE });
-    let place = |o: usize| DVec3::from_array(scene.lattice().ijk(o).map(|x| x as f64));
+    let place = |o: usize| scene.lattice().point(o);
     for what in ["all", "on faces", "inside", "on the lower face of y", "on the upper face of y"] {
         let wanted = |o: &usize| {
             let [i, j, k] = scene.lattice().ijk(*o);
@@ -123,7 +123,7 @@ fn light_next_to_a_luminaire_agrees_with_exact_shadow_rays() {
     let device = Device::new(1).unwrap();
     let tracer = GraphTracer::new(&device, &scene).unwrap();
     let light = &scene.polygons()[0];
-    let place = |o: usize| DVec3::from_array(scene.lattice().ijk(o).map(|x| x as f64));
+    let place = |o: usize| scene.lattice().point(o);
     let near: Vec<usize> = nodes(&scene, 1)
         .into_iter()
         .filter(|&o| light.distance(scene.lattice().to_world(place(o))) < 3.0 / 40.0)
@@ -167,7 +167,7 @@ fn one_bounce_near_a_luminaire_keeps_its_energy() {
     let some: Vec<usize> = all.iter().copied().step_by(all.len() / 300).collect();
     let rays = 256;
     let exact = |o: usize| -> f64 {
-        let p = DVec3::from_array(scene.lattice().ijk(o).map(|x| x as f64));
+        let p = scene.lattice().point(o);
         let frame = Frame::new(scene.normal(p, Side::Lower).unwrap());
         let set = Sobol::set(3, Stage::Test, o as u64);
         let hit = |i: u32| -> f64 {
@@ -202,7 +202,7 @@ fn faces_below_a_near_luminaire_are_lit() {
     let got = run(&scene, SweepSettings { light_points: 8, max_bounces: 0, ..ONE_BOUNCE });
     let mut worst = 0f64;
     for o in nodes(&scene, 0) {
-        let x = scene.lattice().to_world(DVec3::from_array(scene.lattice().ijk(o).map(|i| i as f64)));
+        let x = scene.lattice().to_world(scene.lattice().point(o));
         let expected = unoccluded(&scene.polygons()[0], x, DVec3::Z);
         worst = worst.max((f64::from(got.sides[0].irradiance[o][1]) - expected).abs());
     }
@@ -246,7 +246,7 @@ fn seen_through(layers: [f64; 7], from: usize, boundary: Boundary) -> f64 {
     assert_eq!(nodes.len(), 169);
     let found: f64 = nodes.iter().map(|&o| f64::from(got.sides[0].irradiance[o][1])).sum();
     let open = nodes.iter().map(|&o| {
-        let x = DVec3::from_array(lattice.ijk(o).map(|i| i as f64));
+        let x = lattice.point(o);
         unoccluded(&lamp, lattice.to_world(x), scene.normal(x, Side::Lower).unwrap())
     });
     found / open.sum::<f64>()

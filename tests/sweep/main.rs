@@ -237,7 +237,7 @@ fn closed_cavities_stay_dark() {
     let got = run(&scene, SweepSettings { directions: 64, light_points: 16, ..SweepSettings::default() });
     let (mut dark, mut all) = ([0.0; 2], [0.0; 2]);
     for o in nodes(&scene, 0) {
-        let x = scene.lattice().to_world(DVec3::from_array(scene.lattice().ijk(o).map(|i| i as f64)));
+        let x = scene.lattice().to_world(scene.lattice().point(o));
         let light = f64::from(got.sides[0].irradiance[o][1]);
         all = [all[0] + light, all[1] + 1.0];
         if x.length() < 4.0 && scene.field.samples()[o] < 0.45 {
@@ -407,7 +407,7 @@ fn the_farthest_numbers_are_only_far() {
     let lit = |fill: f32| {
         let lattice = Lattice::aligned([17; 3], DVec3::ZERO, DVec3::splat(1.0 / 16.0)).unwrap();
         let samples = (0..lattice.len()).map(|o| {
-            let x = lattice.to_world(DVec3::from_array(lattice.ijk(o).map(|x| x as f64)));
+            let x = lattice.to_world(lattice.point(o));
             // A block of several cells, where interpolation of equal numbers overflows.
             if x.min_element() > 0.4 && x.max_element() < 0.8 { fill } else { bumps_at(x) as f32 / 95.0 }
         });

@@ -34,10 +34,10 @@ impl Direct<'_> {
         let light = &scene.polygons()[number as usize];
         let points = self.points.on(light, number);
         let (nc, axis) = (flats.isovalues, flats.axis);
-        let corrections = [Side::Lower, Side::Higher]
-            .map(|side| flats.centres.iter().map(|&c| share.correction(side, c)).collect::<Vec<f64>>());
+        let corrections =
+            Side::BOTH.map(|side| flats.centres.iter().map(|&c| share.correction(side, c)).collect::<Vec<f64>>());
         let even = [1.0; 2].map(|x| vec![x; nc]);
-        let [lower, higher] = [Side::Lower, Side::Higher].map(|s| self.sides.contains(&s));
+        let [lower, higher] = Side::BOTH.map(|s| self.sides.contains(&s));
         let higher = higher && !scene.is_capped();
         let (textures, others) = flats.textures.split_at_mut(flats.count);
         for (id, texture) in textures.iter_mut().enumerate() {
