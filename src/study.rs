@@ -148,8 +148,7 @@ impl<'a> Study<'a> {
     }
 
     /// Two independent references on a fixed subset of the vertices of the isosurface at `isovalue` (source units),
-    /// from the cache or computed; `None` if there is no surface. The cache tells them apart by scene, settings and
-    /// isovalue.
+    /// from the cache or computed. The cache tells them apart by scene, settings and isovalue.
     ///
     /// # Errors
     /// `Invalid` if there is no surface; as `reference()`, or from reading the cache.

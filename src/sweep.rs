@@ -67,11 +67,10 @@ use open_share::open_over_sweep;
 use planes::PlanePool;
 use points::Points;
 use rayon::prelude::*;
-use reflect::Reflector;
 pub(crate) use replicate::bright;
 use slits::Slits;
 use state::State;
-use totals::Deblur;
+use totals::{Deblur, Totals};
 
 /// How to sweep.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -267,7 +266,8 @@ pub fn sweep_resumable(
     let replicates = settings.replicates.max(1);
     let (across, isovalues) = settings.flat_resolution;
     let mut flats = Flats::new(scene, &sides, across.max(2), isovalues.max(2));
-    let mut state = State::new(&sides, stored.len(), [geometry.h.len(), geometry.places()], replicates);
+    let size = [geometry.h.len(), geometry.places()];
+    let mut state = State::new(Totals::new(&sides, stored.len(), size, replicates));
     let mut passes = saved.read(0, |bytes| state.restore(bytes, sides.len(), &mut flats)).flatten();
     if state.counts.valid == 0 {
         let nodes = geometry.h.len();
@@ -276,24 +276,14 @@ pub fn sweep_resumable(
     }
     let pool = PlanePool::default();
     let isa = Isa::current();
-    let run = Run {
-        scene,
-        settings,
-        geometry: &geometry,
-        slits: &slits,
-        reflector: Reflector::new(scene, &geometry, &slits, isa),
-        sides: &sides,
-        isa,
-        saved,
-        pool: &pool,
-    };
+    let run = Run { scene, settings, geometry: &geometry, slits: &slits, sides: &sides, isa, saved, pool: &pool };
     let dims = scene.lattice().dims();
-    let deblur = Deblur { dims, lit: |at| geometry.lit(at) };
     run.direct(&mut state, &mut flats, tick).ok_or(Error::Interrupted)?;
     while state.done() < replicates {
         let done = state.done() as f64;
         let progress = |x: f64| tick(DIRECT_SHARE + (1.0 - DIRECT_SHARE) * (done + x) / replicates as f64);
         let indirect = run.replicate(&mut state, passes.take(), &mut flats, &progress).ok_or(Error::Interrupted)?;
+        let deblur = Deblur { dims, lit: &geometry.all_lit() };
         state.add(&indirect, &flats, (scene, geometry.lit_rows(), &deblur));
         pool.keep(indirect.into_iter().flatten());
     }
@@ -303,7 +293,7 @@ pub fn sweep_resumable(
     let State { total, flats: mut sums, bounces, residual, counts, .. } = state;
     sums.iter_mut().flatten().flatten().for_each(|x| *x /= replicates as f32);
     let flats = flats.export(&sums, &sides, scene.surface.outside);
-    let mut sides = total.finish(&rows, &Deblur { dims, lit: |at| lit[at] }, settings.direct);
+    let mut sides = total.finish(&rows, &Deblur { dims, lit: &lit }, settings.direct);
     let world = |o: usize| scene.lattice().to_world(scene.lattice().point(o));
     let dark = slits.hidden.iter().map(|hidden| hidden.0).filter(|&o| scene.covers(world(o)));
     for o in dark {
@@ -345,7 +335,6 @@ struct Run<'a> {
     settings: &'a SweepSettings,
     geometry: &'a Geometry<'a>,
     slits: &'a Slits,
-    reflector: Reflector<'a>,
     sides: &'a [Side],
     isa: Isa,
     saved: Saved<'a>,

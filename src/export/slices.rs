@@ -72,6 +72,7 @@ pub fn write(path: &Path, lattice: &Lattice, components: usize, values: SamplesR
         })
     })
 }
+
 /// Whether [`ELEMENT`] is too coarse for what 64-bit values, or 32-bit integers, differ by, as it is for small
 /// differences on a large offset.
 pub fn are_coarse(values: SamplesRef<'_>) -> bool {

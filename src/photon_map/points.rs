@@ -39,7 +39,7 @@ struct MappedPhoton {
 }
 
 impl<'a> PhotonPoints<'a> {
-    /// Maps the photons of `side` that `keep` accepts.
+    /// Maps the photons that `keep` accepts.
     #[allow(clippy::cast_possible_truncation, reason = "storage is f32")]
     pub(super) fn new(
         scene: &'a Scene,

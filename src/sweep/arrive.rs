@@ -2,7 +2,7 @@
 //! running maximum of h.
 
 use super::directions::Layout;
-use super::ends::Ends;
+use super::ends::LineEnds;
 use super::flats::{Flats, Stop, below, fill_column, shapes, sinks};
 use super::gaps::Crossing;
 use super::gather::{Bounce, Pass};
@@ -63,27 +63,74 @@ pub(crate) fn reports(scene: &Scene, across: usize, isovalues: usize) -> f64 {
     2.0 * reporting * ends * (12 * isovalues + 40) as f64
 }
 
-/// A line that meets Ω: its pack, B of this side and the other, its lane, and where it enters and leaves.
-type Samples<'a> = (&'a Pack, [&'a [Half4]; 2], usize, [f64; 2]);
+/// A line that meets Ω.
+#[derive(Clone, Copy)]
+struct SampledLine<'a> {
+    pack: &'a Pack,
+    lane: usize,
+    /// B of this side and the other.
+    b: [&'a [Half4]; 2],
+    /// τ where it enters Ω and leaves it.
+    span: [f64; 2],
+    /// Its place among the family's lines along u and v.
+    pq: (f64, f64),
+}
 
-/// The rows of a pack that were read between two places τ of a line, which lies in Ω over `span`, in the order from one
-/// to the other: slice k is row k + 1, and the entry and exit rows belong to ends outside Ω.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to rows")]
-fn rows(pack: &Pack, span: [f64; 2], (from, to): (f64, f64)) -> impl Iterator<Item = usize> {
-    let forward = to > from;
-    let bound = |tau: f64, up: bool| -> usize {
-        if tau <= span[0] + 1e-6 {
-            0
-        } else if tau >= span[1] - 1e-6 {
-            pack.h.len()
-        } else {
-            (if up { tau.floor() + 2.0 } else { tau.ceil() + 1.0 }) as usize
-        }
-    };
-    let (lo, hi) = if forward { (bound(from, true), bound(to, false)) } else { (bound(to, true), bound(from, false)) };
-    let count = pack.awake.len();
-    let row = move |step: usize| pack.awake[if forward { step } else { count - 1 - step }] as usize;
-    (0..count).map(row).filter(move |row| (lo..hi).contains(row))
+impl SampledLine<'_> {
+    /// Whether Ω lies between two places of it.
+    fn passes(&self, from: f64, to: f64) -> bool {
+        from.min(to) < self.span[1] + 1e-6 && from.max(to) > self.span[0] - 1e-6
+    }
+}
+
+/// What is seen along a line from one τ towards another.
+#[derive(Clone, Copy)]
+struct View<'a> {
+    line: SampledLine<'a>,
+    from: f64,
+    to: f64,
+}
+
+impl View<'_> {
+    fn forward(&self) -> bool {
+        self.to > self.from
+    }
+
+    /// τ where it enters Ω.
+    fn entry(&self) -> f64 {
+        self.line.span[usize::from(!self.forward())]
+    }
+
+    fn h(&self, row: usize) -> f32 {
+        self.line.pack.h[row][self.line.lane]
+    }
+
+    fn node(&self, row: usize) -> usize {
+        self.line.pack.node[row][self.line.lane] as usize
+    }
+
+    /// The rows of the pack that were read, in the order they are seen in: slice k is row k + 1, and the entry and exit
+    /// rows belong to ends outside Ω.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to rows")]
+    #[inline(always)]
+    fn rows(&self) -> impl Iterator<Item = usize> {
+        let Self { line: SampledLine { pack, span, .. }, from, to } = *self;
+        let forward = self.forward();
+        let bound = |tau: f64, up: bool| -> usize {
+            if tau <= span[0] + 1e-6 {
+                0
+            } else if tau >= span[1] - 1e-6 {
+                pack.h.len()
+            } else {
+                (if up { tau.floor() + 2.0 } else { tau.ceil() + 1.0 }) as usize
+            }
+        };
+        let (near, far) = if forward { (from, to) } else { (to, from) };
+        let (lo, hi) = (bound(near, true), bound(far, false));
+        let count = pack.awake.len();
+        let row = move |step: usize| pack.awake[if forward { step } else { count - 1 - step }] as usize;
+        (0..count).map(row).filter(move |row| (lo..hi).contains(row))
+    }
 }
 
 /// Which lines report: every so many along u and v, from `phase` on; none with strides of 0.
@@ -117,7 +164,7 @@ impl Reporting {
 /// The walls' part of one family of lines.
 pub(super) struct Walls<'a> {
     plan: &'a Plan,
-    ends: &'a Ends,
+    ends: &'a LineEnds,
     flats: &'a Flats,
     /// Rows of lines that meet the box.
     rows: (isize, isize),
@@ -138,7 +185,7 @@ pub(super) struct Walls<'a> {
 
 impl<'a> Walls<'a> {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few thousand lines")]
-    pub(super) fn new(pass: &Pass, bounce: &Bounce<'a>, side: Side, plan: &'a Plan, ends: &'a Ends) -> Self {
+    pub(super) fn new(pass: &Pass, bounce: &Bounce<'a>, side: Side, plan: &'a Plan, ends: &'a LineEnds) -> Self {
         let (shear, flats) = (&plan.shear, bounce.flats);
         let [lo, hi] = pass.scene.local_bounds();
         let margin = pass.scene.has_margin();
@@ -196,9 +243,10 @@ impl<'a> Walls<'a> {
             let span = pack.spans.map(|tau| tau[lane]);
             // Lines through a corner of Ω that no slice cuts have no samples.
             if span[0].ceil() <= span[1].floor() {
-                self.line(Some((pack, b, lane, span)), (p, q), self.near.weight, out);
+                let line = SampledLine { pack, lane, b, span, pq: (p as f64, q as f64) };
+                self.line(Some(line), (p, q), self.near.weight, out);
                 if self.capped && self.plan.sign > 0.0 {
-                    self.caps(pack, lane, span, (p, q), out);
+                    self.caps(line, out);
                 }
             } else if self.margin {
                 self.line(None, (p, q), self.near.weight, out);
@@ -219,7 +267,7 @@ impl<'a> Walls<'a> {
 
     /// What every front on one line sees along it.
     #[inline(always)]
-    fn line(&self, samples: Option<Samples>, (p, q): (isize, isize), weight: f32, out: &mut Arrivals) {
+    fn line(&self, sampled: Option<SampledLine>, (p, q): (isize, isize), weight: f32, out: &mut Arrivals) {
         let nc = self.flats.isovalues;
         let (pf, qf) = (p as f64, q as f64);
         for (wall, forward) in self.ends.fronts(pf, qf) {
@@ -232,13 +280,13 @@ impl<'a> Walls<'a> {
             let reach = next.map_or(if forward { f64::INFINITY } else { f64::NEG_INFINITY }, |s| s.tau);
             let values = out.room(nc);
             fill_column(self.flats, next, values);
-            let range = match samples {
-                Some((pack, b, lane, span)) if self.meets(wall.tau, reach, span) => {
-                    let way = (wall.tau, reach);
-                    if pack.gapped >> lane & 1 == 1 {
-                        self.staircase_with_gaps((pack, b), lane, span, way, ((pf, qf), next), values)
+            let range = match sampled {
+                Some(line) if line.passes(wall.tau, reach) => {
+                    let view = View { line, from: wall.tau, to: reach };
+                    if line.pack.gapped >> line.lane & 1 == 1 {
+                        self.staircase_with_gaps(view, next, values)
                     } else {
-                        self.staircase((pack, b[0]), lane, span, way, (pf, qf), values)
+                        self.staircase(view, values)
                     }
                 }
                 _ if self.primary => (0, nc),
@@ -248,24 +296,12 @@ impl<'a> Walls<'a> {
         }
     }
 
-    fn meets(&self, from: f64, to: f64, span: [f64; 2]) -> bool {
-        from.min(to) < span[1] + 1e-6 && from.max(to) > span[0] - 1e-6
-    }
-
-    /// Replaces in `values` (what the far end shows) the isovalues that meet a level set first, seen from τ = `from`.
-    /// Returns the isovalues that lie on this side there.
+    /// Replaces in `values` (what the far end shows) the isovalues that meet a level set first. Returns the isovalues
+    /// that lie on this side where the view begins.
     #[inline(always)]
-    fn staircase(
-        &self,
-        (pack, b): (&Pack, &[Half4]),
-        lane: usize,
-        span: [f64; 2],
-        (from, to): (f64, f64),
-        pq: (f64, f64),
-        values: &mut [f32],
-    ) -> (usize, usize) {
+    fn staircase(&self, view: View, values: &mut [f32]) -> (usize, usize) {
         let nc = self.flats.isovalues;
-        let forward = to > from;
+        let [b, _] = view.line.b;
         let higher = self.plan.sign < 0.0;
         let ordinal = |t: usize| self.ordinal(t);
         let height = |t: usize| self.height(t);
@@ -273,8 +309,8 @@ impl<'a> Walls<'a> {
         let mut first = None;
         let mut before: Option<(usize, f32)> = None;
         // Rows that were not read hold nothing at these isovalues.
-        for row in rows(pack, span, (from, to)) {
-            let h = pack.h[row][lane];
+        for row in view.rows() {
+            let h = view.h(row);
             if h == OUTSIDE {
                 continue;
             }
@@ -285,15 +321,15 @@ impl<'a> Walls<'a> {
                     }
                     first = Some(t);
                     if self.capped {
-                        self.cap(span[usize::from(!forward)], pq, t, values);
+                        self.cap(view, t, values);
                     }
                 }
                 Some((old, h_old)) => {
                     while t < nc && height(t) <= h {
                         let f = ((height(t) - h_old) / (h - h_old)).clamp(0.0, 1.0);
-                        let node = pack.node[if f < 0.5 { old } else { row }][lane];
+                        let node = view.node(if f < 0.5 { old } else { row });
                         for c in 0..3 {
-                            values[c * nc + ordinal(t)] = self.unit * decode(b[node as usize][c]);
+                            values[c * nc + ordinal(t)] = self.unit * decode(b[node][c]);
                         }
                         t += 1;
                     }
@@ -311,24 +347,17 @@ impl<'a> Walls<'a> {
         if higher { (0, nc - first) } else { (first, nc) }
     }
 
-    /// [`Self::staircase`] along a line through samples that are not finite, with B of this side and the other: beyond
-    /// them isovalues may go on inside the solid, and meet level sets from there.
+    /// [`Self::staircase`] along a line through samples that are not finite, towards `next`: beyond them isovalues may
+    /// go on inside the solid, and meet level sets from there.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "slices in Ω")]
-    fn staircase_with_gaps(
-        &self,
-        (pack, b): (&Pack, [&[Half4]; 2]),
-        lane: usize,
-        span: [f64; 2],
-        (from, to): (f64, f64),
-        (pq, next): ((f64, f64), Option<Stop>),
-        values: &mut [f32],
-    ) -> (usize, usize) {
+    fn staircase_with_gaps(&self, view: View, next: Option<Stop>, values: &mut [f32]) -> (usize, usize) {
         let nc = self.flats.isovalues;
-        let (forward, higher) = (to > from, self.plan.sign < 0.0);
+        let SampledLine { pack, lane, b, span, .. } = view.line;
+        let (forward, higher) = (view.forward(), self.plan.sign < 0.0);
         let mut beyond = Vec::new();
         let (first_slice, last_slice) = (span[0].ceil() as usize, span[1].floor() as usize);
         let start = pack.h[if forward { first_slice } else { last_slice } + 1][lane];
-        let entry = rows(pack, span, (from, to)).map(|row| pack.h[row][lane]).find(|h| *h != OUTSIDE);
+        let entry = view.rows().map(|row| view.h(row)).find(|h| *h != OUTSIDE);
         let asleep = (first_slice..=last_slice).any(|k| !pack.was_read(k + 1));
         // Isovalues whose solid the line enters Ω in. Where there are nothing but gaps, one side takes all.
         let inside = match entry {
@@ -340,17 +369,16 @@ impl<'a> Walls<'a> {
         let mut first = inside;
         if self.capped {
             let covered = if start == OUTSIDE { 0 } else { inside };
-            self.cap(span[usize::from(!forward)], pq, covered, values);
+            self.cap(view, covered, values);
             first = covered;
         }
         // Inside the solid lines end on a cap, black from within.
         let exit = if self.capped { pack.border(lane, forward) } else { None };
         for t in first..nc {
             let mut ray = Crossing::new(self.height(t), false);
-            let met = rows(pack, span, (from, to)).find_map(|row| ray.step(row, pack.h[row][lane]));
+            let met = view.rows().find_map(|row| ray.step(row, view.h(row)));
             if let Some((row, front)) = met {
-                let node = pack.node[row][lane] as usize;
-                let radiance = colour(b[usize::from(!front)].get(node).copied().unwrap_or_default());
+                let radiance = colour(b[usize::from(!front)].get(view.node(row)).copied().unwrap_or_default());
                 for c in 0..3 {
                     values[c * nc + self.ordinal(t)] = self.unit * radiance[c];
                 }
@@ -384,12 +412,12 @@ impl<'a> Walls<'a> {
         self.plan.sign * self.flats.centres[self.ordinal(t)]
     }
 
-    /// The first `count` isovalues meet the cap where the line crosses Ω's face at `tau`.
-    fn cap(&self, tau: f64, pq: (f64, f64), count: usize, values: &mut [f32]) {
+    /// The first `count` isovalues meet the cap where a view enters Ω.
+    fn cap(&self, view: View, count: usize, values: &mut [f32]) {
         if count == 0 || self.plan.sign < 0.0 {
             return;
         }
-        let stop = self.cap_stop(tau, pq);
+        let stop = self.cap_stop(view.entry(), view.line.pq);
         let nc = self.flats.isovalues;
         let mut column = vec![0f32; 3 * nc];
         fill_column(self.flats, Some(stop), &mut column);
@@ -399,7 +427,7 @@ impl<'a> Walls<'a> {
     }
 
     /// The cap at τ of a line, where it crosses a face of Ω.
-    #[allow(clippy::cast_possible_truncation, reason = "texture coordinates")]
+    #[allow(clippy::cast_possible_truncation, reason = "texture coordinates, six caps")]
     fn cap_stop(&self, tau: f64, (p, q): (f64, f64)) -> Stop {
         let shear = &self.plan.shear;
         let mut local = DVec3::ZERO;
@@ -420,15 +448,14 @@ impl<'a> Walls<'a> {
             .expect("six faces");
         let x = face % 3;
         let uv = [(x + 1) % 3, (x + 2) % 3].map(|b| (local[b] / far[b]).clamp(0.0, 1.0) as f32);
-        #[allow(clippy::cast_possible_truncation, reason = "six caps")]
         let cap = self.caps + face as u32;
         Stop { tau, polygon: cap, flat: Some(cap), uv, covers: None }
     }
 
     /// What the caps at a line's entry and exit see outside Ω.
-    fn caps(&self, pack: &Pack, lane: usize, span: [f64; 2], (p, q): (isize, isize), out: &mut Arrivals) {
+    fn caps(&self, line: SampledLine, out: &mut Arrivals) {
+        let SampledLine { pack, lane, span, pq, .. } = line;
         let nc = self.flats.isovalues;
-        let pq = (p as f64, q as f64);
         for (end, h) in [false, true].map(|forward| pack.border(lane, forward)).into_iter().enumerate() {
             let Some(h) = h else { continue };
             let covered = below(&self.flats.axis, nc, h);

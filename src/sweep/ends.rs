@@ -55,11 +55,11 @@ pub(super) enum Place {
 }
 
 /// Finds what the lines of one family end on.
-pub(super) struct Ends {
+pub(super) struct LineEnds {
     met: Vec<Met>,
 }
 
-impl Ends {
+impl LineEnds {
     /// As `side` of the level sets sees them.
     pub(super) fn new(scene: &Scene, (flats, side): (&Flats, Side), shear: &Shear, standing: &[Standing]) -> Self {
         let lattice = scene.lattice();
@@ -140,7 +140,7 @@ impl Ends {
         best.map(|(tau, m)| m.stop(p, q, tau, forward))
     }
 
-    /// [`Ends::stop`] of lines first + 0 … 15 of row q from `from`, with their place in [`Flats::packed`].
+    /// [`LineEnds::stop`] of lines first + 0 … 15 of row q from `from`, with their place in [`Flats::packed`].
     #[inline(always)]
     #[allow(clippy::cast_possible_truncation, reason = "texture coordinates")]
     pub(super) fn stops(
@@ -296,7 +296,7 @@ mod tests {
         for _ in 0..40 {
             let omega = crate::warp::sphere(rng.unit2());
             let plan = Plan::new(Shear::new(scene.lattice(), omega, rng.unit2()), 1.0);
-            let ends = Ends::new(&scene, (&flats, Side::Lower), &plan.shear, &standing);
+            let ends = LineEnds::new(&scene, (&flats, Side::Lower), &plan.shear, &standing);
             let (first, q) = ((rng.unit() * 12.0).floor() - 8.0, (rng.unit() * 12.0).floor());
             let random: [f32; LANES] = std::array::from_fn(|_| rng.unit() as f32);
             for forward in [true, false] {
@@ -346,7 +346,7 @@ mod tests {
         let (mut through, mut beside, mut out) = (0, 0, Vec::new());
         for _ in 0..400 {
             let shear = Shear::new(scene.lattice(), crate::warp::sphere(rng.unit2()), rng.unit2());
-            let ends = Ends::new(&scene, (&flats, Side::Lower), &shear, &standing);
+            let ends = LineEnds::new(&scene, (&flats, Side::Lower), &shear, &standing);
             let axes = shear.layout.axes;
             for _ in 0..50 {
                 let [p, q] = [(); 2].map(|()| (24.0 * rng.unit() - 12.0).floor());

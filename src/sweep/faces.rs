@@ -38,11 +38,12 @@ pub(super) fn inwards(j: usize, n: usize) -> isize {
     }
 }
 
-/// The two lines along u around node `i` of `nu`, and the weights of the second and of the row before, as
-/// [`super::accumulate`] has them: on a side the first is nearer, and light is extrapolated linearly from both
-/// (`extrapolates`) or clamped. `line0` is the line just beyond node 0, −1 of which is missing.
+/// The two lines along u that node `i` of `nu` takes its light from, and the weights of the second of them and of the
+/// row of lines before. `line0` is the line just beyond node 0, `[fu, fv]` are the weights of a node with lines on both
+/// sides. A node on a side of Ω has both within, the nearer one first: light is extrapolated from them (`extrapolates`;
+/// weights then leave 0 … 1) or clamped.
 #[inline(always)]
-pub(super) fn around(
+pub(super) fn lines_around(
     (i, nu): (usize, usize),
     line0: usize,
     [fu, fv]: [f32; 2],
@@ -186,7 +187,7 @@ pub(super) struct Sides<'a> {
     /// The line just beyond node 0, −1 of which is missing, and weights, as [`super::accumulate`] has them.
     pub line0: usize,
     pub weights: [f32; 2],
-    /// As [`around`].
+    /// As [`lines_around`].
     pub extrapolates: bool,
     pub stands: Light<'a>,
     pub wall_light: &'a FaceWallLight<'a>,
@@ -199,7 +200,7 @@ impl Sides<'_> {
     pub(super) fn radiance(&self, i: usize, c: f32, forward: bool) -> [f32; 3] {
         let [nu, nv, _] = self.layout.dims;
         let [j, k] = self.row;
-        let ([near, far], [f, fv]) = around((i, nu), self.line0, self.weights, self.extrapolates);
+        let ([near, far], [f, fv]) = lines_around((i, nu), self.line0, self.weights, self.extrapolates);
         let sides = [leaves(i, nu, self.slope[0]), leaves(j, nv, self.slope[1])];
         if let Some(side) = sides.iter().position(|side| *side == Some(forward)) {
             let axes = self.layout.axes;

@@ -3,7 +3,7 @@
 
 mod fan;
 
-use super::gaps::Hidden;
+use super::gaps::HiddenRanges;
 use super::grid::Geometry;
 use crate::flattened::Side;
 use crate::isa::Isa;
@@ -66,10 +66,11 @@ impl Fans {
             }
         }
         rows.into_par_iter().with_max_len(8).for_each_init(
-            || Scratch { hidden: geometry.has_gaps().then(Hidden::default), ..Scratch::default() },
+            || Scratch { hidden: geometry.has_gaps().then(HiddenRanges::default), ..Scratch::default() },
             |scratch, (fan, row, out)| {
-                let awake = std::array::from_fn(|s| Some(geometry.awake(&fan.layout, *sides.get(s)?)));
-                let through = Through { isa, h: geometry.h(&fan.layout), awake, start, turn };
+                let order = geometry.order(&fan.layout);
+                let awake = std::array::from_fn(|s| Some(&order.awake[sides.get(s)?.index()]));
+                let through = Through { isa, h: &order.h, awake, start, turn };
                 fan.march(&through, row, scratch, out);
             },
         );

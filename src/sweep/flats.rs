@@ -3,7 +3,7 @@
 #![allow(clippy::needless_range_loop, reason = "a channel indexes several planes at once")]
 
 use super::half::{Half4, encode};
-use super::incoming::{Incoming, Sink, around};
+use super::incoming::{Incoming, Sink, texels_around};
 use super::settling::Sums;
 use super::solid::{FREE, solid};
 use super::swept_sides;
@@ -19,8 +19,6 @@ use std::f32::consts::PI;
 pub(super) struct Texture {
     /// Texels along u, v and isovalues.
     pub dims: [usize; 3],
-    /// Where the isovalues stand.
-    axis: IsovalueAxis,
     /// Diffuse reflectance at every isovalue.
     pub albedo: Vec<[f32; 3]>,
     /// Texels along u and v that lines report to, as [`sinks`].
@@ -63,7 +61,7 @@ impl Texture {
     #[inline(always)]
     pub(super) fn column(&self, uv: [f32; 2], out: &mut [f32]) {
         let n = 3 * self.dims[2];
-        let [a, b, c, d] = around(self.dims, uv).map(|(t, w)| (&self.radiance[t * n..][..n], w));
+        let [a, b, c, d] = texels_around(self.dims, uv).map(|(t, w)| (&self.radiance[t * n..][..n], w));
         for (i, o) in out[..n].iter_mut().enumerate() {
             *o = a.1 * a.0[i] + b.1 * b.0[i] + (c.1 * c.0[i] + d.1 * d.0[i]);
         }
@@ -155,7 +153,6 @@ impl Flats {
                 Some(Texture {
                     dims: [*u, *v, isovalues],
                     sink,
-                    axis,
                     albedo: centres.iter().map(|&c| flat.albedo.at(c).as_vec3().to_array()).collect(),
                     sink_area: flat.area() / (sink[0] * sink[1]) as f64,
                     direct: vec![0.0; n],
@@ -234,7 +231,7 @@ impl Flats {
     /// reflects, and what each weighs.
     pub(super) fn texels(&self, flat: u32, uv: [f32; 2]) -> Option<[(usize, f32); 4]> {
         let texture = self.textures[flat as usize].as_ref()?;
-        Some(around(texture.dims, uv).map(|(texel, weight)| (texture.start + texel * self.isovalues, weight)))
+        Some(texels_around(texture.dims, uv).map(|(texel, weight)| (texture.start + texel * self.isovalues, weight)))
     }
 
     /// Where in [`Flats::packed`] the B of a stop over isovalues starts, as [`Flats::places`] has it; black of nothing.
@@ -251,7 +248,7 @@ impl Flats {
         let mut places = [0; N];
         let Some(texture) = &self.textures[flat as usize] else { return places };
         for l in 0..N {
-            let [a, b, c, d] = around(texture.dims, [uv[0][l], uv[1][l]]);
+            let [a, b, c, d] = texels_around(texture.dims, [uv[0][l], uv[1][l]]);
             let left = [random[l] - a.1, random[l] - a.1 - b.1, random[l] - a.1 - b.1 - c.1];
             // Selected from the last to the first: an end at the first that fits would be a branch that nobody can
             // foretell.
@@ -272,9 +269,11 @@ impl Flats {
 
     /// B of direct light alone.
     pub(super) fn reflect_direct(&mut self) {
-        let nothing = self.open();
-        self.close(&nothing);
-        self.reflect(false);
+        for t in self.textures.iter_mut().flatten() {
+            t.indirect.fill(0.0);
+            t.weight.fill(0.0);
+        }
+        self.reflect();
     }
 
     /// Sums of B in the channels that are chosen.
@@ -294,7 +293,7 @@ impl Flats {
             let light = t.indirect.iter_mut().zip(&t.direct).zip(&t.defect);
             light.for_each(|((e, d), x)| *e = (*e + x).max(-d));
         }
-        self.reflect(true);
+        self.reflect();
         for (t, light) in self.textures.iter_mut().zip(light) {
             let (Some(t), Some(light)) = (t, light) else { continue };
             t.count(&light, measured, &mut sums);
@@ -341,7 +340,7 @@ impl Flats {
             let sums = t.indirect.par_chunks_mut(3 * nc).zip(t.weight.par_chunks_mut(nc));
             sums.enumerate().for_each(|(texel, (indirect, weight))| {
                 let at = |i: usize, n: usize| (i as f32 + 0.5) / n as f32;
-                let around = around(sink.dims, [at(texel % nu, nu), at(texel / nu, nv)]);
+                let around = texels_around(sink.dims, [at(texel % nu, nu), at(texel / nu, nv)]);
                 let spread = |out: &mut [f32], from: &[f32]| {
                     let n = out.len();
                     let [a, b, c, d] = around.map(|(t, w)| (&from[t * n..][..n], w));
@@ -386,7 +385,9 @@ impl Flats {
         outside: Side,
     ) -> Vec<Option<FlatLight>> {
         let one_for_all = if sides.len() == 2 { Within::Same } else { Within::Unknown };
-        let of = |number: usize| Some(self.textures.get(number)?.as_ref()?.export(radiance.get(number)?.as_ref()?));
+        let of = |number: usize| {
+            Some(self.textures.get(number)?.as_ref()?.export(self.axis, radiance.get(number)?.as_ref()?))
+        };
         let light = |flat: usize| {
             let solid = self.solid.get(flat).and_then(Option::as_ref);
             let apart = solid.is_some_and(|solid| solid.iter().any(|n| *n != FREE));
@@ -416,8 +417,8 @@ impl Flats {
         }
     }
 
-    /// B = ρ/π (direct + indirect); texels that lie inside the solid take the mean of neighbours that do not.
-    pub(super) fn reflect(&mut self, seen: bool) {
+    /// B = ρ/π (direct + indirect); texels that no line reached take the mean of neighbours that some did.
+    pub(super) fn reflect(&mut self) {
         for t in self.textures.iter_mut().flatten() {
             let nc = t.isovalues();
             let (direct, indirect, albedo) = (&t.direct, &t.indirect, &t.albedo);
@@ -432,9 +433,7 @@ impl Flats {
                     }
                 }
             });
-            if seen {
-                t.fill();
-            }
+            t.fill();
         }
     }
 }
@@ -474,9 +473,9 @@ impl Texture {
     }
 
     /// The values (isovalues fastest) in the order of [`FlatTexture`].
-    fn export(&self, values: &[f32]) -> FlatTexture {
+    fn export(&self, axis: IsovalueAxis, values: &[f32]) -> FlatTexture {
         let [nu, nv, nc] = self.dims;
-        let mut out = FlatTexture { axis: self.axis, ..FlatTexture::black(self.dims) };
+        let mut out = FlatTexture { axis, ..FlatTexture::black(self.dims) };
         for texel in 0..nu * nv {
             for i in 0..nc {
                 out.texels[i * nu * nv + texel] = std::array::from_fn(|c| values[(3 * texel + c) * nc + i]);

@@ -2,7 +2,7 @@
 //! of Ω, and level sets end at their rims. A ray that comes out of a gap may do so inside the solid of its isovalue,
 //! which it then sees from within.
 
-use super::faces::around;
+use super::faces::lines_around;
 use super::fans::{HIGHER, LOWER, sample};
 use super::grid::ring;
 use super::half::colour;
@@ -51,12 +51,12 @@ impl Rims {
 
 /// Isovalues that level sets before gaps hide from the source of a fan, for each line of a row.
 #[derive(Default)]
-pub(super) struct Hidden {
+pub(super) struct HiddenRanges {
     /// What h spans from one gap to the next.
     ranges: Vec<Vec<[f32; 2]>>,
 }
 
-impl Hidden {
+impl HiddenRanges {
     /// Nothing, from so many lines.
     pub(super) fn clear(&mut self, lines: usize) {
         self.ranges.iter_mut().for_each(Vec::clear);
@@ -92,16 +92,16 @@ impl Hidden {
 const LEAST: f32 = 1e-3;
 
 /// The four lines around a node: two of a row of lines and two of the row before.
-pub(super) struct Around {
+pub(super) struct FourLines {
     lines: [usize; 2],
     /// [row][line].
     weights: [[f32; 2]; 2],
 }
 
-impl Around {
-    /// Those of node `i` of `nu`, as [`around`] has them.
+impl FourLines {
+    /// Those of node `i` of `nu`, as [`lines_around`] has them.
     pub(super) fn new(i: (usize, usize), line0: usize, weights: [f32; 2], extrapolates: bool) -> Self {
-        let (lines, [f, fv]) = around(i, line0, weights, extrapolates);
+        let (lines, [f, fv]) = lines_around(i, line0, weights, extrapolates);
         Self { lines, weights: [1.0 - fv, fv].map(|row| [row * (1.0 - f), row * f]) }
     }
 
@@ -510,7 +510,7 @@ mod tests {
         for _ in 0..300 {
             let lines: [Vec<f32>; 3] = std::array::from_fn(|_| line(&mut rng, 0.2));
             let (mut most, mut least) = (vec![f32::NEG_INFINITY; 3], vec![f32::INFINITY; 3]);
-            let mut hidden = Hidden::default();
+            let mut hidden = HiddenRanges::default();
             hidden.clear(3);
             for k in 0..lines[0].len() {
                 let row: Vec<f32> =
@@ -571,7 +571,7 @@ mod tests {
         let light = [&light[0][..], &light[1][..]];
         let (whole, f) = ([0; 3], [0.25, 0.75]);
         for i in 0..20 {
-            let around = Around::new((i, 20), 9, f, true);
+            let around = FourLines::new((i, 20), 9, f, true);
             // Line 9 + i lies by 0.25 before node i, and so does row 0 by 0.75 behind the other.
             let expected = 5.0 - (9.0 + i as f32 - 0.25) + 7.5;
             assert!((around.mean(light, [&whole, &whole]) - expected).abs() < 1e-5, "{i}");

@@ -3,10 +3,10 @@
 use super::accumulate::{Lines, cosine};
 use super::arrive;
 use super::directions::{Layout, Shear};
-use super::ends::{Ends, Standing};
+use super::ends::{LineEnds, Standing};
 use super::faces::{FaceWallLight, FaceWalls, RowEnds, Sides, inwards, note, on_side};
 use super::flats::Flats;
-use super::gaps::Around;
+use super::gaps::FourLines;
 use super::grid::{Geometry, Source};
 use super::half::Half4;
 use super::incoming::{Arrivals, Incoming};
@@ -102,7 +102,7 @@ struct Family<'a> {
     back: &'a [Half4],
     /// In the memory order of its lines.
     normals: &'a [u32],
-    ends: &'a Ends,
+    ends: &'a LineEnds,
     flats: &'a Flats,
     wall_light: &'a FaceWallLight<'a>,
     walls: arrive::Walls<'a>,
@@ -171,7 +171,7 @@ impl Pass<'_> {
                 back: of(1 - n),
                 normals: turned.as_ref().unwrap_or(&self.geometry.normals),
                 wall_light: &wall_light,
-                rows: node_rows(&mut e, self.geometry.lit_rows_of(&any.layout)),
+                rows: node_rows(&mut e, &self.geometry.order(&any.layout).lit_rows),
             };
             for shear in some {
                 if !tick() {
@@ -228,7 +228,7 @@ impl Pass<'_> {
         let (flats, side, lines, scale) = (bounce.flats, receivers.side, bounce.lines.len(), bounce.light.unit);
         let sign = if side == Side::Lower { 1.0 } else { -1.0 };
         let plan = Plan::new(*shear, sign);
-        let ends = Ends::new(self.scene, (flats, side), shear, self.standing);
+        let ends = LineEnds::new(self.scene, (flats, side), shear, self.standing);
         let walls = arrive::Walls::new(self, bounce, side, &plan, &ends);
         let share = 4.0 * std::f64::consts::PI / (2 * lines) as f64 / f64::from(scale);
         let family = Family {
@@ -263,7 +263,7 @@ impl Pass<'_> {
     fn nodes(&self, plan: &Plan, q: isize, out: &mut Vec<[usize; 2]>) {
         let layout = &plan.shear.layout;
         let [nu, nv, na] = layout.dims;
-        let lit = &self.geometry.lit_blocks(layout).rows;
+        let lit = &self.geometry.order(layout).lit_blocks.rows;
         out.clear();
         for (k, (whole, _)) in plan.shift[1][..na].iter().enumerate() {
             let cell = q + whole;
@@ -366,7 +366,7 @@ impl Pass<'_> {
         let nu = layout.dims[0];
         let row = rows[at / nu].lock().expect("no thread panics");
         row.iter().for_each(|e| prefetch(e));
-        prefetch(&family.normals[self.geometry.lit_rows_of(layout).run(at / nu).1]);
+        prefetch(&family.normals[self.geometry.order(layout).lit_rows.run(at / nu).1]);
         row
     }
 
@@ -385,11 +385,11 @@ impl Pass<'_> {
             around.map(|lines| std::array::from_fn(|c| &lines.light[c][k * plan.width..][..plan.width]));
         let at = k * layout.stride[1] + j * layout.stride[0];
         // Normals and light of the row's run, from its first node on.
-        let (first, run) = self.geometry.lit_rows_of(layout).run(at / nu);
+        let order = self.geometry.order(layout);
+        let (first, run) = order.lit_rows.run(at / nu);
         let n = &family.normals[run];
         let gaps = around.map(|lines| lines.gaps.get(k * plan.width / LANES..).unwrap_or_default());
-        let rims = self.geometry.rims(layout);
-        let lit = self.geometry.lit_blocks(layout);
+        let (lit, rims) = (&order.lit_blocks, order.rims.as_ref());
         let [e0, e1, e2] = row;
         let sides = Sides {
             layout: *layout,
@@ -403,7 +403,7 @@ impl Pass<'_> {
             stands: family.light(),
             wall_light: family.wall_light,
         };
-        let h = &self.geometry.h(layout)[at..][..nu];
+        let h = &order.h[at..][..nu];
         let lines = Lines { rows: light, first: line0 + first, shift: [fu, fv], omega: family.omega };
         let mut bits = lit.rows[at / nu];
         while bits != 0 {
@@ -443,7 +443,7 @@ impl Pass<'_> {
         for &i in rims.map_or(&[][..], |rims| rims.within(at / nu, 0, nu)) {
             let i = i as usize;
             let cos = cosine(family.omega, n[i - first]);
-            let lines = Around::new((i, nu), line0, [fu, fv], family.extrapolates);
+            let lines = FourLines::new((i, nu), line0, [fu, fv], family.extrapolates);
             for (c, e) in [&mut e0[..], &mut e1[..], &mut e2[..]].into_iter().enumerate() {
                 e[i - first] += cos * lines.mean([light[0][c], light[1][c]], gaps);
             }

@@ -15,6 +15,19 @@ use crate::mask::{lights_itself, may_light_itself};
 use crate::neighbourhood::neighbourhood;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
+use std::borrow::Cow;
+
+/// What there is of nodes in one memory order.
+pub(super) struct Order<'a> {
+    pub h: Cow<'a, [f32]>,
+    /// The blocks of lit nodes, and where planes keep their light.
+    pub lit_blocks: Blocks,
+    pub lit_rows: LitRows,
+    /// The lit nodes beside samples that are not finite; `None` if all are.
+    pub rims: Option<Rims>,
+    /// Per side, the blocks of nodes within one node of those that reach the sweep.
+    pub awake: [Blocks; 2],
+}
 
 /// What every pass reads: h in both memory orders, and the receiver normals towards the lower side.
 ///
@@ -23,19 +36,13 @@ use rayon::prelude::*;
 pub(super) struct Geometry<'a> {
     pub dims: [usize; 3],
     pub h: &'a [f32],
-    h_transposed: Vec<f32>,
     /// Of lit nodes, as planes of light keep them; the others have none.
     pub normals: Vec<u32>,
     rings: Vec<Vec<u32>>,
     /// Whether a row along x holds nodes of `rings`.
     ringed: Vec<bool>,
-    /// Per memory order, the lit nodes beside samples that are not finite; `None` if all are.
-    rims: Option<[Rims; 2]>,
-    /// Per memory order, the blocks of lit nodes.
-    lit_blocks: [Blocks; 2],
-    lit_rows: [LitRows; 2],
-    /// Per side and memory order, the blocks of nodes within one node of those that reach the sweep.
-    awake: [[Blocks; 2]; 2],
+    /// x, y, z and y, z, x.
+    orders: [Order<'a>; 2],
 }
 
 /// What lines read: h in one memory order, and B.
@@ -88,7 +95,7 @@ impl<'a> Geometry<'a> {
         let mut ringed = vec![false; ny * nz];
         rings.iter().flatten().for_each(|&at| ringed[at as usize / nx] = true);
         let rims = field.has_gaps().then(|| Rims::both(dims, h, |at| lit[at]));
-        let h_transposed = transposed(h, dims);
+        let turned = transposed(h, dims);
         let (lit_blocks, lit_rows) = lit_rows(dims, &lit);
         // Nodes that are not lit take no light whatever lines bring.
         let mut kept = vec![0; lit_rows[0].len()];
@@ -98,14 +105,28 @@ impl<'a> Geometry<'a> {
         });
         drop(normals);
         let fine = |n: usize| (n.div_ceil(64), 1);
-        let awake = Side::BOTH.map(|side| {
-            let reaches = |at: usize| if side == Side::Lower { !(h[at] < 0.0) } else { !(h[at] > 1.0) };
-            [
-                Blocks::along(nx, ny * nz, fine(nx), reaches).joined(ny),
-                Blocks::across(dims, fine(ny), reaches).joined(nz),
-            ]
-        });
-        Self { dims, h, h_transposed, normals: kept, rings, ringed, rims, lit_blocks, lit_rows, awake }
+        let reaches = |side| move |at: usize| if side == Side::Lower { !(h[at] < 0.0) } else { !(h[at] > 1.0) };
+        let along = Side::BOTH.map(|side| Blocks::along(nx, ny * nz, fine(nx), reaches(side)).joined(ny));
+        let across = Side::BOTH.map(|side| Blocks::across(dims, fine(ny), reaches(side)).joined(nz));
+        let ([blocks, turned_blocks], [rows, turned_rows]) = (lit_blocks, lit_rows);
+        let [rims, turned_rims] = rims.map_or([None, None], |both| both.map(Some));
+        let orders = [
+            Order { h: Cow::Borrowed(h), lit_blocks: blocks, lit_rows: rows, rims, awake: along },
+            Order {
+                h: Cow::Owned(turned),
+                lit_blocks: turned_blocks,
+                lit_rows: turned_rows,
+                rims: turned_rims,
+                awake: across,
+            },
+        ];
+        Self { dims, h, normals: kept, rings, ringed, orders }
+    }
+
+    /// What there is in the memory order of `layout`.
+    #[inline(always)]
+    pub(super) fn order(&self, layout: &Layout) -> &Order<'a> {
+        &self.orders[usize::from(layout.transposed)]
     }
 
     /// Whether a node is lit.
@@ -116,33 +137,29 @@ impl<'a> Geometry<'a> {
 
     #[inline(always)]
     fn packed_normal(&self, at: usize) -> u32 {
-        self.lit_rows[0].place_of(at).map_or(0, |place| self.normals[place])
+        self.lit_rows().place_of(at).map_or(0, |place| self.normals[place])
     }
 
     /// Whether nodes of a row along x may hold what is reflected: lit ones, or some that [`Self::fill`] fills.
     pub(super) fn shows(&self, row: usize) -> bool {
-        self.ringed[row] || !self.lit_rows[0].run(row).1.is_empty()
+        self.ringed[row] || !self.lit_rows().run(row).1.is_empty()
     }
 
     /// Numbers of a plane of light, in either memory order.
     pub(super) fn places(&self) -> usize {
-        self.lit_rows[0].len().max(self.lit_rows[1].len())
+        let [rows, turned] = self.orders.each_ref().map(|order| order.lit_rows.len());
+        rows.max(turned)
     }
 
     /// Where planes in x, y, z order keep what.
     pub(super) fn lit_rows(&self) -> &LitRows {
-        &self.lit_rows[0]
+        &self.orders[0].lit_rows
     }
 
-    /// Where planes in the memory order of `layout` keep what.
-    pub(super) fn lit_rows_of(&self, layout: &Layout) -> &LitRows {
-        &self.lit_rows[usize::from(layout.transposed)]
-    }
-
-    /// The same in x, y, z order, for those who need nothing else.
+    /// The same, for those who need nothing else.
     pub(super) fn into_lit_rows(self) -> LitRows {
-        let [rows, _] = self.lit_rows;
-        rows
+        let [order, _] = self.orders;
+        order.lit_rows
     }
 
     /// Whether a node holds a surface of the sweep.
@@ -156,7 +173,7 @@ impl<'a> Geometry<'a> {
         let mut lit = vec![false; self.h.len()];
         let nx = self.dims[0];
         lit.par_chunks_exact_mut(nx).enumerate().with_min_len(64).for_each(|(row, lit)| {
-            let (first, run) = self.lit_rows[0].run(row);
+            let (first, run) = self.lit_rows().run(row);
             lit[first..].iter_mut().zip(&self.normals[run]).for_each(|(lit, n)| *lit = *n != 0);
         });
         lit
@@ -165,21 +182,16 @@ impl<'a> Geometry<'a> {
     /// The normals in y, z, x order.
     pub(super) fn transposed_normals(&self, pool: &PlanePool) -> Vec<u32> {
         let mut to = pool.numbers(self.places());
-        let [rows, turned] = &self.lit_rows;
+        let [rows, turned] = self.orders.each_ref().map(|order| &order.lit_rows);
         transpose([rows, turned], self.dims, &self.normals, &mut to);
         to
     }
 
     /// What lines of `side` read.
     pub(super) fn source<'s>(&'s self, layout: &Layout, side: Side, b: &'s [Half4]) -> Source<'s> {
-        let nu = layout.dims[0];
-        let (h, awake, gaps) = (self.h(layout), self.awake(layout, side), self.has_gaps());
-        Source { h, b, awake, gaps, step: layout.stride.map(|s| s / nu) }
-    }
-
-    /// The blocks where lines of `side` read, in the memory order of `layout`.
-    pub(super) fn awake(&self, layout: &Layout, side: Side) -> &Blocks {
-        &self.awake[side.index()][usize::from(layout.transposed)]
+        let (nu, order) = (layout.dims[0], self.order(layout));
+        let step = layout.stride.map(|s| s / nu);
+        Source { h: &order.h, b, awake: &order.awake[side.index()], gaps: self.has_gaps(), step }
     }
 
     /// Whether h may reach the sweep from below in the cell of a place in Ω.
@@ -187,19 +199,19 @@ impl<'a> Geometry<'a> {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the lattice")]
     pub(super) fn reaches(&self, place: DVec3) -> bool {
         let [i, j, k] = [0, 1, 2].map(|a| (place[a] as usize).min(self.dims[a] - 1));
-        let blocks = &self.awake[Side::Lower.index()][0];
+        let blocks = &self.orders[0].awake[Side::Lower.index()];
         blocks.meets(blocks.rows[k * self.dims[1] + j], i, i + 1)
     }
 
     /// The nodes of row `row` along x within one of those that may reach the sweep from below, from first to behind
     /// last.
     pub(super) fn reaching(&self, row: usize) -> impl Iterator<Item = (usize, usize)> {
-        self.awake[Side::Lower.index()][0].each(row, self.dims[0])
+        self.orders[0].awake[Side::Lower.index()].each(row, self.dims[0])
     }
 
     /// Light of the lit nodes from y, z, x order back to x, y, z; the others are black.
     pub(super) fn untransposed(&self, planes: Planes, pool: &PlanePool) -> Planes {
-        let ([rows, turned], [_, ny, nz]) = (&self.lit_rows, self.dims);
+        let ([rows, turned], [_, ny, nz]) = (self.orders.each_ref().map(|order| &order.lit_rows), self.dims);
         planes.map(|from| {
             let mut to = pool.plane(from.len());
             untranspose([turned, rows], [ny, nz], &from, &mut to);
@@ -211,9 +223,9 @@ impl<'a> Geometry<'a> {
     /// Calls `visit` with the lit nodes of a row along x.
     #[inline(always)]
     pub(super) fn lit_nodes(&self, row: usize, mut visit: impl FnMut(usize)) {
-        let (first, run) = self.lit_rows[0].run(row);
+        let (first, run) = self.lit_rows().run(row);
         let normals = &self.normals[run];
-        for (a, b) in self.lit_blocks[0].each(row, self.dims[0]) {
+        for (a, b) in self.orders[0].lit_blocks.each(row, self.dims[0]) {
             let nodes = normals[a - first..b - first].iter().zip(a..b);
             nodes.filter(|(normal, _)| **normal != 0).for_each(|(_, i)| visit(i));
         }
@@ -222,7 +234,7 @@ impl<'a> Geometry<'a> {
     /// Calls `visit` with ranges of nodes of a row along x that hold all that are lit, at most [`LANES`] at a time.
     #[inline(always)]
     pub(super) fn lit_vectors(&self, row: usize, mut visit: impl FnMut(usize, usize)) {
-        for (a, b) in self.lit_blocks[0].each(row, self.dims[0]) {
+        for (a, b) in self.orders[0].lit_blocks.each(row, self.dims[0]) {
             (a..b).step_by(LANES).for_each(|a| visit(a, (a + LANES).min(b)));
         }
     }
@@ -233,24 +245,9 @@ impl<'a> Geometry<'a> {
         Vec3::from_array(normals::decode(self.packed_normal(at)))
     }
 
-    /// The lit nodes of rows in the memory order of `layout`.
-    pub(super) fn lit_blocks(&self, layout: &Layout) -> &Blocks {
-        &self.lit_blocks[usize::from(layout.transposed)]
-    }
-
     /// Whether some samples are not finite.
     pub(super) fn has_gaps(&self) -> bool {
-        self.rims.is_some()
-    }
-
-    /// The lit nodes beside samples that are not finite, in the memory order of `layout`.
-    pub(super) fn rims(&self, layout: &Layout) -> Option<&Rims> {
-        self.rims.as_ref().map(|rims| &rims[usize::from(layout.transposed)])
-    }
-
-    /// h in the memory order of `layout`.
-    pub(super) fn h(&self, layout: &Layout) -> &[f32] {
-        if layout.transposed { &self.h_transposed } else { self.h }
+        self.orders[0].rims.is_some()
     }
 
     /// The unit normal of a node towards the lower side; `None` where none is lit.
@@ -390,7 +387,7 @@ mod tests {
         assert!(lit > 200);
         // (x, y, z) = (2, 3, 4).
         assert_eq!(transposed(geometry.h, dims)[(2 * 11 + 4) * 9 + 3], geometry.h[(4 * 9 + 3) * 67 + 2]);
-        let [rows, turned] = &geometry.lit_rows;
+        let [rows, turned] = geometry.orders.each_ref().map(|order| &order.lit_rows);
         let places = geometry.places();
         // Dark nodes beside lit ones have places, and none at the other end of their row; some have one in one order.
         assert!(lit < places && places < lattice.len() / 2, "{lit} {places}");

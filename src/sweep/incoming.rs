@@ -6,7 +6,7 @@ use rayon::prelude::*;
 /// The four texels around (u, v) and their weights, clamped at the borders.
 #[inline(always)]
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the texture")]
-pub(super) fn around(dims: [usize; 3], uv: [f32; 2]) -> [(usize, f32); 4] {
+pub(super) fn texels_around(dims: [usize; 3], uv: [f32; 2]) -> [(usize, f32); 4] {
     let mut base = [0usize; 2];
     let mut next = [0usize; 2];
     let mut frac = [0f32; 2];
@@ -113,7 +113,7 @@ impl Sink {
         let nc = self.dims[2];
         for a in all.list.iter().filter(|a| a.flat as usize == number) {
             let (first, last) = (a.range.0 as usize, a.range.1 as usize);
-            for (texel, w) in around(self.dims, a.uv) {
+            for (texel, w) in texels_around(self.dims, a.uv) {
                 let w = w * a.weight;
                 self.weight[texel * nc..][first..last].iter_mut().for_each(|x| *x += w);
                 for c in 0..3 {

@@ -6,7 +6,7 @@
 mod tests;
 
 use super::directions::Shear;
-use super::ends::Ends;
+use super::ends::LineEnds;
 use super::flats::{Flats, Stop};
 use super::grid::Source;
 use super::simd::prefetch;
@@ -455,7 +455,7 @@ impl Pack {
 
     /// Finds what the lines end on, and where its radiance is. `first` and `q` as in [`Pack::read`].
     #[inline(always)]
-    pub(super) fn end(&mut self, plan: &Plan, ends: &Ends, flats: &Flats, first: isize, q: isize) {
+    pub(super) fn end(&mut self, plan: &Plan, ends: &LineEnds, flats: &Flats, first: isize, q: isize) {
         self.cuts.clear();
         if flats.none() && !ends.cut() {
             self.lasts = [[0; LANES]; 2];

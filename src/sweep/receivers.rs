@@ -87,7 +87,7 @@ impl Fans {
         }
         let [b, c] = [(row[1] - y.y).abs(), (row[2] - y.z).abs()];
         let (axis, least) = if c >= b { (2, c) } else { (1, b) };
-        let mut around = Around::default();
+        let mut around = FourSeen::default();
         let mut along = [false; LANES];
         (0..LANES).for_each(|l| along[l] = (x[l] - y.x).abs() > least);
         // The fan of the axis along which the source is farthest away; up is where nodes are beyond it.
@@ -120,7 +120,7 @@ impl Fans {
 
 /// What the four lines around nodes see, in two bytes each those of one row, and where the nodes lie between them.
 #[derive(Default)]
-struct Around {
+struct FourSeen {
     near: [u32; LANES],
     far: [u32; LANES],
     f: [f32; LANES],
@@ -130,7 +130,7 @@ struct Around {
 impl Fan {
     /// Looks up the four lines around nodes `x` of a row whose slices run across it.
     #[inline(always)]
-    fn look_across(&self, seen: &[u8], x: &[f64; LANES], row: [f64; 3], out: &mut Around) {
+    fn look_across(&self, seen: &[u8], x: &[f64; LANES], row: [f64; 3], out: &mut FourSeen) {
         let [_, v, a] = self.layout.axes.map(|axis| row[axis]);
         let inverse = self.depth / (a - self.source[2]);
         let step = self.step(a);
@@ -154,7 +154,7 @@ impl Fan {
 
     /// The same of those that are its `own`, where slices run along the row.
     #[inline(always)]
-    fn look_along(&self, seen: &[u8], x: &[f64; LANES], row: [f64; 3], own: &[bool; LANES], out: &mut Around) {
+    fn look_along(&self, seen: &[u8], x: &[f64; LANES], row: [f64; 3], own: &[bool; LANES], out: &mut FourSeen) {
         let [u, v, _] = self.layout.axes.map(|axis| row[axis]);
         for l in 0..LANES {
             if own[l] {
@@ -204,7 +204,7 @@ fn pair(seen: &[u8], at: usize) -> u32 {
     u32::from(u16::from_le_bytes([pair[0], pair[1]]))
 }
 
-impl Around {
+impl FourSeen {
     #[inline(always)]
     fn shares(&self, turn: u8) -> Seen {
         let (turn, mask) = (u32::from(turn), u32::from(!(TURN - 1)));

@@ -1,14 +1,11 @@
 //! What nodes reflect, as lines read it.
 
+use super::Run;
 use super::flats::Flats;
-use super::grid::Geometry;
 use super::half::{self, Half4};
 use super::lit_rows::LitRows;
 use super::planes::NodeLight;
 use super::settling::Sums;
-use super::slits::Slits;
-use crate::isa::Isa;
-use crate::scene::Scene;
 use glam::DVec3;
 use rayon::prelude::*;
 
@@ -39,19 +36,7 @@ impl Default for Reflected {
     }
 }
 
-/// Turns irradiance into radiance.
-pub(super) struct Reflector<'a> {
-    scene: &'a Scene,
-    geometry: &'a Geometry<'a>,
-    slits: &'a Slits,
-    isa: Isa,
-}
-
-impl<'a> Reflector<'a> {
-    pub(super) fn new(scene: &'a Scene, geometry: &'a Geometry<'a>, slits: &'a Slits, isa: Isa) -> Self {
-        Self { scene, geometry, slits, isa }
-    }
-
+impl Run<'_> {
     /// Which nodes of a row along x have light of their own to reflect: 1, the others 0.
     fn shown(&self, row: usize, to: &mut Vec<f32>) {
         let nx = self.geometry.dims[0];
@@ -73,11 +58,11 @@ impl<'a> Reflector<'a> {
     }
 
     /// B = Le + ρ/π Σ scale · irradiance of the sides, sharpened, and filled where no surface is; packs the flats too.
-    /// `light`: one or two sets of irradiance, each with its scale; `memory`: of the same form, or empty. While light
-    /// settles there is also what the pass read, and ω ≥ 1: the result goes ω times as far from `memory`, which was
-    /// there before that. `sharpening`: [`SHARPENING`], or less. Returns sums of B itself, too.
+    /// `light`: sets of irradiance, each with its scale. `memory`: B that is no longer needed and is written over;
+    /// empty at first. `relaxed`: while light settles, what the pass read, and ω ≥ 1 per channel: the result goes ω
+    /// times as far from what `memory` held. `sharpening`: [`SHARPENING`], or less. Returns sums of B itself, too.
     #[allow(clippy::cast_possible_truncation, reason = "albedo and emission")]
-    pub(super) fn reflect(
+    pub(super) fn reflected(
         &self,
         flats: &mut Flats,
         light: &[(NodeLight, f32)],
@@ -108,7 +93,7 @@ impl<'a> Reflector<'a> {
         flats.pack(unit);
         let [nx, ny, nz] = self.geometry.dims;
         let n = nx * ny * nz;
-        let job = Job {
+        let job = RowJob {
             light,
             lit: self.geometry.lit_rows(),
             emission: emission.map(|e| unit * e),
@@ -127,34 +112,35 @@ impl<'a> Reflector<'a> {
             let old = memory.next();
             let new = old.is_none();
             let mut b = old.unwrap_or_else(|| vec![[0; 4]; n]);
-            let rows = b.par_chunks_mut(nx).enumerate().with_max_len(64).map_init(Rows::default, |rows, (row, b)| {
-                if !self.geometry.shows(row) {
-                    return Sums::default();
-                }
-                let (j, k) = (row % ny, row / ny);
-                let beside = [
-                    Some(row),
-                    (j > 0).then(|| row - 1),
-                    (j + 1 < ny).then_some(row + 1),
-                    (k > 0).then(|| row - ny),
-                    (k + 1 < nz).then_some(row + ny),
-                ];
-                let shown = &mut rows.shown;
-                self.shown(row, &mut shown[0]);
-                if !shown[0].contains(&1.0) {
-                    if !new {
-                        b.fill([0; 4]);
+            let rows =
+                b.par_chunks_mut(nx).enumerate().with_max_len(64).map_init(RowScratch::default, |rows, (row, b)| {
+                    if !self.geometry.shows(row) {
+                        return Sums::default();
                     }
-                    return Sums::default();
-                }
-                for (shown, row) in shown.iter_mut().zip(beside).skip(1) {
-                    match row {
-                        Some(row) => self.shown(row, shown),
-                        None => shown.clear(),
+                    let (j, k) = (row % ny, row / ny);
+                    let beside = [
+                        Some(row),
+                        (j > 0).then(|| row - 1),
+                        (j + 1 < ny).then_some(row + 1),
+                        (k > 0).then(|| row - ny),
+                        (k + 1 < nz).then_some(row + ny),
+                    ];
+                    let shown = &mut rows.shown;
+                    self.shown(row, &mut shown[0]);
+                    if !shown[0].contains(&1.0) {
+                        if !new {
+                            b.fill([0; 4]);
+                        }
+                        return Sums::default();
                     }
-                }
-                self.isa.reflect(&job, s, beside, rows, b)
-            });
+                    for (shown, row) in shown.iter_mut().zip(beside).skip(1) {
+                        match row {
+                            Some(row) => self.shown(row, shown),
+                            None => shown.clear(),
+                        }
+                    }
+                    self.isa.reflect(&job, s, beside, rows, b)
+                });
             // Added up row after row: the same bits on any number of threads.
             let rows: Vec<Sums> = rows.collect();
             rows.iter().for_each(|row| sums.add(row, 1.0 / f64::from(unit)));
@@ -174,7 +160,7 @@ type Cross = [Vec<f32>; 5];
 
 /// Rows of nodes at work.
 #[derive(Default)]
-pub(super) struct Rows {
+pub(super) struct RowScratch {
     shown: Cross,
     light: Cross,
     laplacian: Vec<f32>,
@@ -183,7 +169,7 @@ pub(super) struct Rows {
 }
 
 /// What is done to every row of nodes.
-pub(super) struct Job<'a> {
+pub(super) struct RowJob<'a> {
     light: &'a [(NodeLight<'a>, f32)],
     lit: &'a LitRows,
     /// Times the unit.
@@ -203,10 +189,16 @@ pub(super) struct Job<'a> {
 /// What nodes of a row reflect on side `s`, into `b`. `beside` are the numbers of the row and of those around it, of
 /// which `rows` tell what is shown.
 #[inline(always)]
-pub(super) fn reflect_row(job: &Job, s: usize, beside: [Option<usize>; 5], rows: &mut Rows, b: &mut [Half4]) -> Sums {
+pub(super) fn reflect_row(
+    job: &RowJob,
+    s: usize,
+    beside: [Option<usize>; 5],
+    rows: &mut RowScratch,
+    b: &mut [Half4],
+) -> Sums {
     let nx = b.len();
     let first = beside[0].map_or(0, |row| row * nx);
-    let Rows { shown, light, laplacian, reflected } = rows;
+    let RowScratch { shown, light, laplacian, reflected } = rows;
     for c in 0..3 {
         for (to, row) in light.iter_mut().zip(beside) {
             to.clear();
@@ -313,6 +305,7 @@ fn sharpen(light: &mut Cross, shown: &Cross, laplacian: &mut Vec<f32>, sharpenin
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::isa::Isa;
     use crate::rng::{Rng, Stage};
     use crate::sweep::blocks::Blocks;
     use crate::sweep::planes::HalfPlanes;
@@ -400,7 +393,7 @@ mod tests {
         let before: Vec<Half4> = packed(random(nx));
         let lit = LitRows::new(nx, &Blocks::along(nx, rows, (16, 0), |_| true));
         for (by_node, omega) in [(None, None), (None, Some([1.2, 1.1, 1.0])), (Some(&albedo[..]), Some([1.0; 3]))] {
-            let job = Job {
+            let job = RowJob {
                 lit: &lit,
                 light: &[
                     (NodeLight::Full(&planes), 1.0),
@@ -418,7 +411,7 @@ mod tests {
             };
             let run = |isa: Isa| {
                 let mut b = before.clone();
-                let mut rows = Rows { shown: shown.clone(), ..Rows::default() };
+                let mut rows = RowScratch { shown: shown.clone(), ..RowScratch::default() };
                 let beside = [Some(2), Some(1), Some(3), Some(0), Some(4)];
                 let sums = isa.reflect(&job, 0, beside, &mut rows, &mut b);
                 (b, [sums.light, sums.change, sums.drift].map(|x| x.map(f64::to_bits)))

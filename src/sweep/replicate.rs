@@ -89,12 +89,12 @@ impl Run<'_> {
             let share = 1.0 / state.done() as f32;
             flats.take(&state.flats, share);
             let light = (NodeLight::Half(&state.total.light), share);
-            self.reflector.reflect(flats, &[direct, light], Reflected::default(), None, SHARPENING)
+            self.reflected(flats, &[direct, light], Reflected::default(), None, SHARPENING)
         } else {
             flats.reflect_direct();
-            self.reflector.reflect(flats, &[direct], Reflected::default(), None, SHARPENING)
+            self.reflected(flats, &[direct], Reflected::default(), None, SHARPENING)
         };
-        let black = self.reflector.black();
+        let black = self.black();
         sums.take(&flats.light(black), black);
         Passes {
             light,
@@ -247,11 +247,11 @@ impl Run<'_> {
         }
         let omega = now.settling.omega();
         let settling = if matches!(kind, Kind::Coarse | Kind::Level) {
-            Some((omega, flats.settle(omega, self.reflector.black())))
+            Some((omega, flats.settle(omega, self.black())))
         } else {
             now.late += usize::from(kind == Kind::Late);
             now.settling.since += 1;
-            flats.reflect(true);
+            flats.reflect();
             None
         };
         if now.late == LATE || bounce == s.max_bounces {
@@ -304,14 +304,14 @@ impl Run<'_> {
             // Where light is rough, along few directions, sharpening may make each bounce brighter than the last.
             let sharpening = if now.settling.grows() { 0.0 } else { SHARPENING };
             let relaxed = Some((&now.light, omega));
-            let (reflected, mut sums) = self.reflector.reflect(flats, &light, memory, relaxed, sharpening);
-            sums.take(&on_flats, self.reflector.black());
+            let (reflected, mut sums) = self.reflected(flats, &light, memory, relaxed, sharpening);
+            sums.take(&on_flats, self.black());
             now.before = std::mem::replace(&mut now.light, reflected);
             now.settling.push(sums);
         } else {
             now.before = Reflected::default();
             let memory = std::mem::take(&mut now.light);
-            now.light = self.reflector.reflect(flats, &light, memory, None, SHARPENING).0;
+            now.light = self.reflected(flats, &light, memory, None, SHARPENING).0;
         }
     }
 }

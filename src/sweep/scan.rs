@@ -47,6 +47,7 @@ pub(super) struct ScanRule {
     /// Caps close Ω's faces, black from within.
     pub capped: bool,
 }
+
 impl Pack {
     /// For every sample, the radiance that its ray meets which leaves downhill: B where h is first back at the sample's
     /// value, or what stands at the end. \[BSV93: all nearest greater values, one line per lane\]
@@ -153,6 +154,7 @@ impl Pack {
         Ok(self.node.as_flattened()[if first { near } else { j }])
     }
 }
+
 /// Between which of n ≥ 2 texels of an axis isovalue c stands, and how far: linear between texel centres.
 #[inline]
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the texture")]

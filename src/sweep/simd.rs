@@ -14,7 +14,7 @@ mod tests;
 use super::accumulate::{Lines, accumulate_row};
 use super::arrive::Walls;
 use super::clearance::Clearance;
-use super::ends::Ends;
+use super::ends::LineEnds;
 use super::fans::march_row;
 use super::flats::Flats;
 use super::gather::{COSINES, sum_cosines};
@@ -23,7 +23,7 @@ use super::half::Half4;
 use super::incoming::{Arrivals, Sink};
 use super::pack::{Pack, Plan};
 use super::receivers::Emitter;
-use super::reflect::{Job, Rows, reflect_row};
+use super::reflect::{RowJob, RowScratch, reflect_row};
 use super::scan::{Light, ScanRule};
 use super::segments::Segments;
 use super::settling::Sums;
@@ -80,7 +80,7 @@ macro_rules! dispatch {
 
 impl Isa {
     dispatch!(read, Pack::read, (pack: &mut Pack, plan: &Plan, source: &Source, first: isize, q: isize) -> bool);
-    dispatch!(end, Pack::end, (pack: &mut Pack, plan: &Plan, ends: &Ends, flats: &Flats, first: isize, q: isize));
+    dispatch!(end, Pack::end, (pack: &mut Pack, plan: &Plan, ends: &LineEnds, flats: &Flats, first: isize, q: isize));
     dispatch!(look_through_gaps, Pack::look_through_gaps, (
         pack: &mut Pack, rule: ScanRule, light: Light, out: &mut [Vec<f32>], gaps: &mut [u16], place: (usize, usize)
     ));
@@ -96,7 +96,7 @@ impl Isa {
         emitter: &Emitter, ijk: [usize; 3], to: [f32; 3], normals: &[u32], sums: &mut [[f32; 2]]
     ));
     dispatch!(reflect, reflect_row, (
-        job: &Job, s: usize, beside: [Option<usize>; 5], rows: &mut Rows, b: &mut [Half4]
+        job: &RowJob, s: usize, beside: [Option<usize>; 5], rows: &mut RowScratch, b: &mut [Half4]
     ) -> Sums);
 
     /// [`march_row`].

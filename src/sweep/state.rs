@@ -8,7 +8,6 @@ use super::planes::{HalfPlanes, Planes, SignedPlanes};
 use super::reflect::Reflected;
 use super::settling::Settling;
 use super::totals::{Deblur, Totals, stride};
-use crate::flattened::Side;
 use crate::scene::Scene;
 use ::half::bf16;
 
@@ -42,15 +41,9 @@ pub(super) struct Passes {
 }
 
 impl State {
-    /// Of so many nodes with so many places in planes.
-    pub(super) fn new(sides: &[Side], stored: usize, size: [usize; 2], replicates: usize) -> Self {
-        Self {
-            total: Totals::new(sides, stored, size, replicates),
-            flats: Vec::new(),
-            bounces: 0,
-            residual: 0.0,
-            counts: SweepCounts::default(),
-        }
+    /// Before any bounce.
+    pub(super) fn new(total: Totals) -> Self {
+        Self { total, flats: Vec::new(), bounces: 0, residual: 0.0, counts: SweepCounts::default() }
     }
 
     /// Replicates that are finished.
@@ -59,11 +52,11 @@ impl State {
     }
 
     /// Adds the indirect light of a replicate and what it left on the flats.
-    pub(super) fn add<L: Fn(usize) -> bool + Sync>(
+    pub(super) fn add(
         &mut self,
         indirect: &[Planes],
         flats: &Flats,
-        (scene, rows, deblur): (&Scene, &LitRows, &Deblur<L>),
+        (scene, rows, deblur): (&Scene, &LitRows, &Deblur),
     ) {
         self.total.add(indirect, (scene, rows), deblur);
         let radiance = || flats.textures.iter().map(|t| t.as_ref().map(|t| &t.radiance));
@@ -95,8 +88,7 @@ impl State {
 
     /// Everything as bytes, with the passes of a replicate that is under way.
     pub(super) fn bytes(&self, passes: Option<&Passes>, flats: &Flats) -> Vec<u8> {
-        let Totals { lighting, direct, light, spread, parts, .. } = &self.total;
-        let [_, places] = self.total.size();
+        let Totals { places, lighting, direct, light, spread, parts, .. } = &self.total;
         let numbers = 12 * lighting.len() + 6 * (direct.len() + light.len()) + 3 * spread.len();
         let under_way = passes.map_or(0, |p| 6 * (p.light.b.len() + p.before.b.len() + p.defect.len()));
         // The flats are small beside it.
@@ -169,9 +161,8 @@ impl State {
 
     fn parse(&self, bytes: &[u8], sides: usize, flats: &Flats) -> Option<Parsed> {
         let mut from = Reader { bytes };
-        let [nodes, places] = self.total.size();
-        let replicates = if self.total.spread.is_empty() { 1 } else { 2 };
-        let mut state = Self::new(self.total.sides(), self.total.stored(), [nodes, places], replicates);
+        let (nodes, places) = (self.total.nodes, self.total.places);
+        let mut state = Self::new(self.total.emptied());
         state.total.done = from.count()?;
         state.bounces = from.count()?;
         state.residual = from.real()?;
@@ -365,6 +356,7 @@ impl Reader<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::flattened::Side;
     use crate::isovalue_axis::IsovalueAxis;
 
     /// Runs of zeros, numbers that are not, minus zero among zeros, and an end within a run.
@@ -412,7 +404,7 @@ mod tests {
             let settling = Settling::new([1.0; 3]);
             let passes =
                 Passes { light: of(lit), before: of(before), settling, corrected: false, defect, late: 0, bounce: 1 };
-            let mut state = State::new(&sides, 2, size, 1);
+            let mut state = State::new(Totals::new(&sides, 2, size, 1));
             let bytes = state.bytes(Some(&passes), &none());
             state.restore(&bytes, 2, &mut none()).map(|p| [p.light.b.len(), p.before.b.len(), p.defect.len()])
         };

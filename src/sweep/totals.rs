@@ -20,19 +20,19 @@ pub(super) fn stride(nodes: usize) -> usize {
 
 /// What gathered light is without the blur of nodes that take four lines each: along axes on both sides of which nodes
 /// are lit, [`RECEIVING`] of its second differences is taken off.
-pub(super) struct Deblur<L> {
+pub(super) struct Deblur<'a> {
     /// Nodes along x, y and z.
     pub(super) dims: [usize; 3],
     /// Whether a node is lit.
-    pub(super) lit: L,
+    pub(super) lit: &'a [bool],
 }
 
-impl<L: Fn(usize) -> bool> Deblur<L> {
+impl Deblur<'_> {
     /// Of a lit node and what `light` tells of it and of others.
     #[inline]
     fn deblurred<const N: usize>(&self, node: usize, light: impl Fn(usize) -> [f32; N]) -> [f32; N] {
         // The node itself is lit.
-        let value = |n: usize| (n == node || (self.lit)(n)).then(|| light(n));
+        let value = |n: usize| (n == node || self.lit[n]).then(|| light(n));
         sharpened(self.dims, node, RECEIVING, value).expect("the light of a node that is lit")
     }
 }
@@ -43,8 +43,8 @@ pub(super) struct Totals {
     sides: Vec<Side>,
     stored: usize,
     /// Nodes, and numbers of a plane.
-    nodes: usize,
-    places: usize,
+    pub(super) nodes: usize,
+    pub(super) places: usize,
     /// Sum of the direct irradiance of all swept sides over the replicates so far; gone once it is that of all.
     pub(super) lighting: Vec<Planes>,
     /// Replicates whose direct light is known.
@@ -70,17 +70,11 @@ impl Totals {
         Self { sides: sides.to_vec(), stored, nodes, places, lighting, lit: 0, direct, light, spread, parts, done: 0 }
     }
 
-    pub(super) fn stored(&self) -> usize {
-        self.stored
-    }
-
-    pub(super) fn sides(&self) -> &[Side] {
-        &self.sides
-    }
-
-    /// Nodes, and numbers of a plane.
-    pub(super) fn size(&self) -> [usize; 2] {
-        [self.nodes, self.places]
+    /// The same before any replicate.
+    pub(super) fn emptied(&self) -> Self {
+        // Whether there is a spread is all that their number decides.
+        let replicates = if self.spread.is_empty() { 1 } else { 2 };
+        Self::new(&self.sides, self.stored, [self.nodes, self.places], replicates)
     }
 
     /// Takes the direct irradiance of a replicate. Returns the planes it does not keep.
@@ -89,7 +83,7 @@ impl Totals {
         let before = 1.0 / (self.lit - 1) as f32;
         let lighting = std::mem::take(&mut self.lighting);
         let mean = |s: usize, i: usize| [0, 1, 2].map(|c| before * lighting[s][c][i]);
-        self.deviate((scene, rows), &new, self.lit, mean, None::<&Deblur<fn(usize) -> bool>>);
+        self.deviate((scene, rows), &new, self.lit, mean, None);
         self.lighting = lighting;
         if self.lighting.is_empty() {
             self.lighting = new;
@@ -109,12 +103,7 @@ impl Totals {
     }
 
     /// Takes the indirect irradiance of a replicate, or nothing if there is none.
-    pub(super) fn add<L: Fn(usize) -> bool + Sync>(
-        &mut self,
-        new: &[Planes],
-        (scene, rows): (&Scene, &LitRows),
-        deblur: &Deblur<L>,
-    ) {
+    pub(super) fn add(&mut self, new: &[Planes], (scene, rows): (&Scene, &LitRows), deblur: &Deblur) {
         self.done += 1;
         if new.is_empty() {
             return;
@@ -130,13 +119,13 @@ impl Totals {
     /// Adds the deviations of the light of the replicate that is the `count`th of its kind, where `mean` (side, place)
     /// is that of those before; deblurred, if it will be.
     #[allow(clippy::cast_possible_truncation, reason = "albedo")]
-    fn deviate<L: Fn(usize) -> bool + Sync>(
+    fn deviate(
         &mut self,
         (scene, rows): (&Scene, &LitRows),
         new: &[Planes],
         count: usize,
         mean: impl Fn(usize, usize) -> [f32; 3] + Sync,
-        deblur: Option<&Deblur<L>>,
+        deblur: Option<&Deblur>,
     ) {
         if self.spread.is_empty() {
             return;
@@ -151,7 +140,7 @@ impl Totals {
             (0..3).map(|c| luminance[c] * light[c]).sum()
         };
         let all = |planes: &Planes, place: usize| [0, 1, 2].map(|c| planes[c][place]);
-        let at = |planes: &Planes, node: usize| match deblur.filter(|deblur| (deblur.lit)(node)) {
+        let at = |planes: &Planes, node: usize| match deblur.filter(|deblur| deblur.lit[node]) {
             Some(deblur) => luminance(node, deblur.deblurred(node, |node| all(planes, rows.place_of_lit(node)))),
             None => rows.place_of(node).map_or(0.0, |place| luminance(node, all(planes, place))),
         };
@@ -186,7 +175,7 @@ impl Totals {
                 for (i, root) in run.iter_mut().enumerate() {
                     let node = first + i;
                     let d = match &known {
-                        Some((deblur, known)) if (deblur.lit)(node) => {
+                        Some((deblur, known)) if deblur.lit[node] => {
                             deblur.deblurred(node, |node| [known[rows.place_of_lit(node)]])[0]
                         }
                         Some((_, known)) => known[start + i],
@@ -204,12 +193,7 @@ impl Totals {
     /// What all replicates gave at the nodes that are lit: gathered light deblurred, direct light as it is, since
     /// borders of shadows would ring; `apart`: that on its own, too.
     #[allow(clippy::cast_possible_truncation, reason = "a factor of at most 1")]
-    pub(super) fn finish<L: Fn(usize) -> bool + Sync>(
-        self,
-        rows: &LitRows,
-        deblur: &Deblur<L>,
-        apart: bool,
-    ) -> Vec<SweptSide> {
+    pub(super) fn finish(self, rows: &LitRows, deblur: &Deblur, apart: bool) -> Vec<SweptSide> {
         let done = self.done;
         let scale = 1.0 / done as f32;
         let together = together(&self.parts) as f32;
@@ -218,7 +202,7 @@ impl Totals {
         let side = |(&side, direct): (&Side, HalfPlanes)| {
             let light = indirect.next();
             let own = |place: usize| [0, 1, 2].map(|c| direct.at(c, place));
-            let irradiance = all_nodes(self.nodes, rows, deblur, |node, place| {
+            let irradiance = all_nodes(rows, deblur, |node, place| {
                 let gathered = |light: &HalfPlanes| deblur.deblurred(node, |node| light.all(rows.place_of_lit(node)));
                 let (direct, gathered) = (own(place), light.as_ref().map_or([0.0; 3], gathered));
                 std::array::from_fn(|c| direct[c] + scale * gathered[c].max(0.0))
@@ -226,29 +210,28 @@ impl Totals {
             // Of two replicates or more.
             let error = |roots: Vec<bf16>| -> Vec<f32> {
                 let factor = (together * scale / (done - 1) as f32).sqrt();
-                all_nodes(self.nodes, rows, deblur, |_, place| factor * roots[place].to_f32())
+                all_nodes(rows, deblur, |_, place| factor * roots[place].to_f32())
             };
-            let direct = if apart { all_nodes(self.nodes, rows, deblur, |_, place| own(place)) } else { Vec::new() };
+            let direct = if apart { all_nodes(rows, deblur, |_, place| own(place)) } else { Vec::new() };
             SweptSide { side, irradiance, direct, std_error: spread.next().map(error).unwrap_or_default() }
         };
         self.sides.iter().take(self.stored).zip(self.direct).map(side).collect()
     }
 }
 
-/// What `value` (node, place in planes) says of the nodes that are lit, in an array of all `nodes`; 0 at the others.
-fn all_nodes<T: Clone + Default + Send, L: Fn(usize) -> bool + Sync>(
-    nodes: usize,
+/// What `value` (node, place in planes) says of the nodes that are lit, in an array of all nodes; 0 at the others.
+fn all_nodes<T: Clone + Default + Send>(
     rows: &LitRows,
-    deblur: &Deblur<L>,
+    deblur: &Deblur,
     value: impl Fn(usize, usize) -> T + Sync,
 ) -> Vec<T> {
-    let mut all = vec![T::default(); nodes];
+    let mut all = vec![T::default(); deblur.lit.len()];
     let nx = deblur.dims[0];
     all.par_chunks_exact_mut(nx).enumerate().with_min_len(64).for_each(|(row, all)| {
         let (first, run) = rows.run(row);
         for ((i, to), place) in all.iter_mut().enumerate().skip(first).zip(run) {
             let node = row * nx + i;
-            if (deblur.lit)(node) {
+            if deblur.lit[node] {
                 *to = value(node, place);
             }
         }
@@ -298,7 +281,8 @@ mod tests {
         let dims = [5, 4, 2];
         let place = |node: usize| [node % 5, node / 5 % 4, node / 20].map(|x| x as f32);
         let dark = 2 + 5 * 3;
-        let deblur = Deblur { dims, lit: |node| node != dark };
+        let lit: Vec<bool> = (0..40).map(|node| node != dark).collect();
+        let deblur = Deblur { dims, lit: &lit };
         for node in (0..40).filter(|node| *node != dark) {
             let [even, curved] = deblur.deblurred(node, |node| {
                 let [x, y, z] = place(node);

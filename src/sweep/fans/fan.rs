@@ -4,7 +4,7 @@ use super::sample;
 use crate::isa::Isa;
 use crate::sweep::blocks::Blocks;
 use crate::sweep::directions::Layout;
-use crate::sweep::gaps::Hidden;
+use crate::sweep::gaps::HiddenRanges;
 use glam::DVec3;
 use std::ops::Range;
 
@@ -69,7 +69,7 @@ pub(super) struct Through<'a> {
 #[derive(Default)]
 pub(super) struct Scratch {
     /// Where samples are missing.
-    pub hidden: Option<Hidden>,
+    pub hidden: Option<HiddenRanges>,
     /// The greatest and the least h of each line so far.
     pub most: Vec<f32>,
     pub least: Vec<f32>,
