@@ -71,6 +71,26 @@ pub enum Interpolation {
     Irradiance,
 }
 
+/// Options that mean nothing to sweeps.
+const OF_PHOTONS: [&str; 10] = [
+    "photons",
+    "bounces",
+    "estimator",
+    "photons-per-estimate",
+    "samples",
+    "strategy",
+    "smoothing",
+    "neighbours",
+    "interpolation",
+    "bands",
+];
+/// Options of exact rays, of which sweeps cast a few where they end.
+const OF_RAYS: [&str; 3] = ["tau", "shadow-rays", "gather"];
+/// Options that mean nothing to photons.
+const OF_SWEEPS: [&str; 2] = ["directions", "light-points"];
+/// Options that mean nothing to samples at the grid's points.
+const OF_SCATTERED: [&str; 3] = ["samples", "neighbours", "interpolation"];
+
 /// What a user may set about a bake, in a scene file's `[bake]` table or by flags of the same names. Unset values come
 /// from the preset.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, clap::Args)]
@@ -205,57 +225,27 @@ impl BakeOptions {
         all.filter(|(_, value)| !value.is_null()).map(|(name, _)| name.clone()).collect()
     }
 
-    /// Options that mean nothing to sweeps, by name, and whether they are set.
-    fn of_photons(&self) -> [(&'static str, bool); 10] {
-        [
-            ("photons", self.photons.is_some()),
-            ("bounces", self.bounces.is_some()),
-            ("estimator", self.estimator.is_some()),
-            ("photons-per-estimate", self.photons_per_estimate.is_some()),
-            ("samples", self.samples.is_some()),
-            ("strategy", self.strategy.is_some()),
-            ("smoothing", self.smoothing.is_some()),
-            ("neighbours", self.neighbours.is_some()),
-            ("interpolation", self.interpolation.is_some()),
-            ("bands", self.bands.is_some()),
-        ]
-    }
-
-    /// Options of exact rays, of which sweeps cast a few where they end, and whether they are set.
-    fn of_rays(&self) -> [(&'static str, bool); 3] {
-        [
-            ("tau", self.tau.is_some()),
-            ("shadow-rays", self.shadow_rays.is_some()),
-            ("gather", self.gather_rays.is_some()),
-        ]
-    }
-
-    /// Options that mean nothing to photons, and whether they are set.
-    fn of_sweeps(&self) -> [(&'static str, bool); 2] {
-        [("directions", self.directions.is_some()), ("light-points", self.light_points.is_some())]
+    /// Those of `names` that are set.
+    fn set_of(&self, names: &[&'static str]) -> Vec<&'static str> {
+        let set = self.set();
+        names.iter().copied().filter(|name| set.iter().any(|set| set == name)).collect()
     }
 
     /// What is set and changes nothing in a bake of `settings`, for people: a line for each cause.
     pub fn idle(&self, settings: &BakeSettings) -> Vec<String> {
         let scattered = settings.strategy != StrategyName::Nodes;
-        let at_nodes = [
-            ("samples", self.samples.is_some()),
-            ("neighbours", self.neighbours.is_some()),
-            ("interpolation", self.interpolation.is_some()),
-        ];
-        let smoothing = [("smoothing", self.smoothing == Some(true))];
-        let (sweeps, photons) = (self.of_sweeps(), self.of_photons());
-        let of: &[(&[(&str, bool)], &str)] = match (settings.engine, scattered) {
-            (Engine::Sweep, _) => &[(&photons, "engine = \"sweep\"")],
-            (Engine::Photon, true) => &[(&sweeps, "engine = \"photon\""), (&smoothing, "scattered samples")],
+        let smoothing: &[&'static str] = if self.smoothing == Some(true) { &["smoothing"] } else { &[] };
+        let of: &[(&[&'static str], &str)] = match (settings.engine, scattered) {
+            (Engine::Sweep, _) => &[(&OF_PHOTONS, "engine = \"sweep\"")],
+            (Engine::Photon, true) => &[(&OF_SWEEPS, "engine = \"photon\""), (smoothing, "scattered samples")],
             (Engine::Photon, false) => &[
-                (&sweeps, "engine = \"photon\""),
-                (&at_nodes, "strategy = \"nodes\" (uniform, level-set and planes scatter samples)"),
-                (&smoothing[usize::from(settings.gather_rays > 1)..], "fewer than 2 gather rays"),
+                (&OF_SWEEPS, "engine = \"photon\""),
+                (&OF_SCATTERED, "strategy = \"nodes\" (uniform, level-set and planes scatter samples)"),
+                (if settings.gather_rays > 1 { &[] } else { smoothing }, "fewer than 2 gather rays"),
             ],
         };
-        let line = |&(options, because): &(&[(&'static str, bool)], &str)| {
-            let set: Vec<&str> = options.iter().filter(|o| o.1).map(|o| o.0).collect();
+        let line = |&(options, because): &(&[&'static str], &str)| {
+            let set = self.set_of(options);
             let verb = if set.len() == 1 { "has" } else { "have" };
             (!set.is_empty()).then(|| format!("{} {verb} no effect with {because}", set.join(", ")))
         };
@@ -264,8 +254,8 @@ impl BakeOptions {
 
     /// The first options that are set and ask for photons and for sweeps.
     fn asks_for(&self) -> [Option<&'static str>; 2] {
-        let first = |options: &[(&'static str, bool)]| options.iter().find(|o| o.1).map(|o| o.0);
-        [first(&self.of_photons()).or(first(&self.of_rays())), first(&self.of_sweeps())]
+        let first = |options: &[&'static str]| self.set_of(options).first().copied();
+        [first(&OF_PHOTONS).or_else(|| first(&OF_RAYS)), first(&OF_SWEEPS)]
     }
 
     /// Whether nothing that is set asks for one of the engines.

@@ -109,8 +109,7 @@ impl ReferenceArgs {
             seed: self.seed,
         };
         let begun = Instant::now();
-        let (mesh, result, inside) =
-            compute(&scene, isovalue, self.refine, self.trilinear, &settings, &device()?, progress)?;
+        let (mesh, result, inside) = self.compute(&scene, isovalue, &settings, progress)?;
         let seconds = begun.elapsed().as_secs_f64();
         result.write(&self.output, &mesh, Origin::comment(&scene, self.isovalue, &settings))?;
         let count = result.sampled.iter().filter(|s| **s).count();
@@ -136,38 +135,37 @@ impl ReferenceArgs {
         }
         Ok(())
     }
+
+    /// Mesh and reference of one isosurface, and the rays that departed below its triangles.
+    fn compute(
+        &self,
+        scene: &Scene,
+        isovalue: f32,
+        settings: &ReferenceSettings,
+        progress: Progress,
+    ) -> Result<(SurfaceMesh, Reference, u64)> {
+        let device = device()?;
+        let mesh = SurfaceMesh::extract(scene, isovalue, self.refine)?;
+        let vertices = settings.vertices.unwrap_or(usize::MAX).min(mesh.local.len());
+        let stage = progress.stage("reference", vertices as u64 * u64::from(settings.batches.max(2)));
+        let tick = |n| stage.tick(n);
+        let (result, inside) = if self.trilinear {
+            let tracer = GraphTracer::new(&device, scene)?;
+            (reference(scene, &tracer, &mesh, isovalue, settings, &tick)?, 0)
+        } else {
+            let tracer = SurfaceTracer::new(&device, scene, isovalue, self.refine)?;
+            let result = reference(scene, &tracer, &mesh, isovalue, settings, &tick)?;
+            let inside = tracer.inside_starts();
+            (result, inside)
+        };
+        stage.end()?;
+        Ok((mesh, result, inside))
+    }
 }
 
 /// `error` of an isovalue outside the sweep, which may be another unless a bake holds it.
 fn other_sweep(error: Error, of_bake: bool) -> Error {
     if of_bake { error } else { Error::Invalid(format!("{error}, or give a sweep that holds it with --isovalues")) }
-}
-
-/// Mesh and reference of one isosurface, and the rays that departed below its triangles.
-pub(super) fn compute(
-    scene: &Scene,
-    isovalue: f32,
-    refine: usize,
-    trilinear: bool,
-    settings: &ReferenceSettings,
-    device: &Device,
-    progress: Progress,
-) -> Result<(SurfaceMesh, Reference, u64)> {
-    let mesh = SurfaceMesh::extract(scene, isovalue, refine)?;
-    let vertices = settings.vertices.unwrap_or(usize::MAX).min(mesh.local.len());
-    let stage = progress.stage("reference", vertices as u64 * u64::from(settings.batches.max(2)));
-    let tick = |n| stage.tick(n);
-    let (result, inside) = if trilinear {
-        let tracer = GraphTracer::new(device, scene)?;
-        (reference(scene, &tracer, &mesh, isovalue, settings, &tick)?, 0)
-    } else {
-        let tracer = SurfaceTracer::new(device, scene, isovalue, refine)?;
-        let result = reference(scene, &tracer, &mesh, isovalue, settings, &tick)?;
-        let inside = tracer.inside_starts();
-        (result, inside)
-    };
-    stage.end()?;
-    Ok((mesh, result, inside))
 }
 
 /// A path-traced picture of the level set of `isovalue` (source units): of its triangles, or of the trilinear surface.
