@@ -15,7 +15,8 @@ use crate::tracer::Tracer;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use std::f64::consts::PI;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::iter::Sum;
+use std::ops::AddAssign;
 
 /// Where indirect light comes from.
 #[derive(Debug)]
@@ -43,17 +44,44 @@ pub struct RadianceSample {
     pub indirect_variance: f32,
 }
 
+/// What samples cost.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counts {
+    /// Rays traced.
+    pub rays: u64,
+    /// Gather rays that landed where the cache holds nothing.
+    pub misses: u64,
+    /// Samples taken.
+    pub samples: u64,
+    /// Positions left out because ∇h vanishes there.
+    pub without_gradient: u64,
+}
+
+impl AddAssign for Counts {
+    fn add_assign(&mut self, o: Self) {
+        self.rays += o.rays;
+        self.misses += o.misses;
+        self.samples += o.samples;
+        self.without_gradient += o.without_gradient;
+    }
+}
+
+impl Sum for Counts {
+    fn sum<I: Iterator<Item = Self>>(all: I) -> Self {
+        all.fold(Self::default(), |mut sum, counts| {
+            sum += counts;
+            sum
+        })
+    }
+}
+
 /// Samples and what they cost.
 #[derive(Debug)]
 pub struct RadianceSamples {
     /// One per position; `None` where ∇h vanishes.
     pub samples: Vec<Option<RadianceSample>>,
-    /// Positions left out because ∇h vanishes there.
-    pub without_gradient: u64,
-    /// Rays traced.
-    pub rays: u64,
-    /// Gather rays that landed where the cache holds nothing.
-    pub misses: u64,
+    /// Of all of them.
+    pub counts: Counts,
 }
 
 impl RadianceSample {
@@ -62,18 +90,22 @@ impl RadianceSample {
 }
 
 /// Samples as a block: rays, misses, and the numbers of each; a variance of −1 stands for none.
-fn to_block(counts: [u64; 2], samples: &[Option<RadianceSample>]) -> Vec<u8> {
+fn to_block(counts: Counts, samples: &[Option<RadianceSample>]) -> Vec<u8> {
     let numbers = samples.iter().flat_map(|s| {
         let s = s.unwrap_or(RadianceSample { variance: -1.0, ..RadianceSample::default() });
         let [a, b] = s.indirect;
         let (r, d) = (s.radiance, s.direct);
         [r.x, r.y, r.z, s.variance, d.x, d.y, d.z, a.x, a.y, a.z, b.x, b.y, b.z, s.indirect_variance]
     });
-    counts.into_iter().flat_map(u64::to_le_bytes).chain(numbers.flat_map(f32::to_le_bytes)).collect()
+    [counts.rays, counts.misses]
+        .into_iter()
+        .flat_map(u64::to_le_bytes)
+        .chain(numbers.flat_map(f32::to_le_bytes))
+        .collect()
 }
 
-/// The inverse of [`to_block`], for samples at `places`, into `out`; the counts.
-fn from_block(bytes: &[u8], places: &[(u64, Vec3)], out: &mut [Option<RadianceSample>]) -> [u64; 2] {
+/// The inverse of [`to_block`], for samples at `places`, into `out`; the rays and misses.
+fn from_block(bytes: &[u8], places: &[(u64, Vec3)], out: &mut [Option<RadianceSample>]) -> Counts {
     let (counts, numbers) = bytes.split_at(16);
     for ((b, &(_, position)), out) in numbers.as_chunks::<{ RadianceSample::SAVED }>().0.iter().zip(places).zip(out) {
         let n: [f32; 14] = std::array::from_fn(|i| f32::from_le_bytes(std::array::from_fn(|k| b[4 * i + k])));
@@ -87,7 +119,8 @@ fn from_block(bytes: &[u8], places: &[(u64, Vec3)], out: &mut [Option<RadianceSa
             indirect_variance: n[13],
         });
     }
-    [0, 8].map(|i| u64::from_le_bytes(std::array::from_fn(|k| counts[i + k])))
+    let [rays, misses] = [0, 8].map(|i| u64::from_le_bytes(std::array::from_fn(|k| counts[i + k])));
+    Counts { rays, misses, ..Counts::default() }
 }
 
 /// What samples of one side of a scene's level sets are taken with.
@@ -118,12 +151,12 @@ impl<T: Tracer> Sampler<'_, T> {
     /// The sample at `position`, its random numbers keyed by `key`; `None` where ∇h vanishes, no light between a
     /// luminaire and the wall that it covers ([`Scene::covers`]). Adds rays and misses to `counts`.
     #[allow(clippy::cast_possible_truncation, reason = "isovalues and storage are f32")]
-    pub fn sample(
+    fn sample(
         &self,
         key: u64,
         position: Vec3,
         scratch: &mut Neighbours,
-        counts: &mut [u64; 2],
+        counts: &mut Counts,
     ) -> Option<RadianceSample> {
         let Self { scene, tracer, side, .. } = *self;
         let p = position.as_dvec3();
@@ -139,7 +172,7 @@ impl<T: Tracer> Sampler<'_, T> {
         }
         let index = key * 2 + side.index() as u64;
         let direct = direct_irradiance(scene, tracer, &receiver, self.shadow_rays, Stage::Direct.key(self.seed, index));
-        counts[0] += direct.rays;
+        counts.rays += direct.rays;
         let (mean, variance, halves) = match self.indirect {
             Indirect::Map(map) => {
                 let e = map.irradiance(&receiver, scratch);
@@ -149,8 +182,8 @@ impl<T: Tracer> Sampler<'_, T> {
                 let g =
                     gathered_irradiance(scene, tracer, *cache, &receiver, *rays, Stage::Gather.key(self.seed, index));
                 let e = g.estimate;
-                counts[0] += e.rays;
-                counts[1] += e.misses;
+                counts.rays += e.rays;
+                counts.misses += e.misses;
                 (e.mean, e.variance, g.halves)
             }
         };
@@ -169,23 +202,26 @@ impl<T: Tracer> Sampler<'_, T> {
     }
 
     /// A block of samples into `out`: taken from `saved` if it holds the block, else made at the `places` (keys and
-    /// positions) and kept there. Returns rays and misses.
+    /// positions) and kept there.
     pub fn block(
         &self,
         places: &[(u64, Vec3)],
         out: &mut [Option<RadianceSample>],
         saved: Saved<'_>,
         block: usize,
-    ) -> [u64; 2] {
-        if let Some(bytes) = saved.load(block, 16 + RadianceSample::SAVED * places.len()) {
-            return from_block(&bytes, places, out);
-        }
-        let (mut scratch, mut counts) = (Neighbours::default(), [0; 2]);
-        for (out, &(key, position)) in out.iter_mut().zip(places) {
-            *out = self.sample(key, position, &mut scratch, &mut counts);
-        }
-        saved.save(block, || to_block(counts, out));
-        counts
+    ) -> Counts {
+        let cost = if let Some(bytes) = saved.load(block, 16 + RadianceSample::SAVED * places.len()) {
+            from_block(&bytes, places, out)
+        } else {
+            let (mut scratch, mut counts) = (Neighbours::default(), Counts::default());
+            for (out, &(key, position)) in out.iter_mut().zip(places) {
+                *out = self.sample(key, position, &mut scratch, &mut counts);
+            }
+            saved.save(block, || to_block(counts, out));
+            counts
+        };
+        let samples = out.iter().flatten().count() as u64;
+        Counts { samples, without_gradient: out.len() as u64 - samples, ..cost }
     }
 }
 
@@ -201,18 +237,16 @@ pub fn sample_places<T: Tracer>(
     saved: Saved<'_>,
     tick: Tick,
 ) -> RadianceSamples {
-    let (rays, misses) = (AtomicU64::new(0), AtomicU64::new(0));
     let mut samples = vec![None; count];
-    samples.par_chunks_mut(BLOCK).enumerate().with_max_len(1).for_each(|(n, out)| {
+    let blocks = samples.par_chunks_mut(BLOCK).enumerate().with_max_len(1).map(|(n, out)| {
         if !tick(0) {
-            return;
+            return Counts::default();
         }
         let places: Vec<(u64, Vec3)> = (n * BLOCK..n * BLOCK + out.len()).map(place).collect();
         let counts = sampler.block(&places, out, saved, n);
-        rays.fetch_add(counts[0], Ordering::Relaxed);
-        misses.fetch_add(counts[1], Ordering::Relaxed);
         tick(out.len() as u64);
+        counts
     });
-    let without_gradient = samples.par_iter().filter(|s| s.is_none()).count() as u64;
-    RadianceSamples { samples, without_gradient, rays: rays.into_inner(), misses: misses.into_inner() }
+    let counts = blocks.sum();
+    RadianceSamples { samples, counts }
 }

@@ -1,7 +1,7 @@
 //! Light where a grid's point holds no level set of the sweep: at places around it, to which its value is fitted.
 
 use super::bands::Band;
-use super::grid_points::{Counts, Packed, STAND_INS, smoothed_light};
+use super::grid_points::{Packed, STAND_INS, smoothed_light};
 use crate::checkpoint::Saved;
 use crate::direct::luminance;
 use crate::fitted_grid::{FitSample, GridFit, draws};
@@ -10,7 +10,7 @@ use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, stand_ins};
 use crate::node_set::NodeSet;
 use crate::progress::Tick;
-use crate::radiance::{BLOCK, RadianceSample, Sampler, sample_places};
+use crate::radiance::{BLOCK, Counts, RadianceSample, Sampler, sample_places};
 use crate::scene::Scene;
 use crate::smoothing::{Scattered, Smoothing, smooth_scattered};
 use crate::split::{MOST_VISIBLE, Parts, Split};
@@ -143,7 +143,7 @@ impl<'a> Beside<'a> {
                 light[n as usize] = BesideLight { radiance, variance, indirect_variance, common: 0.0, halves, direct };
             }
         }
-        Counts::from(&sampled)
+        sampled.counts
     }
 
     /// Smooths what was gathered over the places around ([`smooth_scattered`]): where little arrives, few rays bring

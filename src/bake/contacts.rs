@@ -7,7 +7,7 @@
 //! wedge brings: two equations for E and E_w. \[Lambert1760\]
 
 use super::BakeSettings;
-use super::grid_points::{Counts, STAND_INS};
+use super::grid_points::STAND_INS;
 use crate::direct::{Receiver, direct_irradiance, luminance, luminous_reflectance};
 use crate::flattened::{Departure, Side, SurfacePoint, Target};
 use crate::gather::gathered_irradiance;
@@ -15,6 +15,7 @@ use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, local_position};
 use crate::polygon::Polygon;
 use crate::progress::Tick;
+use crate::radiance::Counts;
 use crate::radiance_cache::RadianceCache;
 use crate::rng::Stage;
 use crate::scene::{ON, Scene};

@@ -9,7 +9,7 @@ use crate::illumination_grid::IlluminationGrid;
 use crate::mask::{Mask, local_position, own_light};
 use crate::node_set::NodeSet;
 use crate::progress::Tick;
-use crate::radiance::{BLOCK, RadianceSamples, Sampler};
+use crate::radiance::{BLOCK, Counts, Sampler};
 use crate::scene::Scene;
 use crate::smoothing::{Halves, Smoothed, Smoothing, smooth};
 use crate::split::{Parts, Split};
@@ -18,35 +18,9 @@ use crate::volume::Lattice;
 use glam::Vec3;
 use rayon::prelude::*;
 use std::f64::consts::PI;
-use std::ops::AddAssign;
 
 /// Places around a point without a level set of its own; as many random numbers are every point's.
 pub(super) const STAND_INS: usize = 4;
-
-/// What samples cost.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct Counts {
-    pub(super) rays: u64,
-    pub(super) misses: u64,
-    pub(super) samples: u64,
-    pub(super) without_gradient: u64,
-}
-
-impl AddAssign for Counts {
-    fn add_assign(&mut self, o: Self) {
-        self.rays += o.rays;
-        self.misses += o.misses;
-        self.samples += o.samples;
-        self.without_gradient += o.without_gradient;
-    }
-}
-
-impl From<&RadianceSamples> for Counts {
-    fn from(s: &RadianceSamples) -> Self {
-        let &RadianceSamples { ref samples, rays, misses, without_gradient } = s;
-        Self { rays, misses, samples: samples.len() as u64 - without_gradient, without_gradient }
-    }
-}
 
 /// The points of a grid that hold light of their own level set.
 pub(super) struct GridPoints<'a> {
@@ -179,8 +153,9 @@ impl<'a> GridPoints<'a> {
             None => (0..blocks(self.lattice)).map(|_| &mut [][..]).collect(),
         };
         let rows = rows.zip(grid.mask.par_chunks_mut(BLOCK)).zip(halves).zip(direct);
-        let counts =
-            rows.enumerate().with_max_len(1).map(|(block, ((((radiance, std_error), mask), halves), direct))| {
+        rows.enumerate()
+            .with_max_len(1)
+            .map(|(block, ((((radiance, std_error), mask), halves), direct))| {
                 let start = block * BLOCK;
                 let range = start..start + radiance.len();
                 let own: Vec<usize> = self.set.members(range).filter(|&o| band.holds(self.isovalue(o))).collect();
@@ -193,7 +168,7 @@ impl<'a> GridPoints<'a> {
                 };
                 let places: Vec<(u64, Vec3)> = own.iter().map(place).collect();
                 let mut samples = vec![None; own.len()];
-                let [rays, misses] = sampler.block(&places, &mut samples, saved, block);
+                let counts = sampler.block(&places, &mut samples, saved, block);
                 let before = self.set.before(start);
                 for (&o, s) in own.iter().zip(&samples) {
                     let Some(s) = s else { continue };
@@ -209,14 +184,10 @@ impl<'a> GridPoints<'a> {
                         halves[self.set.before(o) - before] = Packed::new(s.indirect);
                     }
                 }
-                let without_gradient = samples.iter().filter(|s| s.is_none()).count() as u64;
                 tick(own.len() as u64);
-                Counts { rays, misses, samples: own.len() as u64 - without_gradient, without_gradient }
-            });
-        counts.reduce(Counts::default, |mut a, b| {
-            a += b;
-            a
-        })
+                counts
+            })
+            .sum()
     }
 
     /// The grid, with gathered light smoothed over the points if it was kept for that ([`smooth`]).

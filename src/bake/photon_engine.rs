@@ -3,7 +3,7 @@
 use super::bands::{Band, Levels, REACH};
 use super::beside::{Beside, BesideLight, rays_beside};
 use super::contacts::{Contacts, Wedge};
-use super::grid_points::{Counts, GridPoints, PointLight};
+use super::grid_points::{GridPoints, PointLight};
 use super::{BakeSettings, Context, Interpolation, Lit, PhotonCounts};
 use crate::embree::{GraphTracer, pyramids};
 use crate::error::{Error, Result};
@@ -17,7 +17,7 @@ use crate::mask::Mask;
 use crate::node_set::NodeSet;
 use crate::photon::trace_photons;
 use crate::progress::{Clock, Tick};
-use crate::radiance::{BLOCK, Indirect, RadianceSample, Sampler, sample_places};
+use crate::radiance::{BLOCK, Counts, Indirect, RadianceSample, Sampler, sample_places};
 use crate::radiance_cache::{NodeBand, NodePhotons, RadianceCache};
 use crate::sampling::{Strategy, positions};
 use crate::scene::Scene;
@@ -251,7 +251,7 @@ impl<'a> FieldLight<'a> {
                     let sampler = Sampler { scene, tracer, indirect: &gathered, side, shadow_rays, seed };
                     let saved = saved(side, 2).starting_at(first);
                     let got = sample_places(&sampler, own.len(), &place, saved, &|n| tick(n * each));
-                    counts += Counts::from(&got);
+                    counts += got.counts;
                     own.iter().zip(got.samples).for_each(|(&n, s)| samples[n] = s);
                 }
             }

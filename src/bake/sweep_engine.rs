@@ -4,7 +4,7 @@
 use super::bands::Band;
 use super::beside::{Beside, rays_beside};
 use super::contacts::{Contacts, Wedge};
-use super::grid_points::{Counts, STAND_INS, split};
+use super::grid_points::{STAND_INS, split};
 use super::photon_engine::Job;
 use super::{Context, Lit};
 use crate::brdf::reflected;
@@ -91,7 +91,7 @@ pub(super) fn light(Job { number, scene, lattice, masks }: &Job, context: Contex
         // Keys of a point beside; none of these is one.
         let place = |n: usize| ((STAND_INS * near[n]) as u64, local_position(&scene.field, lattice, near[n]).as_vec3());
         let sampled = sample_places(&sampler, near.len(), &place, Saved::NOWHERE, &|n| stage.tick(n));
-        lit.counts += Counts::from(&sampled);
+        lit.counts += sampled.counts;
         let mut grid = swept_grid((&own, masks), outgoing(scene, &own, s.irradiance), s.std_error);
         for (&o, sample) in near.iter().zip(&sampled.samples) {
             if let Some(sample) = sample {
