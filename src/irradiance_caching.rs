@@ -69,7 +69,7 @@ pub fn interpolate(
     let known: Vec<Known> = grid.numbers().par_iter().map(|&n| Known::new(scene, side, &samples[n as usize])).collect();
     from_nearest(lattice, masks, (&grid, neighbours), tick, |o, place, found| {
         let p = local_position(field, lattice, o);
-        let around = Around::new(place, found, &known);
+        let around = NearSamples::new(place, found, &known);
         let normal = scene.normal(p, side);
         let direct = normal.map_or_else(|| around.direct(), |n| around.share() * open_irradiance(scene, p, n));
         let indirect = around.indirect(normal.unwrap_or_default().as_vec3());
@@ -99,7 +99,7 @@ impl Known {
 }
 
 /// The samples around a point.
-struct Around<'a> {
+struct NearSamples<'a> {
     place: Vec3,
     /// Squared distance of each, and its number.
     found: &'a [(f32, u32)],
@@ -108,7 +108,7 @@ struct Around<'a> {
     radius: f32,
 }
 
-impl<'a> Around<'a> {
+impl<'a> NearSamples<'a> {
     fn new(place: Vec3, found: &'a [(f32, u32)], known: &'a [Known]) -> Self {
         let farthest = found.iter().map(|e| e.0).fold(0.0, f32::max);
         Self { place, found, known, radius: (farthest.sqrt() * 1.01).max(f32::MIN_POSITIVE) }

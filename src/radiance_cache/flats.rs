@@ -3,7 +3,7 @@
 
 use super::Filler;
 use super::binned::{Binned, GATHERED, SHOWN, Width};
-use super::openings::{Hidden, Open, Solid, is_open};
+use super::openings::{CoveredPart, Open, Solid, is_open};
 use crate::brdf::reflected;
 use crate::direct::{Estimate, Receiver, direct_irradiance};
 use crate::flat::{self, Flat, FlatLight, FlatTexture, Texel, Within};
@@ -42,7 +42,7 @@ pub(super) fn fill_flat<T: Tracer>(
     let Some(flat) = flat::flat(scene, number).filter(|f| !f.albedo.black()) else { return Filled::default() };
     let dims = flat.resolution(settings.flat_resolution, settings.isovalue_resolution);
     let mut parts = flat.texels(dims);
-    let hidden = Hidden::new(scene, number, &flat);
+    let hidden = CoveredPart::new(scene, number, &flat);
     hidden.take_off(dims, &mut parts);
     // What lights the hidden part is no light of what is left of a texel.
     let photons = photons.filter(|p| !hidden.holds([p.uvc[0], p.uvc[1]].map(f64::from)));
@@ -360,7 +360,8 @@ mod tests {
             FlatPhoton { flat: ceiling, uvc: [(); 3].map(|()| rng.unit() as f32), power, bounces: 1 }
         });
         let texture = filled(&scene, &Nothing, number, photons, &SETTINGS).gathered.unwrap().outside;
-        let (hidden, expected) = (Hidden::new(&scene, number, &flat), reflected(flat.albedo.at(0.5), DVec3::ONE).x);
+        let (hidden, expected) =
+            (CoveredPart::new(&scene, number, &flat), reflected(flat.albedo.at(0.5), DVec3::ONE).x);
         let mut shown = [crate::stats::Moments::default(); 2];
         let mut most = 0f64;
         for i in 0..20_000 {

@@ -11,12 +11,12 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 /// What luminaires closely before a flat hide of it.
-pub(super) struct Hidden<'a> {
+pub(super) struct CoveredPart<'a> {
     flat: &'a Flat,
     covering: Vec<&'a Polygon>,
 }
 
-impl<'a> Hidden<'a> {
+impl<'a> CoveredPart<'a> {
     pub(super) fn new(scene: &'a Scene, number: usize, flat: &'a Flat) -> Self {
         let wall = u32::try_from(number).ok().filter(|_| number < scene.polygons().len());
         Self { flat, covering: wall.into_iter().flat_map(|wall| scene.covering(wall)).collect() }
