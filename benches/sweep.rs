@@ -28,6 +28,9 @@ use std::time::Instant;
 /// Interleaved repetitions, of which medians are taken.
 const REPEATS: usize = 7;
 
+/// The sweep of bumps.
+const BUMPS: [f64; 2] = [3.6, 95.0];
+
 /// Real volumes, their sweeps, and the isovalue of the extracted mesh.
 const DATA: [(&str, [f64; 2], f64); 4] = [
     ("pasta-proton.vti", [0.01, 0.05], 0.029),
@@ -42,13 +45,18 @@ fn scene_of(volume: &Volume, [lo, hi]: [f64; 2]) -> Scene {
     Scene::new(field, Surface::default(), Boundary::Open, walls).expect("a scene")
 }
 
-fn bumps(n: usize) -> Scene {
-    let volume = Generator::from_name("bumps").and_then(|g| g.sample([n; 3])).expect("a volume");
-    scene_of(&volume, [3.6, 95.0])
+fn bumps(n: usize) -> Volume {
+    Generator::from_name("bumps").and_then(|g| g.sample([n; 3])).expect("a volume")
 }
 
-/// A sum of Gaussian blobs all over, with a sweep that no node is outside of.
-fn foam(n: usize) -> Scene {
+/// All that the samples span: every node lies on an isosurface of this sweep.
+fn range_of(volume: &Volume) -> [f64; 2] {
+    let (lo, hi) = volume.range().expect("samples");
+    [lo, hi]
+}
+
+/// A sum of Gaussian blobs all over.
+fn foam(n: usize) -> Volume {
     let lattice = Lattice::aligned([n; 3], DVec3::ZERO, DVec3::splat(1.0 / (n - 1) as f64)).expect("a lattice");
     let mut rng = Rng::stream(3, Stage::Test, 0);
     let blobs: Vec<DVec3> = (0..300).map(|_| DVec3::new(rng.unit(), rng.unit(), rng.unit())).collect();
@@ -61,9 +69,7 @@ fn foam(n: usize) -> Scene {
             blobs.iter().map(blob).sum::<f64>() as f32
         })
         .collect();
-    let range = samples.iter().fold([f32::INFINITY, 0.0], |[lo, hi]: [f32; 2], &h| [lo.min(h), hi.max(h)]);
-    let volume = Volume::new("foam", lattice, Samples::F32(samples)).expect("a volume");
-    scene_of(&volume, range.map(f64::from))
+    Volume::new("foam", lattice, Samples::F32(samples)).expect("a volume")
 }
 
 /// An isosurface in Embree, and cosine-distributed rays off its vertices.
@@ -210,7 +216,7 @@ fn main() {
     );
     let mut passes = Vec::new();
     for n in if full { vec![64, 101, 128, 256] } else { vec![101] } {
-        let scene = bumps(n);
+        let scene = scene_of(&bumps(n), BUMPS);
         passes.push(((n as f64).ln() * 3.0, compare(&device, &format!("bumps {n}³"), &scene, 0.4).ln()));
         passes.retain(|pass| pass.1.is_finite());
         converge(&scene);
@@ -221,9 +227,15 @@ fn main() {
         let fit = |of: fn(f64, f64) -> f64| passes.iter().map(|p| of(p.0 - x, p.1 - y)).sum::<f64>();
         println!("time of a pass over voxels: fitted exponent {:.2}", fit(|x, y| x * y) / fit(|x, _| x * x));
     }
-    let scene = foam(101);
+    let foam = foam(101);
+    let scene = scene_of(&foam, range_of(&foam));
     compare(&device, "foam 101³", &scene, 0.2);
     converge(&scene);
+    let whole = |name: &str, volume: &Volume, c: f64| {
+        let scene = scene_of(volume, range_of(volume));
+        compare(&device, &format!("{name}, whole range"), &scene, scene.field.sweep().isovalue(c));
+    };
+    whole("bumps 101³", &bumps(101), 40.16);
     for (file, range, c) in DATA {
         let Some(path) = data.map(|d| Path::new(d).join(file)) else { continue };
         if !path.exists() {
@@ -234,5 +246,6 @@ fn main() {
         let scene = scene_of(&volume, range);
         compare(&device, file, &scene, scene.field.sweep().isovalue(c));
         converge(&scene);
+        whole(file, &volume, c);
     }
 }
