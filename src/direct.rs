@@ -177,13 +177,13 @@ pub fn direct_once<T: Tracer>(scene: &Scene, tracer: &T, receiver: &Receiver, rn
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::{Field, Sweep};
+    use crate::field::Field;
     use crate::flattened::FlattenedHit;
     use crate::polygon::Polygon;
     use crate::rng::Stage;
     use crate::scene::{Boundary, Surface, cornell_box};
     use crate::stats::Moments;
-    use crate::volume::{Lattice, Samples, Volume};
+    use crate::volume::{Lattice, Samples};
 
     /// What hides a luminaire but for a strip of it.
     struct Slit<'a> {
@@ -230,8 +230,7 @@ mod tests {
     fn slivers_of_light_and_shadow_are_found_in_the_mean() {
         let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::splat(0.125)).unwrap();
         let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[2] as f32).collect();
-        let volume = Volume::new("x", lattice, Samples::F32(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.5, 7.5).unwrap()).unwrap();
+        let field = Field::made(lattice, Samples::F32(samples), 0.5, 7.5);
         let walls = cornell_box(field.lattice(), 0.0).unwrap();
         let scene = Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap();
         let light = &scene.luminaires()[0];

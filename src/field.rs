@@ -398,6 +398,15 @@ pub(crate) fn has_direction(v: DVec3) -> bool {
 }
 
 #[cfg(test)]
+impl Field {
+    /// Of these samples, swept from `lo` to `hi`.
+    pub(crate) fn made(lattice: Lattice, samples: crate::volume::Samples, lo: f64, hi: f64) -> Self {
+        let volume = Volume::new("made", lattice, samples).unwrap();
+        Self::new(&volume, Sweep::new(lo, hi).unwrap()).unwrap()
+    }
+}
+
+#[cfg(test)]
 mod tests {
     use super::*;
     use crate::volume::Samples;

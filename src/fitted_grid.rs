@@ -297,18 +297,17 @@ impl Sorted {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::Sweep;
+
     use crate::illumination_grid::shepard;
     use crate::mask::{Mask, masks};
     use crate::rng::{Rng, Sobol};
-    use crate::volume::{Samples, Volume};
+    use crate::volume::Samples;
 
     #[test]
     fn a_trilinear_radiance_is_recovered_where_shepard_blurs_it() {
         let lattice = Lattice::aligned([9, 8, 7], DVec3::ZERO, DVec3::ONE).unwrap();
         let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[0] as f32).collect();
-        let volume = Volume::new("x", lattice, Samples::F32(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.0, 8.0).unwrap()).unwrap();
+        let field = Field::made(lattice, Samples::F32(samples), 0.0, 8.0);
         let f = |p: DVec3| 1.0 + 0.1 * p.x + 0.2 * p.y * p.z;
         let set = Sobol::set(1, Stage::Test, 0);
         let samples: Vec<RadianceSample> = (0..8 * 7 * 6 * 8)
@@ -354,8 +353,7 @@ mod tests {
         let fitted = |spacing: f64, unit: f32| {
             let lattice = Lattice::aligned([7; 3], DVec3::ZERO, DVec3::splat(spacing)).unwrap();
             let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[0] as f32).collect();
-            let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
-            let field = Field::new(&volume, Sweep::new(0.0, 6.0).unwrap()).unwrap();
+            let field = Field::made(lattice.clone(), Samples::F32(samples), 0.0, 6.0);
             let free = NodeSet::new(lattice.len(), |_| true);
             let mut rng = Rng::stream(3, Stage::Test, 0);
             let mut next = || rng.unit() as f32;
@@ -382,8 +380,7 @@ mod tests {
     fn errors_go_through_the_fit() {
         let lattice = Lattice::aligned([12; 3], DVec3::ZERO, DVec3::ONE).unwrap();
         let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[0] as f32).collect();
-        let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.0, 11.0).unwrap()).unwrap();
+        let field = Field::made(lattice.clone(), Samples::F32(samples), 0.0, 11.0);
         let free = NodeSet::new(lattice.len(), |o| lattice.ijk(o)[0] % 2 == 1);
         let mut rng = Rng::stream(1, Stage::Test, 0);
         let errors: Vec<f32> = (0..4000).map(|_| 0.1 * rng.unit() as f32).collect();
@@ -423,8 +420,7 @@ mod tests {
     fn errors_of_samples_are_in_the_blend_and_in_the_fit() {
         let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::ONE).unwrap();
         let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[0] as f32).collect();
-        let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.0, 8.0).unwrap()).unwrap();
+        let field = Field::made(lattice.clone(), Samples::F32(samples), 0.0, 8.0);
         let masks = masks(&field, &lattice);
         let mut rng = Rng::stream(5, Stage::Test, 0);
         let places: Vec<Vec3> = (0..729).map(|_| 8.0 * Vec3::from_array([(); 3].map(|()| rng.unit() as f32))).collect();

@@ -254,13 +254,13 @@ impl<T: Tracer, L: KnownLight> Corners<'_, T, L> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::{Field, Sweep};
+    use crate::field::Field;
     use crate::isovalue_axis::IsovalueAxis;
     use crate::photon::{FlatPhoton, Photons};
     use crate::radiance_cache::CacheSettings;
     use crate::rng::Stage;
     use crate::scene::{Boundary, Surface, cornell_box};
-    use crate::volume::{Lattice, Samples, Volume};
+    use crate::volume::{Lattice, Samples};
 
     /// The floor, and nothing else.
     struct Floor(u32);
@@ -280,8 +280,7 @@ mod tests {
     fn either_side_gathers_its_own_light() {
         let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::splat(0.125)).unwrap();
         let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[0] as f32).collect();
-        let volume = Volume::new("ramp", lattice, Samples::F32(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.0, 8.0).unwrap()).unwrap();
+        let field = Field::made(lattice, Samples::F32(samples), 0.0, 8.0);
         let walls = cornell_box(field.lattice(), 0.0).unwrap();
         let floor = walls.iter().position(|p| p.name == "z_min").unwrap() as u32;
         // No luminaire: nothing is direct.
@@ -339,8 +338,7 @@ mod tests {
     fn rare_light_counts_in_full() {
         let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::splat(0.125)).unwrap();
         let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[0] as f32).collect();
-        let volume = Volume::new("ramp", lattice, Samples::F32(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.0, 8.0).unwrap()).unwrap();
+        let field = Field::made(lattice, Samples::F32(samples), 0.0, 8.0);
         let mut walls = cornell_box(field.lattice(), 0.0).unwrap();
         walls.retain(|p| p.name == "z_min");
         let scene = Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap();

@@ -182,21 +182,20 @@ impl<'a> NearSamples<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::{Field, Sweep};
+    use crate::field::Field;
     use crate::illumination_grid::shepard;
     use crate::mask::masks;
     use crate::polygon::Polygon;
     use crate::rng::{Sobol, Stage};
     use crate::scene::{Boundary, Surface};
-    use crate::volume::{Samples, Volume};
+    use crate::volume::Samples;
 
     /// Level sets of `distance` 0.25 to 5 from the middle under a square luminaire.
     fn scene(distance: impl Fn(DVec3) -> f64) -> Scene {
         let lattice = Lattice::aligned([13; 3], DVec3::splat(-6.0), DVec3::ONE).unwrap();
         let at = |o: usize| lattice.point(o) - 6.0;
         let samples = (0..lattice.len()).map(|o| -distance(at(o)) as f32).collect();
-        let volume = Volume::new("x", lattice, Samples::F32(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(-5.0, -0.25).unwrap()).unwrap();
+        let field = Field::made(lattice, Samples::F32(samples), -5.0, -0.25);
         let corner = |x: f64, y: f64| DVec3::new(x, y, 12.0);
         let vertices = [corner(-4.0, -4.0), corner(-4.0, 4.0), corner(4.0, 4.0), corner(4.0, -4.0)];
         let light = Polygon::new("lamp", vertices.to_vec(), DVec3::ZERO, DVec3::new(3.0, 2.0, 1.0)).unwrap();

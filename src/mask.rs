@@ -287,8 +287,7 @@ mod tests {
         let lattice = Lattice::aligned([8, 3, 3], DVec3::ZERO, DVec3::ONE).unwrap();
         let row = [0.0, 0.0, 0.0, 0.5, 2.0, 9.0, 9.0, 9.0f32];
         let samples = (0..lattice.len()).map(|o| row[o % 8]).collect();
-        let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.2, 1.2).unwrap()).unwrap();
+        let field = Field::made(lattice.clone(), Samples::F32(samples), 0.2, 1.2);
         let got = masks(&field, &lattice);
         use Mask::{Empty, Filled, Valid};
         // Cells 2–3, 3–4 hold the sweep; nodes of those cells and the cells beside them are filled.
@@ -305,8 +304,7 @@ mod tests {
         // A ramp around them, so that all have a gradient.
         let mut value = |o: usize| if rng.unit() < 0.06 { 60.0 * rng.unit() as f32 } else { 100.0 + o as f32 };
         let values = (0..lattice.len()).map(&mut value).collect();
-        let volume = Volume::new("x", lattice.clone(), Samples::F32(values)).unwrap();
-        let field = Field::new(&volume, Sweep::new(-1.0, 40.0).unwrap()).unwrap();
+        let field = Field::made(lattice.clone(), Samples::F32(values), -1.0, 40.0);
         let h = field.samples();
         let mut count = [0; 3];
         for (o, mask) in masks(&field, &lattice).into_iter().enumerate() {
@@ -332,8 +330,7 @@ mod tests {
         let missing = |[i, j, k]: [usize; 3]| [[1, 1, 1], [3, 1, 0], [4, 3, 5]].contains(&[i, j, k]);
         let h = |o: usize| lattice.ijk(o).map(|i| i as f64).iter().sum::<f64>();
         let samples = (0..lattice.len()).map(|o| if missing(lattice.ijk(o)) { f64::NAN } else { h(o) });
-        let volume = Volume::new("x", lattice.clone(), Samples::F64(samples.collect())).unwrap();
-        let field = Field::new(&volume, Sweep::new(-1.0, 16.0).unwrap()).unwrap();
+        let field = Field::made(lattice.clone(), Samples::F64(samples.collect()), -1.0, 16.0);
         let got = masks(&field, &lattice);
         let mut alone = Vec::new();
         for (o, mask) in got.iter().enumerate() {
@@ -431,8 +428,7 @@ mod tests {
             let lattice = Lattice::aligned([6, 5, 19], DVec3::ZERO, DVec3::ONE).unwrap();
             let far = |o: usize| (0..3).map(|a| lattice.ijk(o)[a].abs_diff(place[a])).max().unwrap();
             let samples = (0..lattice.len()).map(|o| if far(o) == 0 { 0.5 } else { -1.0 }).collect();
-            let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
-            let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+            let field = Field::made(lattice.clone(), Samples::F32(samples), 0.0, 1.0);
             for (o, mask) in masks(&field, &lattice).into_iter().enumerate() {
                 assert_eq!(mask == Mask::Empty, far(o) > 1, "{place:?}: {:?}", lattice.ijk(o));
             }

@@ -195,8 +195,7 @@ mod tests {
     fn what_is_at_hand_takes_no_search() {
         let lattice = Lattice::aligned([9; 3], DVec3::ZERO, DVec3::ONE).unwrap();
         let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[2] as f32).collect();
-        let volume = Volume::new("x", lattice, Samples::F32(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(3.5, 3.500_001).unwrap()).unwrap();
+        let field = Field::made(lattice, Samples::F32(samples), 3.5, 3.500_001);
         let found = positions_at_hand(&field, &Strategy::Uniform, 4096, 1).unwrap();
         assert!(found.len() < 100, "{}", found.len());
     }
@@ -208,8 +207,7 @@ mod tests {
         let lattice = Lattice::aligned([9, 8, 7], DVec3::ZERO, DVec3::new(1.0, 2.0, 0.5)).unwrap();
         let h = |[x, y, z]: [usize; 3]| (x * x) as f32 / 64.0 + 0.3 * (y as f32 - 2.0).sin() + 0.05 * z as f32;
         let samples = (0..lattice.len()).map(|o| h(lattice.ijk(o))).collect();
-        let volume = Volume::new("x", lattice, Samples::F32(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.31, 0.83).unwrap()).unwrap();
+        let field = Field::made(lattice, Samples::F32(samples), 0.31, 0.83);
         let far = field.lattice().far();
         let block = |p: DVec3| (0..3).fold(0, |b, a| b * 4 + ((4.0 * p[a] / far[a]) as usize).min(3));
         const FINE: usize = 96;

@@ -286,17 +286,16 @@ impl Surroundings for Points<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::Sweep;
+
     use crate::rng::{Rng, Stage};
     use crate::scene::{Boundary, Surface};
-    use crate::volume::{Samples, Volume};
+    use crate::volume::Samples;
 
     /// RMS error before and after smoothing noise of standard deviation 0.1 per half off `light`, on planes of h = x.
     fn errors(light: impl Fn(DVec3) -> f32, judged: impl Fn(DVec3) -> bool) -> [f64; 2] {
         let lattice = Lattice::aligned([16, 17, 18], DVec3::ZERO, DVec3::ONE).unwrap();
         let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[0] as f32).collect();
-        let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.0, 15.0).unwrap()).unwrap();
+        let field = Field::made(lattice.clone(), Samples::F32(samples), 0.0, 15.0);
         let scene = Scene::new(field, Surface::default(), Boundary::Open, Vec::new()).unwrap();
         let place = |o: usize| lattice.point(o);
         let halves: Vec<[Vec3; 2]> = (0..lattice.len())

@@ -82,10 +82,10 @@ fn lit(scene: &Scene, p: DVec3, irradiance: DVec3) -> DVec3 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::{Field, Sweep};
+    use crate::field::Field;
     use crate::polygon::Polygon;
     use crate::scene::{Boundary, Surface};
-    use crate::volume::{Lattice, Samples, Volume};
+    use crate::volume::{Lattice, Samples};
 
     /// Spheres on [−1, 1]³ that reflect more the greater they are, between a red luminaire above and a green one at the
     /// right.
@@ -93,8 +93,7 @@ mod tests {
         let lattice = Lattice::aligned([21; 3], DVec3::splat(-1.0), DVec3::splat(0.1)).unwrap();
         let radius = |o: usize| lattice.to_world(lattice.point(o)).length();
         let samples = (0..lattice.len()).map(|o| 1.0 - radius(o)).collect();
-        let volume = Volume::new("spheres", lattice.clone(), Samples::F64(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.1, 0.9).unwrap()).unwrap();
+        let field = Field::made(lattice.clone(), Samples::F64(samples), 0.1, 0.9);
         let square = |name, at: DVec3, a: DVec3, b: DVec3, emission| {
             let corners = vec![at - a - b, at + a - b, at + a + b, at - a + b];
             Polygon::new(name, corners, DVec3::ZERO, emission).unwrap()

@@ -235,17 +235,16 @@ mod tests {
     use super::*;
     use crate::bake::Preset;
     use crate::export::bake_file::BakedVolume;
-    use crate::field::{Field, Sweep};
+    use crate::field::Field;
     use crate::scene::{Boundary, Surface, cornell_box};
+    use crate::volume::Samples;
     use crate::volume::generate::Generator;
-    use crate::volume::{Samples, Volume};
 
     /// Bumps whose values are small: isovalues that four digits after the point do not tell apart.
     pub(super) fn subject(albedo: f64) -> Subject {
         let bumps = Generator::from_name("bumps").unwrap().sample([8; 3]).unwrap();
         let values = (0..bumps.lattice.len()).map(|o| 1e-6 * bumps.value(o) as f32).collect();
-        let volume = Volume::new("small", bumps.lattice, Samples::F32(values)).unwrap();
-        let field = Field::new(&volume, Sweep::new(3.6e-6, 95e-6).unwrap()).unwrap();
+        let field = Field::made(bumps.lattice, Samples::F32(values), 3.6e-6, 95e-6);
         let walls = cornell_box(field.lattice(), 0.0).unwrap();
         let surface = Surface { albedo: DVec3::splat(albedo).into(), ..Surface::default() };
         let scene = Scene::new(field, surface, Boundary::Open, walls).unwrap();

@@ -302,10 +302,10 @@ fn beside(lattice: &Lattice, grid: &IlluminationGrid, p: DVec3, rng: &mut Rng) -
 mod tests {
     use super::*;
     use crate::embree::{Device, GraphTracer};
-    use crate::field::Sweep;
+
     use crate::flattened::Side;
     use crate::scene::{Boundary, Surface, cornell_box};
-    use crate::volume::{Samples, Volume};
+    use crate::volume::Samples;
 
     const N: usize = 41;
     const GLOW: f64 = 0.5;
@@ -315,8 +315,7 @@ mod tests {
         let step = 2.0 / (N - 1) as f64;
         let lattice = Lattice::aligned([N; 3], DVec3::splat(-1.0), DVec3::splat(step)).unwrap();
         let samples = (0..lattice.len()).map(|o| h(place(&lattice, o))).collect();
-        let volume = Volume::new("h", lattice.clone(), Samples::F64(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(sweep[0], sweep[1]).unwrap()).unwrap();
+        let field = Field::made(lattice.clone(), Samples::F64(samples), sweep[0], sweep[1]);
         let surface = Surface {
             albedo: DVec3::ZERO.into(),
             emission: DVec3::splat(GLOW),

@@ -123,9 +123,9 @@ fn step(c: f32) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::Sweep;
+
     use crate::mask::masks;
-    use crate::volume::{Lattice, Samples, Volume};
+    use crate::volume::{Lattice, Samples};
     use glam::DVec3;
 
     #[test]
@@ -134,8 +134,7 @@ mod tests {
         // Most of the nodes are low.
         let h = |o: usize| (o as f32 / lattice.len() as f32).powi(3) * 1.2 - 0.1;
         let samples: Vec<f32> = (0..lattice.len()).map(h).collect();
-        let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+        let field = Field::made(lattice.clone(), Samples::F32(samples), 0.0, 1.0);
         let masks = masks(&field, &lattice);
         let levels = Levels::new([(&field, &masks[..])].into_iter(), REACH);
         let valid = masks.iter().filter(|&&m| m == Mask::Valid).count();

@@ -274,10 +274,10 @@ pub(super) fn smoothed_light(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::{Field, Sweep};
+    use crate::field::Field;
     use crate::rng::{Rng, Stage};
     use crate::scene::{Boundary, Surface};
-    use crate::volume::{Samples, Volume};
+    use crate::volume::Samples;
     use glam::DVec3;
 
     /// Sharpened nodes may make a gather negative, of which radiance holds nothing: what is smoothed takes nothing off.
@@ -285,8 +285,7 @@ mod tests {
     fn gathers_below_zero_leave_no_specks() {
         let lattice = Lattice::aligned([3; 3], DVec3::ZERO, DVec3::ONE).unwrap();
         let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[0] as f64).collect();
-        let volume = Volume::new("x", lattice, Samples::F64(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.0, 2.0).unwrap()).unwrap();
+        let field = Field::made(lattice, Samples::F64(samples), 0.0, 2.0);
         let surface = Surface { albedo: DVec3::splat(0.5).into(), ..Surface::default() };
         let scene = Scene::new(field, surface, Boundary::Open, Vec::new()).unwrap();
         let light = |radiance: f32, halves: [f32; 2], mean: f32| {

@@ -379,20 +379,19 @@ impl Fit {
 mod tests {
     use super::*;
     use crate::direct::Receiver;
-    use crate::field::Sweep;
+
     use crate::flattened::{Departure, Side};
     use crate::nearest::Neighbours;
     use crate::photon_map::{Estimator, PhotonMap};
     use crate::rng::{Rng, Stage};
     use crate::scene::{Boundary, Surface};
-    use crate::volume::{Lattice, Samples, Volume};
+    use crate::volume::{Lattice, Samples};
 
     /// A ramp along x over `steps` steps of each axis.
     fn ramp(steps: usize) -> Scene {
         let lattice = Lattice::aligned([steps + 1; 3], DVec3::ZERO, DVec3::splat(0.5)).unwrap();
         let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[0] as f64 / steps as f64).collect();
-        let volume = Volume::new("ramp", lattice, Samples::F64(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+        let field = Field::made(lattice, Samples::F64(samples), 0.0, 1.0);
         Scene::new(field, Surface::default(), Boundary::Open, Vec::new()).unwrap()
     }
 
@@ -465,8 +464,7 @@ mod tests {
     fn flanks_of_a_ridge_keep_their_light_on_either_side() {
         let lattice = Lattice::aligned([17; 3], DVec3::ZERO, DVec3::splat(0.5)).unwrap();
         let samples = (0..lattice.len()).map(|o| 1.0 - (lattice.ijk(o)[0] as f64 - 8.0).abs() / 8.0).collect();
-        let volume = Volume::new("ridge", lattice, Samples::F64(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+        let field = Field::made(lattice, Samples::F64(samples), 0.0, 1.0);
         let scene = Scene::new(field, Surface::default(), Boundary::Open, Vec::new()).unwrap();
         let mut rng = Rng::stream(8, Stage::Test, 0);
         for side in Side::BOTH {

@@ -168,9 +168,9 @@ impl<'a> PhotonPoints<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::Sweep;
+
     use crate::scene::{Boundary, Surface, cornell_box};
-    use crate::volume::{Lattice, Samples, Volume};
+    use crate::volume::{Lattice, Samples};
 
     /// Planes: of a ball much thicker than the sweep ∫ K |∇h| dV = π r² / 2, and sweeps between two samples fill a part
     /// of Ω, too.
@@ -179,8 +179,7 @@ mod tests {
         for width in [0.5, 0.05, 0.005, 5e-5] {
             let lattice = Lattice::aligned([17; 3], DVec3::ZERO, DVec3::ONE).unwrap();
             let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[2] as f32).collect();
-            let volume = Volume::new("planes", lattice.clone(), Samples::F32(samples)).unwrap();
-            let field = Field::new(&volume, Sweep::new(8.2, 8.2 + width).unwrap()).unwrap();
+            let field = Field::made(lattice.clone(), Samples::F32(samples), 8.2, 8.2 + width);
             assert!((field.share_on_sweep() / (width / 16.0) - 1.0).abs() < 1e-3, "{width}");
             let walls = cornell_box(&lattice, 0.1).unwrap();
             let scene = Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap();

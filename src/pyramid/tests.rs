@@ -100,8 +100,7 @@ fn rays_that_enter_along_planes_meet_the_sheet_in_their_way() {
             (y + across(x, z)) as f32
         };
         let samples = (0..lattice.len()).map(at).collect();
-        let volume = Volume::new("sheets", lattice, Samples::F32(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.0, 20.0).unwrap()).unwrap();
+        let field = Field::made(lattice, Samples::F32(samples), 0.0, 20.0);
         let pyramid = Pyramid::new(&field, false);
         let mut rng = Rng::stream(8, Stage::Test, long as u64);
         for isa in Isa::found() {

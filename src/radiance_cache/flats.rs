@@ -346,8 +346,7 @@ mod tests {
         let lattice = Lattice::aligned([17; 3], DVec3::ZERO, DVec3::splat(0.0625)).unwrap();
         // The solid is one corner, far away.
         let samples = (0..lattice.len()).map(|o| f32::from(o == 0)).collect();
-        let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.1, 1.0).unwrap()).unwrap();
+        let field = Field::made(lattice.clone(), Samples::F32(samples), 0.1, 1.0);
         let walls = cornell_box(field.lattice(), 0.0).unwrap();
         let scene = Scene::new(field, Surface::default(), Boundary::Open, walls).unwrap();
         let ceiling = scene.covered_wall(0).unwrap();

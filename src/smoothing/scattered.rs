@@ -167,11 +167,11 @@ impl Surroundings for Cloud<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::{Field, Sweep};
+    use crate::field::Field;
     use crate::flattened::Side;
     use crate::rng::{Rng, Stage};
     use crate::scene::{Boundary, Scene, Surface};
-    use crate::volume::{Samples, Volume};
+    use crate::volume::Samples;
 
     /// Four places about most points of three in four planes of x, where h rises by `slope` a step from x = 0 and falls
     /// from x = 8 on.
@@ -187,8 +187,7 @@ mod tests {
             let lattice = Lattice::aligned([17, 14, 15], DVec3::ZERO, DVec3::ONE).unwrap();
             let height = |o: usize| slope * (8.0 - (lattice.ijk(o)[0] as f32 - 8.0).abs());
             let samples = (0..lattice.len()).map(height).collect();
-            let volume = Volume::new("steep", lattice.clone(), Samples::F32(samples)).unwrap();
-            let field = Field::new(&volume, Sweep::new(0.0, 8.0).unwrap()).unwrap();
+            let field = Field::made(lattice.clone(), Samples::F32(samples), 0.0, 8.0);
             let owners = NodeSet::new(lattice.len(), |o| !lattice.ijk(o)[0].is_multiple_of(4));
             let (mut positions, mut starts) = (Vec::new(), vec![0]);
             for o in owners.members(0..lattice.len()) {

@@ -102,8 +102,7 @@ pub(super) mod tests {
     fn clearances_end_where_bytes_do() {
         let lattice = Lattice::aligned([600, 5, 5], DVec3::ZERO, DVec3::ONE).unwrap();
         let samples = (0..lattice.len()).map(|at| if at == 0 { 0.5 } else { -1.0 }).collect();
-        let volume = Volume::new("a speck", lattice, Samples::F64(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+        let field = Field::made(lattice, Samples::F64(samples), 0.0, 1.0);
         let slices = Clearance::new(&Geometry::new(&field)).slices;
         // Of rows as long as this, ten nodes at a time are known to hold nothing: the first twelve may.
         assert_eq!([0, 2, 3, 4, 5, 64, 65, 66, 149].map(|b| slices[b]), [1, 1, 1, 5, 9, 245, 249, 249, 249]);

@@ -335,9 +335,9 @@ fn rings(dims: [usize; 3], lit: &[bool]) -> Vec<Vec<u32>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::Sweep;
+
     use crate::rng::{Rng, Stage};
-    use crate::volume::{Lattice, Samples, Volume};
+    use crate::volume::{Lattice, Samples};
 
     /// Every cell with a node that is not below the sweep, and of the others few: those of the same blocks and beside.
     #[test]
@@ -348,8 +348,7 @@ mod tests {
         let h = |_| if rng.unit() < 2e-3 { 2.0 * rng.unit() } else { -rng.unit() };
         let mut samples: Vec<f64> = (0..lattice.len()).map(h).collect();
         samples[77] = f64::NAN;
-        let volume = Volume::new("sparse", lattice.clone(), Samples::F64(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+        let field = Field::made(lattice.clone(), Samples::F64(samples), 0.0, 1.0);
         let geometry = Geometry::new(&field);
         let mut counts = [0; 3];
         for _ in 0..20_000 {
@@ -380,8 +379,7 @@ mod tests {
         let inside = |[x, y, z]: [usize; 3]| x < 4 && y < 5 || (x > 60 && z > 8) || (y == 7 && z == 3);
         let h = |o: usize| if inside(lattice.ijk(o)) { 0.5 + 1e-3 * (o % 7) as f32 } else { -9.0 + (o % 3) as f32 };
         let samples = (0..lattice.len()).map(h).collect();
-        let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+        let field = Field::made(lattice.clone(), Samples::F32(samples), 0.0, 1.0);
         let geometry = Geometry::new(&field);
         let lit = (0..lattice.len()).filter(|&o| geometry.lit(o)).count();
         assert!(lit > 200);

@@ -83,8 +83,8 @@ pub(super) fn open_over_sweep(scene: &Scene, side: Side) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::Sweep;
-    use crate::volume::{Lattice, Samples, Volume};
+
+    use crate::volume::{Lattice, Samples};
 
     /// h = x on the unit cube, a luminaire from x = 0.5 to 1.5 across its face: at isovalue c the part c < x < 1 lies
     /// in the solid.
@@ -92,8 +92,7 @@ mod tests {
     fn shares_follow_from_the_field_on_the_luminaire() {
         let lattice = Lattice::aligned([11; 3], DVec3::ZERO, DVec3::splat(0.1)).unwrap();
         let samples = (0..lattice.len()).map(|o| lattice.ijk(o)[0] as f64 / 10.0).collect();
-        let volume = Volume::new("ramp", lattice, Samples::F64(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+        let field = Field::made(lattice, Samples::F64(samples), 0.0, 1.0);
         let corners = [(0.5, 0.2), (1.5, 0.2), (1.5, 0.8), (0.5, 0.8)];
         let corners = corners.map(|(x, y)| DVec3::new(x, y, 0.5)).to_vec();
         let light = Polygon::new("light", corners, DVec3::ZERO, DVec3::ONE).unwrap();

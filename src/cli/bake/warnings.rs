@@ -202,8 +202,7 @@ mod tests {
         let said = |dims: [usize; 3], spacing: DVec3| {
             let lattice = Lattice::aligned(dims, DVec3::ZERO, spacing).unwrap();
             let samples = (0..lattice.len()).map(|o| (o % 2) as u8).collect();
-            let volume = Volume::new("v", lattice, Samples::U8(samples)).unwrap();
-            let field = Field::new(&volume, Sweep::new(0.2, 0.8).unwrap()).unwrap();
+            let field = Field::made(lattice, Samples::U8(samples), 0.2, 0.8);
             long_voxels(&Scene::new(field, Surface::default(), Boundary::Open, Vec::new()).unwrap())
         };
         let advice = said([5, 3, 3], DVec3::new(3.2, 1.0, 1.0)).unwrap();

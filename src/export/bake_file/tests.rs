@@ -109,8 +109,7 @@ fn sides_are_told_by_their_names() {
 #[test]
 fn every_wall_has_an_array_of_its_own() {
     let lattice = Lattice::aligned([3; 3], DVec3::ZERO, DVec3::ONE).unwrap();
-    let volume = Volume::new("x", lattice, Samples::F32((0..27).map(|o| (o % 3) as f32).collect())).unwrap();
-    let field = Field::new(&volume, Sweep::new(0.5, 1.5).unwrap()).unwrap();
+    let field = Field::made(lattice, Samples::F32((0..27).map(|o| (o % 3) as f32).collect()), 0.5, 1.5);
     let corners = [[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]];
     let wall = |(n, name)| {
         let vertices = corners.map(|[x, y]| DVec3::new(x, y, -1.0 - n as f64)).to_vec();

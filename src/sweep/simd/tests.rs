@@ -1,5 +1,5 @@
 use super::*;
-use crate::field::{Field, Sweep};
+use crate::field::Field;
 use crate::isovalue_axis::IsovalueAxis;
 use crate::rng::{Rng, Stage};
 use crate::sweep::clearance::tests::specks;
@@ -7,7 +7,7 @@ use crate::sweep::grid::Geometry;
 use crate::sweep::half::Half4;
 use crate::sweep::half::{decode, encode};
 use crate::sweep::pack::{ASLEEP, LANES, OUTSIDE};
-use crate::volume::{Lattice, Samples, Volume};
+use crate::volume::{Lattice, Samples};
 use glam::DVec3;
 
 /// A pack of noise with plateaus, gaps, rows that were not read, ends outside and cuts.
@@ -101,8 +101,7 @@ fn every_instruction_set_finds_the_same_extrema() {
     let lattice = Lattice::aligned([9, 14, 11], DVec3::ZERO, DVec3::ONE).unwrap();
     let mut samples: Vec<f64> = (0..lattice.len()).map(|_| rng.unit()).collect();
     samples[700] = f64::NAN;
-    let volume = Volume::new("noise", lattice, Samples::F64(samples)).unwrap();
-    let field = Field::new(&volume, Sweep::new(0.0, 1.0).unwrap()).unwrap();
+    let field = Field::made(lattice, Samples::F64(samples), 0.0, 1.0);
     for _ in 0..200 {
         let mut segments = Segments::NONE;
         // Partly outside, and from nodes until enough is found; the last lanes stay empty.
