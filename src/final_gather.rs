@@ -185,9 +185,8 @@ pub fn seen(baked: &BakedVolume, ray: &FlattenedRay, hit: FlattenedHit) -> Optio
     let scene = &baked.scene;
     let p = ray.at(hit.t);
     match hit.target {
-        Target::Surface(side) => baked.radiance(side, p),
-        Target::Companion(n, side) => {
-            let (own, p) = holder(baked, Some(n), p);
+        Target::Surface(side) | Target::Companion(_, side) => {
+            let (own, p) = holder(baked, hit.target.companion(), p);
             own.radiance(side, p)
         }
         Target::Cap(_, Side::Higher) => Some(DVec3::ZERO),
@@ -240,8 +239,9 @@ impl KnownLight for BakedLight<'_> {
     fn radiance(&self, _: &Scene, landed: SurfacePoint, _: &mut u64) -> Option<DVec3> {
         let SurfacePoint { target, within, position, isovalue } = landed;
         match target {
-            Target::Surface(side) => stored(self.baked, None, side, position),
-            Target::Companion(n, side) => stored(self.baked, Some(n), side, position),
+            Target::Surface(side) | Target::Companion(_, side) => {
+                stored(self.baked, target.companion(), side, position)
+            }
             Target::Cap(_, Side::Higher) => None,
             Target::Cap(face, Side::Lower) => Some(cap(self.baked, face, position, isovalue).unwrap_or_default()),
             Target::Polygon(id) => {
@@ -279,8 +279,7 @@ mod tests {
         let lattice = Lattice::aligned([41; 3], DVec3::splat(-1.0), DVec3::splat(0.05)).unwrap();
         let place = |o: usize| lattice.to_world(lattice.point(o));
         let samples = (0..lattice.len()).map(|o| place(o).length()).collect();
-        let volume = Volume::new("spheres", lattice.clone(), Samples::F64(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.2, 0.9).unwrap()).unwrap();
+        let field = Field::made(lattice.clone(), Samples::F64(samples), 0.2, 0.9);
         let albedo = DVec3::splat(ALBEDO).into();
         let surface = Surface { albedo, emission: DVec3::splat(GLOW), outside, both_sides: false };
         Scene::new(field, surface, Boundary::Open, luminaires).unwrap()

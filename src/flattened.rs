@@ -182,6 +182,14 @@ pub enum Target {
     Companion(u8, Side),
 }
 
+impl Target {
+    /// The companion whose level set it is; `None` for the scene's own, and for what is no level set.
+    #[inline]
+    pub fn companion(self) -> Option<u8> {
+        if let Self::Companion(n, _) = self { Some(n) } else { None }
+    }
+}
+
 /// The nearest hit of a ray.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FlattenedHit {

@@ -29,14 +29,11 @@ pub fn landing(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit) -> Option<L
     let isovalue = ray.isovalue;
     let none = DVec3::ZERO;
     let (normal, on, albedo, emission) = match hit.target {
-        Target::Surface(side) => {
-            let normal = scene.normal(position.as_dvec3(), side)?;
-            (normal, Departure::Surface(side), scene.surface.albedo.at(f64::from(isovalue)), scene.surface.emission)
-        }
-        Target::Companion(n, side) => {
-            let companion = &scene.companions()[usize::from(n)];
-            let (normal, surface) = (companion.normal(position.as_dvec3(), side)?, &companion.member.surface);
-            (normal, Departure::Companion(n, side), surface.albedo.at(f64::from(isovalue)), surface.emission)
+        Target::Surface(side) | Target::Companion(_, side) => {
+            let companion = hit.target.companion();
+            let at = scene.field_at(companion, position.as_dvec3());
+            let on = companion.map_or(Departure::Surface(side), |n| Departure::Companion(n, side));
+            (at.normal(side)?, on, at.surface.albedo.at(f64::from(isovalue)), at.surface.emission)
         }
         Target::Cap(face, side) => {
             let n = scene.face_normal(face);

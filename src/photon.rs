@@ -162,17 +162,11 @@ impl Photons {
         let position = x.as_vec3().as_dvec3();
         let normal = landed.map(|l| l.receiver.normal);
         let (flat, [u, v]) = match target {
-            Target::Surface(side) => {
-                let gradient = scene.field.gradient(position);
-                let field = (scene.number(), side);
-                let landed = SurfacePhoton::landed(photon, bounces, field, position.as_vec3(), normal, gradient);
-                return self.surface.push(landed);
-            }
-            Target::Companion(n, side) => {
-                let companion = &scene.companions()[usize::from(n)];
-                let place = companion.to_index(position).as_vec3();
-                let gradient = companion.member.field.gradient(place.as_dvec3());
-                let field = (companion.number, side);
+            Target::Surface(side) | Target::Companion(_, side) => {
+                let at = scene.field_at(target.companion(), position);
+                let place = at.place.as_vec3();
+                let gradient = at.field.gradient(place.as_dvec3());
+                let field = (at.number, side);
                 return self.surface.push(SurfacePhoton::landed(photon, bounces, field, place, normal, gradient));
             }
             // The texture of a cap is its outer side's.

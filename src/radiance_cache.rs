@@ -22,7 +22,7 @@ use crate::photon::{Photons, SurfacePhoton};
 use crate::photon_map::{EstimateSettings, PhotonMap};
 use crate::progress::Tick;
 use crate::rng::Stage;
-use crate::scene::Scene;
+use crate::scene::{FieldAt, Scene};
 use crate::sharpening::sharpen;
 use crate::tracer::Tracer;
 use flats::{ByFlat, fill_flat};
@@ -241,18 +241,10 @@ impl RadianceCache {
     pub fn lookup(&self, scene: &Scene, landed: SurfacePoint, misses: &mut u64) -> DVec3 {
         let SurfacePoint { target, within, position, isovalue } = landed;
         match target {
-            Target::Surface(side) => {
-                let surface = &scene.surface;
-                let at = (position, isovalue);
-                let white = self.white(scene.number(), &scene.field, side, at, misses);
-                surface.albedo.at(f64::from(isovalue)) * white + surface.emission
-            }
-            Target::Companion(n, side) => {
-                let c = &scene.companions()[usize::from(n)];
-                let surface = &c.member.surface;
-                let at = (c.to_index(position), isovalue);
-                let white = self.white(c.number, &c.member.field, side, at, misses);
-                surface.albedo.at(f64::from(isovalue)) * white + surface.emission
+            Target::Surface(side) | Target::Companion(_, side) => {
+                let at = scene.field_at(target.companion(), position);
+                let white = self.white(at, side, isovalue, misses);
+                at.surface.albedo.at(f64::from(isovalue)) * white + at.surface.emission
             }
             // Rays go on from there.
             Target::Cap(_, Side::Higher) => DVec3::ZERO,
@@ -273,19 +265,13 @@ impl RadianceCache {
         texture.map_or(DVec3::ZERO, |texture| texture.lookup([u, v, f64::from(isovalue)]))
     }
 
-    /// What a white surface of field `number` would reflect where its level set `isovalue` is at a position.
-    fn white(
-        &self,
-        number: usize,
-        field: &Field,
-        side: Side,
-        (position, isovalue): (DVec3, f32),
-        misses: &mut u64,
-    ) -> DVec3 {
+    /// What a white surface of a field would reflect where its level set `isovalue` is.
+    fn white(&self, at: FieldAt, side: Side, isovalue: f32, misses: &mut u64) -> DVec3 {
+        let FieldAt { number, field, place, .. } = at;
         let Some(nodes) = self.nodes.get(number).and_then(Option::as_ref) else { return DVec3::ZERO };
         let Some(values) = nodes.sides[side.index()].as_ref() else { return DVec3::ZERO };
         let known = Known { field, stored: &nodes.stored, values };
-        let (cell, u) = field.locate(position);
+        let (cell, u) = field.locate(place);
         known.between(cell, u, isovalue).or_else(|| known.beside(cell)).unwrap_or_else(|| {
             *misses += 1;
             DVec3::ZERO
@@ -424,8 +410,7 @@ mod tests {
         let lattice = Lattice::aligned([9, 9, 9], DVec3::ZERO, DVec3::ONE).unwrap();
         let at = |o: usize| lattice.ijk(o).map(|i| i as f64);
         let samples = (0..lattice.len()).map(|o| (at(o)[0] + 0.9 * at(o)[1] + 1.1 * at(o)[2]) as f32).collect();
-        let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.0, 24.0).unwrap()).unwrap();
+        let field = Field::made(lattice.clone(), Samples::F32(samples), 0.0, 24.0);
         Scene::new(field, Surface { albedo: DVec3::ONE.into(), ..Surface::default() }, Boundary::Open, vec![]).unwrap()
     }
 
@@ -498,8 +483,7 @@ mod tests {
     fn cells_beside_filled_nodes_find_the_nearest() {
         let lattice = Lattice::aligned([30, 3, 3], DVec3::ZERO, DVec3::ONE).unwrap();
         let samples = (0..lattice.len()).map(|o| (o % 30) as f32).collect();
-        let volume = Volume::new("x", lattice.clone(), Samples::F32(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.0, 29.0).unwrap()).unwrap();
+        let field = Field::made(lattice.clone(), Samples::F32(samples), 0.0, 29.0);
         let surface = Surface { albedo: DVec3::ONE.into(), ..Surface::default() };
         let scene = Scene::new(field, surface, Boundary::Open, Vec::new()).unwrap();
         let mut nodes = vec![[f32::NAN; 3]; lattice.len()];

@@ -194,10 +194,9 @@ fn local(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit, direction: DVec3)
     let p = ray.at(hit.t);
     let isovalue = f64::from(ray.isovalue);
     let (albedo, normal) = match hit.target {
-        Target::Surface(side) => (scene.surface.albedo.at(isovalue), scene.normal(p, side)),
-        Target::Companion(n, side) => {
-            let companion = &scene.companions()[usize::from(n)];
-            (companion.member.surface.albedo.at(isovalue), companion.normal(p, side))
+        Target::Surface(side) | Target::Companion(_, side) => {
+            let at = scene.field_at(hit.target.companion(), p);
+            (at.surface.albedo.at(isovalue), at.normal(side))
         }
         Target::Cap(face, _) => (scene.face_surface(face).albedo.at(isovalue), Some(scene.face_normal(face))),
         Target::Polygon(id) => {

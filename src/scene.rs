@@ -6,7 +6,7 @@ mod cover;
 mod mtl;
 mod obj;
 
-pub use companion::{Companion, Member, Policy};
+pub use companion::{Companion, FieldAt, Member, Policy};
 pub(crate) use cover::{ON, SLIT, value_on, voxel_along};
 pub use obj::{Placement, read_context, read_obj};
 
@@ -440,14 +440,14 @@ pub fn cornell_box(lattice: &Lattice, margin: f64) -> Result<Vec<Polygon>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::Sweep;
-    use crate::volume::{Samples, Volume};
+
+    use crate::volume::Samples;
     use glam::DMat3;
 
     fn scene_on(lattice: Lattice, margin: f64, boundary: Boundary) -> Result<Scene> {
         let samples = (0..lattice.len()).map(|i| i as f32).collect();
-        let volume = Volume::new("test", lattice, Samples::F32(samples)).unwrap();
-        let field = Field::new(&volume, Sweep::new(0.0, volume.range().unwrap().1).unwrap()).unwrap();
+        let last = (lattice.len() - 1) as f64;
+        let field = Field::made(lattice, Samples::F32(samples), 0.0, last);
         let polygons = cornell_box(field.lattice(), margin)?;
         Scene::new(field, Surface::default(), boundary, polygons)
     }

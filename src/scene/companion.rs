@@ -77,13 +77,6 @@ impl Companion {
         self.back.determinant() < 0.0
     }
 
-    /// Unit normal of `side` of its level set through local `p` of the scene, in the world; `None` where ∇h vanishes.
-    #[inline]
-    pub fn normal(&self, p: DVec3, side: Side) -> Option<DVec3> {
-        let n = self.member.field.falling_normal(self.to_index(p))?;
-        Some(side.facing(n))
-    }
-
     /// The ray in its index space, as its own scene would trace it.
     #[inline(always)]
     pub fn ray_to_index(&self, ray: &FlattenedRay) -> FlattenedRay {
@@ -128,6 +121,41 @@ impl Companion {
     /// The corners of its Ω in the scene's local frame.
     pub fn corners(&self) -> [DVec3; 8] {
         self.member.field.lattice().corners().map(|p| self.to_local(p))
+    }
+}
+
+/// One of a scene's fields at a place of the scene.
+#[derive(Clone, Copy, Debug)]
+pub struct FieldAt<'a> {
+    /// Its number among all fields.
+    pub number: usize,
+    /// h.
+    pub field: &'a Field,
+    /// Material and sides of its level sets.
+    pub surface: &'a Surface,
+    /// The place in its index space.
+    pub place: DVec3,
+}
+
+impl FieldAt<'_> {
+    /// Unit normal of `side` of its level set there, in the world; `None` where ∇h vanishes.
+    #[inline]
+    pub fn normal(&self, side: Side) -> Option<DVec3> {
+        Some(side.facing(self.field.falling_normal(self.place)?))
+    }
+}
+
+impl Scene {
+    /// The scene's own field, or that of a companion, at local `p`.
+    #[inline]
+    pub fn field_at(&self, companion: Option<u8>, p: DVec3) -> FieldAt<'_> {
+        match companion.map(|n| &self.companions()[usize::from(n)]) {
+            None => FieldAt { number: self.number(), field: &self.field, surface: &self.surface, place: p },
+            Some(c) => {
+                let Member { field, surface, .. } = &c.member;
+                FieldAt { number: c.number, field, surface, place: c.to_index(p) }
+            }
+        }
     }
 }
 

@@ -144,7 +144,9 @@ fn the_nearest_hit_of_all_fields_wins() {
                 let p = ray.at(hit.t);
                 let (normal, departure) = match hit.target {
                     Target::Surface(side) => (seen.normal(p, side), Departure::Surface(side)),
-                    Target::Companion(n, side) => (companion.normal(p, side), Departure::Companion(n, side)),
+                    Target::Companion(n, side) => {
+                        (seen.field_at(Some(n), p).normal(side), Departure::Companion(n, side))
+                    }
                     Target::Polygon(id) => (Some(seen.polygons()[id as usize].normal()), Departure::Polygon(id)),
                     Target::Cap(..) => unreachable!("the scene is open"),
                 };
@@ -202,7 +204,9 @@ fn two_meshes_are_hit_where_two_graphs_are() {
                 let p = ray.at(hit.t);
                 let (normal, departure) = match hit.target {
                     Target::Surface(side) => (seen.normal(p, side), Departure::Surface(side)),
-                    Target::Companion(n, side) => (seen.companions()[0].normal(p, side), Departure::Companion(n, side)),
+                    Target::Companion(n, side) => {
+                        (seen.field_at(Some(n), p).normal(side), Departure::Companion(n, side))
+                    }
                     _ => break,
                 };
                 sides[usize::from(matches!(departure, Departure::Companion(..)))] += 1;
