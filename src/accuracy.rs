@@ -139,7 +139,7 @@ pub struct Accuracy {
 }
 
 /// Rgb above which a vertex counts as lit.
-pub const LIT: f64 = 0.02;
+const LIT: f64 = 0.02;
 
 /// Linear radiance to clamped display rgb.
 #[inline]

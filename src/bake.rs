@@ -173,15 +173,25 @@ struct Context<'a> {
 }
 
 impl<'a> Context<'a> {
-    /// What is saved of stages `first` and the next of field `number`: one of each side.
-    fn saved(&self, number: u32, first: u32) -> [Saved<'a>; 2] {
-        let first = STAGES * number + first;
+    /// What is saved of `kept` of field `number`: a stage for each side.
+    fn saved(&self, number: u32, kept: Kept) -> [Saved<'a>; 2] {
+        let first = STAGES * number + 2 * kept as u32;
         [first, first + 1].map(|n| self.checkpoint.map_or(Saved::NOWHERE, |c| c.stage(n)))
     }
 }
 
-/// Stages of a checkpoint that a field has: per side the cache's, the points', and the places' beside them. Sweeps have
-/// one in place of the cache's.
+/// What a checkpoint keeps of a field.
+#[derive(Clone, Copy)]
+enum Kept {
+    /// The radiance cache; of a sweep, in the first of its two stages, all.
+    Cache,
+    /// Light at the grid's points, or at scattered samples.
+    Points,
+    /// Light at places beside points.
+    Beside,
+}
+
+/// Stages of a checkpoint that a field has.
 const STAGES: u32 = 6;
 
 /// Illuminates every isosurface of the sweep.

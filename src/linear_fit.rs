@@ -36,18 +36,13 @@ impl NormalMatrix {
         self.0[0].x
     }
 
-    /// The matrix, symmetric but for rounding.
-    pub fn matrix(&self) -> DMat4 {
-        let [a, b, c, d] = self.0.map(|column| column.as_dvec4());
-        DMat4::from_cols(a, b, c, d)
-    }
-
     /// The symmetric matrix whose product with [`Sums`] is the fit's value at d = 0 and its slope; of no use if
     /// [`NormalMatrix::weight`] is 0.
     pub fn inverse(&self) -> DMat4 {
         // ∫K d_x² / ∫K over the ball is 1/7 for Epanechnikov's kernel. [Silverman86]
         let ridge = DVec4::new(0.0, 1.0, 1.0, 1.0) * (RIDGE / 7.0 * f64::from(self.weight()));
-        (self.matrix() + DMat4::from_diagonal(ridge)).inverse()
+        let [a, b, c, d] = self.0.map(|column| column.as_dvec4());
+        (DMat4::from_cols(a, b, c, d) + DMat4::from_diagonal(ridge)).inverse()
     }
 
     /// The first row of [`NormalMatrix::inverse`]: the value at d = 0.

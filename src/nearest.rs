@@ -154,16 +154,6 @@ impl PointGrid {
         &self.numbers
     }
 
-    /// Number of points.
-    pub fn len(&self) -> usize {
-        self.points.len()
-    }
-
-    /// Whether there are none.
-    pub fn is_empty(&self) -> bool {
-        self.points.is_empty()
-    }
-
     #[inline]
     #[allow(clippy::cast_possible_truncation, reason = "floats saturate")]
     fn cell(&self, p: Vec3) -> [i32; 3] {

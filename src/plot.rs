@@ -135,7 +135,7 @@ impl Page {
 
 impl Plot {
     /// The plot as an SVG document.
-    pub fn to_svg(&self) -> String {
+    fn to_svg(&self) -> String {
         let [left, top, right, bottom] = MARGINS;
         let points = || self.series.iter().flat_map(|s| s.points.iter().copied()).filter(|p| self.shows(p));
         let axes = [

@@ -141,6 +141,11 @@ impl Polygon {
         &self.vertices
     }
 
+    /// The mean of the vertices.
+    pub fn middle(&self) -> DVec3 {
+        self.vertices.iter().sum::<DVec3>() / self.vertices.len() as f64
+    }
+
     /// Unit normal of the front.
     pub fn normal(&self) -> DVec3 {
         self.normal

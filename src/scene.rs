@@ -325,7 +325,7 @@ impl Scene {
         let flux = |p: &Polygon| p.emission.max_element() * p.area();
         let lights = self.luminaires();
         let Some(strongest) = lights.iter().max_by(|a, b| flux(a).total_cmp(&flux(b))) else { return 0.0 };
-        let aim = strongest.vertices().iter().sum::<DVec3>() / strongest.vertices().len() as f64 - centre;
+        let aim = strongest.middle() - centre;
         let Some(n) = aim.try_normalize() else { return 0.0 };
         lights.iter().map(|p| p.emission * unoccluded(p, centre, n)).sum::<DVec3>().max_element()
     }

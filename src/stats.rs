@@ -50,7 +50,7 @@ pub fn chi_square_p(statistic: f64, dof: usize) -> f64 {
 }
 
 /// Two-sided probability of a standard normal beyond |z|.
-pub fn normal_p(z: f64) -> f64 {
+fn normal_p(z: f64) -> f64 {
     // erfc(x) = 1 − P(½, x²)
     1.0 - lower_gamma(0.5, z * z / 2.0)
 }

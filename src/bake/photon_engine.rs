@@ -4,7 +4,7 @@ use super::bands::{Band, Levels, REACH};
 use super::beside::{Beside, BesideLight, rays_beside};
 use super::contacts::{Contacts, Wedge};
 use super::grid_points::{GridPoints, PointLight};
-use super::{BakeSettings, Context, Interpolation, Lit, PhotonCounts};
+use super::{BakeSettings, Context, Interpolation, Kept, Lit, PhotonCounts};
 use crate::embree::{GraphTracer, pyramids};
 use crate::error::{Error, Result};
 use crate::fitted_grid::{GridFit, errors};
@@ -89,7 +89,7 @@ pub(super) fn light(jobs: &[Job], context: Context) -> Result<Lit> {
         let clock = Clock::start();
         for ((job, tracer), source) in jobs.iter().zip(&tracers).zip(&sources).filter(|_| gather) {
             let first = band.number * RadianceCache::blocks(&job.scene);
-            let saved = context.saved(job.number, 0).map(|saved| saved.starting_at(first));
+            let saved = context.saved(job.number, Kept::Cache).map(|saved| saved.starting_at(first));
             let nodes = NodeBand { range: band.range(), saved };
             cache.fill(&job.scene, tracer, source, &cache_settings, nodes, &|n| stage.tick(n * node));
         }
@@ -220,7 +220,7 @@ impl<'a> FieldLight<'a> {
             let map = source.map(side).filter(|_| settings.gather_rays == 0);
             map.map_or(Indirect::Gather(cache, rays), Indirect::Map)
         };
-        let saved = |side: Side, kind: u32| context.saved(*number, kind)[side.index()];
+        let saved = |side: Side, kept: Kept| context.saved(*number, kept)[side.index()];
         let mut counts = Counts::default();
         match &mut self.sampled {
             Sampled::Grid(places, sides) => {
@@ -232,12 +232,13 @@ impl<'a> FieldLight<'a> {
                     let side = *side;
                     let gathered = indirect(side, gather_rays);
                     let sampler = Sampler { scene, tracer, indirect: &gathered, side, shadow_rays, seed };
-                    counts += points.sample(&sampler, band, at_points, &apart, saved(side, 2), &|n| tick(n * each));
+                    counts += points
+                        .sample(&sampler, band, at_points, &apart, saved(side, Kept::Points), &|n| tick(n * each));
                     counts += contacts.solve(at_points.grid(), own, side, &wedge, &|n| tick(n * each));
                     let fewer @ [gather_rays, shadow_rays] = rays_beside(rays);
                     let sampler = Sampler { indirect: &indirect(side, gather_rays), shadow_rays, ..sampler };
                     let tick = |n: u64| tick(n * rays_of(fewer));
-                    counts += beside.sample(&sampler, band, at_beside, saved(side, 4), &tick);
+                    counts += beside.sample(&sampler, band, at_beside, saved(side, Kept::Beside), &tick);
                 }
             }
             Sampled::Scattered(at, sides) => {
@@ -249,7 +250,7 @@ impl<'a> FieldLight<'a> {
                     let side = *side;
                     let gathered = indirect(side, gather_rays);
                     let sampler = Sampler { scene, tracer, indirect: &gathered, side, shadow_rays, seed };
-                    let saved = saved(side, 2).starting_at(first);
+                    let saved = saved(side, Kept::Points).starting_at(first);
                     let got = sample_places(&sampler, own.len(), &place, saved, &|n| tick(n * each));
                     counts += got.counts;
                     own.iter().zip(got.samples).for_each(|(&n, s)| samples[n] = s);

@@ -6,7 +6,7 @@ use super::beside::{Beside, rays_beside};
 use super::contacts::{Contacts, Wedge};
 use super::grid_points::{STAND_INS, split};
 use super::photon_engine::Job;
-use super::{Context, Lit};
+use super::{Context, Kept, Lit};
 use crate::brdf::reflected;
 use crate::checkpoint::Saved;
 use crate::embree::GraphTracer;
@@ -46,7 +46,7 @@ pub(super) fn light(Job { number, scene, lattice, masks }: &Job, context: Contex
     let clock = Clock::start();
     let stage = progress.stage("sweep", STEPS as u64);
     let done = std::sync::atomic::AtomicU64::new(0);
-    let [saved, _] = context.saved(*number, 0);
+    let [saved, _] = context.saved(*number, Kept::Cache);
     let swept = sweep_resumable(scene, &settings.sweep(), saved, &|fraction| {
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 … 1000")]
         let now = (fraction * STEPS) as u64;
@@ -81,7 +81,7 @@ pub(super) fn light(Job { number, scene, lattice, masks }: &Job, context: Contex
         let [gather_rays, shadow_rays] = rays_beside(rays);
         let (indirect, seed) = (Indirect::Gather(&cache, gather_rays), settings.seed);
         let sampler = Sampler { scene, tracer: &tracer, indirect: &indirect, side: s.side, shadow_rays, seed };
-        let saved = context.saved(*number, 4)[s.side.index()];
+        let saved = context.saved(*number, Kept::Beside)[s.side.index()];
         let mut light = beside.dark();
         let counts = beside.sample(&sampler, Band::WHOLE, &mut light, saved, &|n| stage.tick(n));
         lit.counts += counts;

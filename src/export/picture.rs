@@ -9,6 +9,18 @@ use exr::prelude::{Blocks, Compression, Encoding, Image, Layer, LayerAttributes,
 use rayon::prelude::*;
 use std::path::Path;
 
+/// How EXR files are packed.
+pub(super) const EXR: Encoding =
+    Encoding { compression: Compression::ZIP16, blocks: Blocks::ScanLines, line_order: LineOrder::Increasing };
+
+/// What went wrong while an EXR file was written.
+pub(super) fn from_exr(error: exr::error::Error) -> std::io::Error {
+    match error {
+        exr::error::Error::Io(e) => e,
+        e => std::io::Error::other(e),
+    }
+}
+
 /// A picture in linear RGB, rows from top to bottom, pixels from left to right.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Picture {
@@ -126,15 +138,10 @@ impl Picture {
             let [r, g, b] = self.rgb[at.y() * self.width + at.x()].map(finite);
             (r, g, b)
         };
-        let encoding =
-            Encoding { compression: Compression::ZIP16, blocks: Blocks::ScanLines, line_order: LineOrder::Increasing };
-        let layer = Layer::new((self.width, self.height), own, encoding, SpecificChannels::rgb(pixel));
+        let layer = Layer::new((self.width, self.height), own, EXR, SpecificChannels::rgb(pixel));
         // On this thread: the crate would start a thread pool of its own beside rayon's.
         files::write_atomically(path, |out| {
-            Image::from_layer(layer).write().non_parallel().to_buffered(out).map_err(|e| match e {
-                exr::error::Error::Io(e) => e,
-                e => std::io::Error::other(e),
-            })
+            Image::from_layer(layer).write().non_parallel().to_buffered(out).map_err(from_exr)
         })
     }
 

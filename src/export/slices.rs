@@ -1,5 +1,6 @@
 //! A grid as an OpenEXR of several layers, one per slice: for compositing programs and for pipelines that read EXR.
 
+use super::picture::{EXR, from_exr};
 use crate::error::{Error, Result};
 use crate::files;
 use crate::volume::vti::SamplesRef;
@@ -7,8 +8,7 @@ use crate::volume::{ElementType, Lattice};
 use exr::meta::attribute::{AttributeValue, Text};
 use exr::prelude::WritableImage;
 use exr::prelude::{
-    AnyChannel, AnyChannels, Blocks, Compression, Encoding, FlatSamples, Image, ImageAttributes, IntegerBounds, Layer,
-    LayerAttributes, LineOrder,
+    AnyChannel, AnyChannels, FlatSamples, Image, ImageAttributes, IntegerBounds, Layer, LayerAttributes,
 };
 use std::path::Path;
 
@@ -45,8 +45,6 @@ pub fn write(path: &Path, lattice: &Lattice, components: usize, values: SamplesR
     let [nx, ny, nz] = lattice.dims();
     let text = |s: &str| Text::from_slice_unchecked(s.as_bytes());
     let numbers = |v: &[f64]| v.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
-    let encoding =
-        Encoding { compression: Compression::ZIP16, blocks: Blocks::ScanLines, line_order: LineOrder::Increasing };
     let places = [("origin", lattice.origin().to_array().to_vec()), ("axes", lattice.axes().to_cols_array().to_vec())];
     let layers: Vec<_> = (0..nz)
         .map(|k| {
@@ -59,18 +57,13 @@ pub fn write(path: &Path, lattice: &Lattice, components: usize, values: SamplesR
                 let name = text(&format!("isolume:{name}"));
                 attributes.other.insert(name, AttributeValue::Text(text(&numbers(value))));
             }
-            Layer::new((nx, ny), attributes, encoding, AnyChannels::sort(channels.collect()))
+            Layer::new((nx, ny), attributes, EXR, AnyChannels::sort(channels.collect()))
         })
         .collect();
     let attributes = ImageAttributes::new(IntegerBounds::from_dimensions((nx, ny)));
     // On this thread: the crate would start a thread pool of its own beside rayon's.
     let image = Image::from_layers(attributes, layers);
-    files::write_atomically(path, |file| {
-        image.write().non_parallel().to_buffered(file).map_err(|e| match e {
-            exr::error::Error::Io(e) => e,
-            e => std::io::Error::other(e),
-        })
-    })
+    files::write_atomically(path, |file| image.write().non_parallel().to_buffered(file).map_err(from_exr))
 }
 
 /// Whether [`ELEMENT`] is too coarse for what 64-bit values, or 32-bit integers, differ by, as it is for small

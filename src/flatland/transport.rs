@@ -436,7 +436,7 @@ impl World {
 
     /// E₀ over its full amount: the unoccluded share of a point at the centre of the field, at mid-height, that faces
     /// the brightest luminaire; the largest channel of all luminaires. 0 without luminaires.
-    pub fn reference_share(&self) -> f64 {
+    fn reference_share(&self) -> f64 {
         let [lo, hi] = self.scene.field.bounds();
         let x = (0.5 * (lo + hi)).extend(0.5 * self.scene.height);
         let flux = |p: &Polygon| p.emission.max_element() * p.area();

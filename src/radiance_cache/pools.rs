@@ -28,9 +28,8 @@ impl Pools {
             .filter(|(_, p)| p.other_face != 0)
             .filter_map(|(n, p)| {
                 let flat = flat::flat(scene, n as usize)?;
-                let centre = p.vertices().iter().sum::<glam::DVec3>() / p.vertices().len() as f64;
                 let single = flat.resolution(across, 1) == [1, 1, 1] && !flat.albedo.black();
-                single.then(|| (n, (centre - origin).as_vec3(), p.normal().as_vec3()))
+                single.then(|| (n, (p.middle() - origin).as_vec3(), p.normal().as_vec3()))
             })
             .collect();
         let grid = PointGrid::new(&small.iter().map(|s| s.1).collect::<Vec<_>>(), 3.0);

@@ -7,7 +7,6 @@ use super::gaps::HiddenRanges;
 use super::grid::Geometry;
 use crate::flattened::Side;
 use crate::isa::Isa;
-use crate::polygon::Polygon;
 use crate::scene::Scene;
 use crate::volume::Lattice;
 pub(super) use fan::{Fan, Kept};
@@ -79,13 +78,12 @@ impl Fans {
 
 /// Bytes of what the fans of luminaires' middles and corners see on `lattice`, at most.
 pub(crate) fn seen(scene: &Scene, lattice: &Lattice) -> u64 {
-    let middle = |light: &Polygon| light.vertices().iter().sum::<DVec3>() / light.vertices().len() as f64;
     let of = |x: DVec3| {
         let y = lattice.to_index(x);
         let fans = (0..6).filter_map(|f| Fan::new(lattice.dims(), y, f % 3, f >= 3));
         fans.flat_map(|fan| fan.kept).map(|kept| kept.count[0] as u64 * kept.count[1] as u64).sum()
     };
-    let points = scene.luminaires().iter().flat_map(|light| light.vertices().iter().copied().chain([middle(light)]));
+    let points = scene.luminaires().iter().flat_map(|light| light.vertices().iter().copied().chain([light.middle()]));
     points.map(of).max().unwrap_or(0)
 }
 

@@ -71,7 +71,7 @@ pub fn read(path: &Path) -> Result<Volume> {
     let promised = element.bytes(lattice.len());
     let samples = Samples::from_vec(files::read_section(path, section, promised)?, element, header.endian);
     let samples = match samples {
-        Samples::U16(v) if half => Samples::F32(v.into_iter().map(|b| half::f16::from_bits(b).to_f32()).collect()),
+        Samples::U16(v) if half => Samples::from_halves(&v),
         samples => samples,
     };
     Volume::new(path.display().to_string(), lattice, samples)

@@ -69,9 +69,7 @@ pub fn read(path: &Path) -> Result<Volume> {
     let promised = header.element.bytes(lattice.len());
     let bytes = files::read_section(path, behind(from + length), promised)?;
     let samples = match Samples::from_vec(bytes, header.element, header.endian) {
-        Samples::U16(v) if header.half => {
-            Samples::F32(v.into_iter().map(|b| half::f16::from_bits(b).to_f32()).collect())
-        }
+        Samples::U16(v) if header.half => Samples::from_halves(&v),
         samples => samples,
     };
     Volume::new(path.display().to_string(), lattice, samples)

@@ -141,6 +141,11 @@ impl Samples {
         }
     }
 
+    /// Half-precision numbers, from their bits.
+    pub fn from_halves(bits: &[u16]) -> Self {
+        Samples::F32(bits.iter().map(|&b| half::f16::from_bits(b).to_f32()).collect())
+    }
+
     /// Number of samples.
     pub fn len(&self) -> usize {
         each_sample_type!(self, v => v.len())
