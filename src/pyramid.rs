@@ -60,7 +60,7 @@ impl Level {
 struct Place {
     /// In memory: its first sample, and its first tile of each level but the last.
     at: [usize; LEVELS],
-    /// In the lattice: its first corner.
+    /// In the lattice: its first corner, from a point that the walk chooses.
     corner: Vec4,
 }
 
@@ -70,6 +70,11 @@ impl Place {
         // Nothing wraps that is there.
         let at = std::array::from_fn(|level| self.at[level].wrapping_add(step.at[level]));
         Self { at, corner: self.corner + step.corner }
+    }
+
+    /// The same place, its corner counted from `base`.
+    fn from(self, base: Vec4) -> Self {
+        Self { corner: self.corner - base, ..self }
     }
 }
 

@@ -128,7 +128,7 @@ impl Pyramid {
             for n in round.cells.lanes() {
                 let number = usize::from(n) % WIDTH;
                 let Some(lane) = &mut lanes[number] else { continue };
-                match lane.cell::<ANY, K>(kernel, next[number]) {
+                match lane.cell::<ANY, K>(kernel, self.slack, next[number]) {
                     Step::On => next[number] = then.queue(kernel, self, &memory, lane, n),
                     Step::Hit(hit) => (hits[number], lane.capped) = (Some(hit), false),
                     Step::End => lane.capped = false,

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::field::Sweep;
-use crate::flattened::{Departure, Side};
+use crate::flattened::{Departure, FlattenedHit, Side};
 use crate::rng::{Rng, Stage};
 use crate::volume::{Lattice, Samples, Volume};
 use crate::warp;
@@ -80,7 +80,8 @@ fn with_and_without_simd_hits_are_the_same_bits() {
 }
 
 /// Rays that enter Ω far from its first corner start between f32's numbers. A sheet across all of Ω stops them, also
-/// those that cross lattice planes at a small angle just where they meet it.
+/// those that cross lattice planes at a small angle just where they meet it, and where it is, wherever their reach
+/// ends.
 #[test]
 fn rays_that_enter_along_planes_meet_the_sheet_in_their_way() {
     let across = |x: f64, z: f64| 1.3 * (0.7 * x).sin() + 0.9 * (0.5 * z + 0.3 * x).cos();
@@ -114,7 +115,17 @@ fn rays_that_enter_along_planes_meet_the_sheet_in_their_way() {
                 let place = [x, y + 0.6 * rng.unit() - 0.3, z];
                 let origin = turned([0, 1, 2].map(|a| place[a] - before * d[a]));
                 let ray = FlattenedRay::free(origin.as_vec3(), turned(d).as_vec3(), 9.0 / 20.0);
-                assert!(pyramid.occluded(&field, &ray, f64::INFINITY), "{isa:?}, long axis {long}: {ray:?}");
+                let case = || format!("{isa:?}, long axis {long}: {ray:?}");
+                assert!(pyramid.occluded(&field, &ray, f64::INFINITY), "{}", case());
+                let hit = pyramid.intersect(&field, &ray, f64::INFINITY);
+                let Some(FlattenedHit { t, .. }) = hit else { panic!("no hit of {}", case()) };
+                let value = field.value(ray.origin.as_dvec3() + f64::from(t) * ray.direction.as_dvec3());
+                assert!((20.0 * value - 9.0).abs() < 1e-3, "{value} at {t}: {}", case());
+                for beyond in [1e-3, 0.3, 3.0] {
+                    let reach = f64::from(t) + beyond;
+                    assert_eq!(pyramid.intersect(&field, &ray, reach), hit, "{}", case());
+                    assert!(pyramid.occluded(&field, &ray, reach), "{}", case());
+                }
             }
         }
     }

@@ -4,8 +4,8 @@
 //! of [`Line::time`], planes of equal time in the order of their axes. Neighbours on the path share the face in
 //! between. The state there (inside: h ≥ c) comes from the face's own corners and the face's own plane, bit for bit
 //! the same from both sides; a cell whose two states differ *must* give a hit. So the path cannot change sides unseen,
-//! however roughly times are rounded: rounding moves the path by 1e-5 cells at most, where no cell is active nothing
-//! depends on it, and in active cells everything is computed anew in f64.
+//! however roughly times are rounded: rounding moves the path by about 1e-7 of its length, where no cell is active
+//! nothing depends on it, and in active cells everything is computed anew in f64.
 //!
 //! Cells that are skipped have all their corners on one side. None of the path is skipped wrongly: a cell of the path
 //! is met between two times of its own planes, in order; a block's planes lie around those of its cells and times are
@@ -47,8 +47,8 @@ pub(super) struct Ray<'a> {
     c: f64,
     /// The smallest f32 not below `c`: samples compare to both alike.
     c32: f32,
-    /// As [`Pyramid::slack`], and more if the ray is not quite its line.
-    slack: f32,
+    /// The lattice point that corners and lines of the walk count from.
+    base: Vec4,
     /// Where Ω begins.
     t: f64,
     reach: f64,
@@ -199,7 +199,7 @@ impl Pyramid {
             if child.level > 0 {
                 continue;
             }
-            match lane.cell::<ANY, K>(kernel, child) {
+            match lane.cell::<ANY, K>(kernel, self.slack, child) {
                 Step::On => {}
                 Step::Hit(hit) => return Some(hit),
                 Step::End => return None,
@@ -254,7 +254,7 @@ impl Pyramid {
             let line = &lane.line;
             let number = [0, 1, 2].map(|a| if line.negative(a) { roots[a] - 1 - n[a] } else { n[a] });
             let at = self.levels[top].at(number);
-            let node = self.root(number);
+            let node = self.root(number).from(lane.ray.base);
             let corner = node.corner;
             let near = line.times(corner + (Vec4::ONE - line.far) * width);
             let far = line.times(corner + line.far * width);
@@ -433,9 +433,9 @@ impl<'a, R> Lane<'a, R> {
         self.stack.pop(pyramid, &self.line)
     }
 
-    /// A cell of the path, or one that the path only touches.
+    /// A cell of the path, or one that the path only touches. `slack`: [`Pyramid::slack`].
     #[inline(always)]
-    pub(super) fn cell<const ANY: bool, K: Kernel>(&self, kernel: K, cell: Child) -> Step {
+    pub(super) fn cell<const ANY: bool, K: Kernel>(&self, kernel: K, slack: f32, cell: Child) -> Step {
         let (ray, line) = (&self.ray, &self.line);
         let corners = kernel.corners(ray.samples, cell.at, ray.steps);
         let inside = kernel.inside(&corners, ray.c32);
@@ -452,9 +452,10 @@ impl<'a, R> Lane<'a, R> {
         }
         // Most cells are passed by.
         let local = |t: f32| (line.start - corner + line.d * t).max(Vec4::ZERO).min(Vec4::ONE);
-        if kernel.clear(&corners, ray.c32, local(t_in.max(0.0)), local(t_out), ray.slack) {
+        if kernel.clear(&corners, ray.c32, local(t_in.max(0.0)), local(t_out), slack) {
             return Step::On;
         }
+        let [corner, near, far] = [corner, near, far].map(|place| place + ray.base);
         let t = ray.time(entry, near.to_array()[entry]).max(0.0);
         let t = if first { 0.0 } else { t };
         if t > ray.reach {

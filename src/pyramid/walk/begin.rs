@@ -106,7 +106,7 @@ impl Pyramid {
             inv,
             c,
             c32,
-            slack: self.slack,
+            base: Vec4::ZERO,
             t: 0.0,
             reach,
             within: true,
@@ -154,24 +154,17 @@ impl Pyramid {
         }
         let inv = d.map(|x| 1.0 / x);
         let Some(Entry { t, axis: entry }) = enter(self.cells, o, d, inv, reach) else { return Begun::Done(None) };
-        let (cell, mut line) = self.line([o, d, inv], t, reach);
-        // A ray that enters starts between f32's numbers, and crosses planes sooner or later than its line: the more,
-        // the smaller the angle. Parts of it are not clear that are so on the line.
-        let scale = d.iter().fold(0.0, |most, x| x.abs().max(most));
-        let apart = (0..3).filter(|&a| d[a].abs() > f64::from(PARALLEL) * scale).fold(0.0, |most, a| {
-            let off = o[a] + t * d[a] - f64::from(line.start[a]);
-            (off * inv[a] * scale).abs().max(most)
-        });
-        let slack = self.slack + 6.0 * apart as f32;
-        let start = self.nodes(cell);
+        let (cell, base, mut line) = self.line([o, d, inv], t, entry.is_some(), reach);
+        let mut start = self.nodes(cell);
         self.prefetch(kernel, &start);
+        start.places = start.places.map(|place| place.from(base));
 
         let c = f64::from(ray.isovalue);
         let within = entry.is_none();
         let four = |[x, y, z]: [f64; 3]| [x, y, z, 0.0];
         let (samples, steps) = (field.samples(), self.steps);
         let (o, d, inv) = (four(o), four(d), four(inv));
-        let mut ray_in = Ray { samples, steps, o, d, inv, c, c32: ray.isovalue, slack, t, reach, within };
+        let mut ray_in = Ray { samples, steps, o, d, inv, c, c32: ray.isovalue, base, t, reach, within };
         let mut departing = None;
         if let (Departure::Surface(side), true) = (ray.departure, within) {
             let here = ray_in.cell_at(self.sample(cell)).value(ray_in.local(point(cell), 0.0));
@@ -236,12 +229,15 @@ impl Pyramid {
         None
     }
 
-    /// The cell of a ray (start, direction and its reciprocals) at `t`, and the line from there.
+    /// The cell of a ray (start, direction and its reciprocals) at `t`, and the line from there, with the lattice point
+    /// that it counts from. A ray that enters Ω does so between f32's numbers: far from the first corner it would cross
+    /// planes sooner or later than a line that counts from there, the more, the smaller the angle. From the lattice
+    /// point nearest to it f32 tells all times alike well.
     #[inline(always)]
     #[allow(clippy::cast_possible_truncation, reason = "clamped cell numbers; lines are f32")]
-    fn line(&self, [o, d, inv]: [[f64; 3]; 3], t: f64, reach: f64) -> ([u32; 3], Line) {
+    fn line(&self, [o, d, inv]: [[f64; 3]; 3], t: f64, enters: bool, reach: f64) -> ([u32; 3], Vec4, Line) {
         let scale = d[0].abs().max(d[1].abs()).max(d[2].abs());
-        let mut cell = [0u32; 3];
+        let (mut cell, mut base) = ([0u32; 3], Vec4::ZERO);
         let mut line = Line {
             start: Vec4::ZERO,
             d: Vec4::ZERO,
@@ -256,18 +252,20 @@ impl Pyramid {
         };
         for a in 0..3 {
             let p = o[a] + t * d[a];
-            (line.start[a], line.d[a]) = (p as f32, (d[a] / scale) as f32);
+            base[a] = if enters { p.round() as f32 } else { 0.0 };
+            let start = (p - f64::from(base[a])) as f32;
+            (line.start[a], line.d[a]) = (start, (d[a] / scale) as f32);
             // On a shared plane the ray is in the cell it goes to.
             let below = d[a] < 0.0 && p == p.floor();
             cell[a] = (p.floor() as i32 - i32::from(below)).clamp(0, self.cells[a] as i32 - 1).cast_unsigned();
             if d[a].abs() > f64::from(PARALLEL) * scale {
-                (line.o[a], line.inv[a]) = (p as f32, (scale * inv[a]) as f32);
+                (line.o[a], line.inv[a]) = (start, (scale * inv[a]) as f32);
                 line.flip |= (u32::from(d[a] < 0.0) * 3) << (2 * a);
                 line.far[a] = if d[a] < 0.0 { 0.0 } else { 1.0 };
             } else {
-                line.o[a] = cell[a] as f32 + 0.5;
+                line.o[a] = cell[a] as f32 - base[a] + 0.5;
             }
         }
-        (cell, line)
+        (cell, base, line)
     }
 }
