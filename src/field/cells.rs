@@ -4,11 +4,11 @@ use super::Field;
 use rayon::prelude::*;
 
 impl Field {
-    /// Numbers of the cells, x fastest, that level sets of the sweep pass.
+    /// Numbers of the cells, x fastest, that level sets of the sweep pass: a constant cell holds none.
     pub fn cells_on_sweep(&self) -> Vec<usize> {
         let passed = |&cell: &usize| {
             let [lo, hi] = self.cell_range(cell);
-            lo <= 1.0 && hi >= 0.0
+            lo <= 1.0 && hi >= 0.0 && lo < hi
         };
         (0..self.lattice().cells().iter().product()).into_par_iter().filter(passed).collect()
     }

@@ -37,15 +37,16 @@ struct Emitting<'a> {
     mean: f64,
 }
 
-/// Places that tell [`Emitting::mean`], which only balances sources.
-const PILOTS: u32 = 4096;
+/// Places that tell [`Emitting::mean`], which only balances sources: the first number of them that finds any.
+const PILOTS: [u32; 2] = [1 << 12, 1 << 20];
 
 impl<'a> Emitting<'a> {
     fn new(number: usize, field: &'a Field) -> Self {
         let mut this = Self { number, field, cells: field.cells_on_sweep(), mean: 0.0 };
         let set = Sobol::set(0, Stage::Photon, 0);
-        this.mean = (0..PILOTS).filter_map(|i| this.place(&set, i)).map(|(_, weight)| weight).sum::<f64>();
-        this.mean /= f64::from(PILOTS);
+        let sum = |pilots| (0..pilots).filter_map(|i| this.place(&set, i)).map(|(_, weight)| weight).sum::<f64>();
+        let mut means = PILOTS.into_iter().map(|pilots| sum(pilots) / f64::from(pilots));
+        this.mean = means.find(|mean| *mean > 0.0).unwrap_or(0.0);
         this
     }
 
@@ -269,5 +270,20 @@ mod tests {
             let off = found.iter().map(|(p, _)| field.value(*p)).filter(|h| !(-1e-6..=1.0 + 1e-6).contains(h)).count();
             assert_eq!(off, 0);
         }
+    }
+
+    /// Where the background has the isovalue that the sweep begins with, and only few cells hold level sets.
+    #[test]
+    fn a_background_at_the_sweeps_end_does_not_emit() {
+        let n = 96;
+        let lattice = Lattice::aligned([n; 3], DVec3::ZERO, DVec3::ONE).unwrap();
+        let ball = |o: usize| (2.0 - lattice.point(o).distance(DVec3::splat(7.0))).max(0.0) as f32;
+        let samples = (0..lattice.len()).map(ball).collect();
+        let field = Field::made(lattice, Samples::F32(samples), 0.0, 2.0);
+        let emitting = Emitting::new(0, &field);
+        assert!((20..200).contains(&emitting.cells.len()), "{} cells", emitting.cells.len());
+        let set = Sobol::set(7, Stage::Test, 0);
+        let found = (0..4096).filter_map(|i| emitting.place(&set, i)).count();
+        assert!(emitting.mean > 0.0 && found > 4096 / 4, "{} {found}", emitting.mean);
     }
 }
