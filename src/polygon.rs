@@ -235,8 +235,8 @@ impl Polygon {
 }
 
 /// How far, as a share of its size, a parallelogram or rectangle may be off: as coordinates of six digits, and those
-/// of f64 far from the origin, put it.
-pub(crate) const SQUARE: f64 = 1e-6;
+/// of f64 far from the origin, put it. As far as vertices may leave their plane.
+pub(crate) const SQUARE: f64 = 1e-5;
 
 fn is_parallelogram(v: &[DVec3]) -> bool {
     v.len() == 4 && (v[0] + v[2] - v[1] - v[3]).length() <= SQUARE * (v[2] - v[0]).length()
@@ -415,6 +415,7 @@ impl LocalPolygon {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::rng::{Rng, Stage};
     use glam::DMat3;
 
     fn square() -> Polygon {
@@ -425,14 +426,25 @@ mod tests {
     /// Survey coordinates, and what a modeller writes with six digits.
     #[test]
     fn rounded_rectangles_are_rectangles() {
-        let e = [DVec3::new(0.6, 0.8, 0.0), DVec3::new(-0.4, 0.3, 0.0)];
-        for (shift, digits) in [(DVec3::new(148_376.1, 1_234.2, -223_423.3), 1e15), (DVec3::new(0.1, 0.2, 0.3), 1e6)] {
-            let corners = [shift, shift + e[0], shift + e[0] + e[1], shift + e[1]];
-            let rounded = corners.map(|x| (x * digits).round() / digits).to_vec();
-            let p = Polygon::new("s", rounded, DVec3::ONE, DVec3::ONE).unwrap();
-            assert!(p.is_parallelogram(), "{shift}");
-            assert!((p.area() - 0.5).abs() < 2e-6);
+        let mut rng = Rng::stream(6, Stage::Test, 0);
+        let mut most = 0f64;
+        for (far, digits) in [(2e5, 1e15), (0.3, 1e6)] {
+            for _ in 0..1000 {
+                let mut unit = || DVec3::new(rng.unit(), rng.unit(), rng.unit());
+                let (shift, turn) = (far * unit(), unit() * std::f64::consts::TAU);
+                let turn = DMat3::from_euler(glam::EulerRot::XYZ, turn.x, turn.y, turn.z);
+                let e = [0.6 * turn.x_axis, 0.5 * turn.y_axis];
+                let corners = [shift, shift + e[0], shift + e[0] + e[1], shift + e[1]];
+                let rounded = corners.map(|x| (x * digits).round() / digits);
+                most = most.max((rounded[0] + rounded[2] - rounded[1] - rounded[3]).length());
+                let p = Polygon::new("s", rounded.to_vec(), DVec3::ONE, DVec3::ONE).unwrap();
+                assert!(p.is_parallelogram(), "{shift}");
+                let [e, f] = p.texture_edges();
+                assert!(e.dot(f).abs() <= SQUARE * e.length() * f.length(), "{shift}");
+                assert!((p.area() - 0.3).abs() < 2e-6);
+            }
         }
+        assert!(most > 1.5e-6, "nothing was rounded");
         let off = [DVec3::ZERO, DVec3::X, DVec3::new(1.0, 1.0, 0.0), DVec3::new(0.001, 1.0, 0.0)];
         assert!(!Polygon::new("s", off.to_vec(), DVec3::ONE, DVec3::ONE).unwrap().is_parallelogram());
     }
