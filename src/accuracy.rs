@@ -29,15 +29,14 @@ pub struct ReferenceMesh {
     pub triangles: Vec<[u32; 3]>,
     /// Linear outgoing radiance.
     pub radiance: Vec<DVec3>,
-    /// Variance of the radiance as a mean; 0 where unknown.
-    pub variance: Vec<DVec3>,
+    /// Variance of the radiance as a mean, if it is known.
+    pub variance: Option<Vec<DVec3>>,
     /// Whether a vertex takes part.
     pub sampled: Vec<bool>,
 }
 
 impl ReferenceMesh {
-    /// From the properties that `isolume reference` writes; variance 0 and all vertices sampled where those are
-    /// missing.
+    /// From the properties that `isolume reference` writes; all vertices sampled where that is missing.
     ///
     /// # Errors
     /// `Invalid` if positions or radiance are missing, or if anything is no finite number.
@@ -54,7 +53,7 @@ impl ReferenceMesh {
         let read = Self {
             positions: triple(POSITION).ok_or_else(|| missing("positions"))?,
             triangles: mesh.triangles.clone(),
-            variance: triple(VARIANCE).unwrap_or_else(|| vec![DVec3::ZERO; radiance.len()]),
+            variance: triple(VARIANCE),
             sampled: flags.into_iter().map(|flag| flag > 0.0).collect(),
             radiance,
         };
@@ -65,9 +64,12 @@ impl ReferenceMesh {
     /// Refuses what is no reference: every vertex has its numbers, all of them finite, and triangles have vertices.
     fn check(&self) -> Result<()> {
         let n = self.positions.len();
-        for (what, found) in
-            [("radiance", self.radiance.len()), ("variance", self.variance.len()), ("sampled", self.sampled.len())]
-        {
+        let variance = self.variance.as_deref();
+        for (what, found) in [
+            ("radiance", self.radiance.len()),
+            ("variance", variance.map_or(n, <[DVec3]>::len)),
+            ("sampled", self.sampled.len()),
+        ] {
             if found != n {
                 return Err(Error::Invalid(format!(
                     "has {n} vertices, but {found} values of {what}; give one to each"
@@ -80,7 +82,7 @@ impl ReferenceMesh {
         }
         finite(POSITION, self.positions.iter().map(DVec3::to_array))?;
         finite(RADIANCE, self.radiance.iter().map(DVec3::to_array))?;
-        finite(VARIANCE, self.variance.iter().map(DVec3::to_array))
+        finite(VARIANCE, variance.unwrap_or_default().iter().map(DVec3::to_array))
     }
 }
 
@@ -149,7 +151,8 @@ pub fn display(radiance: DVec3, exposure: f64) -> DVec3 {
 
 /// Variance of the displayed rgb of vertex `v`, summed over channels.
 fn noise(reference: &ReferenceMesh, v: usize, exposure: f64) -> f64 {
-    let (mean, variance) = (reference.radiance[v] * exposure, reference.variance[v] * exposure * exposure);
+    let Some(variance) = &reference.variance else { return 0.0 };
+    let (mean, variance) = (reference.radiance[v] * exposure, variance[v] * exposure * exposure);
     (0..3).map(|c| clamped_variance(mean[c], variance[c])).sum()
 }
 
@@ -193,8 +196,9 @@ pub fn compare(texture: &[DVec3], references: &[ReferenceMesh], exposure: f64) -
                 .into(),
         ));
     }
-    // Without variance the same is what is to be expected.
-    let noisy = references.iter().flat_map(|r| &r.variance).any(|&v| v != DVec3::ZERO);
+    // Without noise the same is what is to be expected.
+    let exact = |r: &ReferenceMesh| r.variance.as_ref().is_some_and(|v| v.iter().all(|&v| v == DVec3::ZERO));
+    let noisy = !references.iter().all(exact);
     if references.len() == 2 && noisy && first.radiance == references[1].radiance {
         return Err(Error::Invalid("the two references are the same; give the second another --seed".into()));
     }

@@ -348,7 +348,7 @@ fn flat(r: [f64; 4], variance: f64) -> ReferenceMesh {
         positions: vec![DVec3::ZERO, DVec3::X, DVec3::new(1.0, 1.0, 0.0), DVec3::Y],
         triangles: vec![[0, 1, 2], [0, 2, 3]],
         radiance: r.map(DVec3::splat).to_vec(),
-        variance: vec![DVec3::splat(variance); 4],
+        variance: Some(vec![DVec3::splat(variance); 4]),
         sampled: vec![true; 4],
     }
 }
@@ -448,7 +448,7 @@ fn what_is_no_number_or_missing_is_no_reference() {
     refused(&texture[..3], good.clone(), "3 colours");
     refused(&[DVec3::splat(0.3), DVec3::NAN, DVec3::ONE, DVec3::ONE], good.clone(), "vertex 1");
     refused(&texture, ReferenceMesh { radiance: vec![DVec3::ONE; 3], ..good.clone() }, "radiance");
-    refused(&texture, ReferenceMesh { variance: Vec::new(), ..good.clone() }, "variance");
+    refused(&texture, ReferenceMesh { variance: Some(Vec::new()), ..good.clone() }, "variance");
     refused(&texture, ReferenceMesh { sampled: vec![true; 5], ..good.clone() }, "sampled");
     refused(&texture, ReferenceMesh { radiance: vec![DVec3::NAN; 4], ..good.clone() }, "radiance_r");
     refused(&texture, ReferenceMesh { positions: vec![DVec3::INFINITY; 4], ..good.clone() }, "x of vertex 0");
@@ -466,7 +466,7 @@ fn two_references_cancel_their_noise() {
         radiance: (0..n)
             .map(|_| DVec3::splat(0.5) + 0.05 * DVec3::new(rng.normal(), rng.normal(), rng.normal()))
             .collect(),
-        variance: vec![DVec3::splat(0.05 * 0.05); n],
+        variance: Some(vec![DVec3::splat(0.05 * 0.05); n]),
         sampled: vec![true; n],
     };
     let references = [noisy(), noisy()];

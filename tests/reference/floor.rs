@@ -38,7 +38,7 @@ fn the_floor_of_all_light_is_free_of_noise() {
             positions: mesh.positions.clone(),
             triangles: mesh.triangles.clone(),
             radiance: made.radiance,
-            variance: made.variance,
+            variance: Some(made.variance),
             sampled: made.sampled,
         }
     });
