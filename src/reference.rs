@@ -14,7 +14,7 @@ pub use surface_map::{SurfaceMap, SurfaceMapSettings};
 
 use crate::direct::Receiver;
 use crate::error::{Error, Result};
-use crate::export::ply;
+use crate::export::{Mesh, ply};
 use crate::isosurface;
 use crate::isovalue_axis::IsovalueAxis;
 use crate::photon::{PhotonSettings, check_power, trace_photons};
@@ -23,6 +23,7 @@ use crate::rng::{Rng, Stage};
 use crate::scene::Scene;
 use crate::surface_mesh::{SurfaceMesh, channel};
 use crate::tracer::Tracer;
+use crate::volume::Space;
 use glam::DVec3;
 use rayon::prelude::*;
 use std::path::Path;
@@ -112,19 +113,19 @@ pub struct Reference {
 }
 
 impl Reference {
-    /// Writes the reference of `mesh` as PLY: `radiance_r/g/b`, `variance_r/g/b` and `sampled` per vertex; `comment` as
-    /// [`Origin::comment`].
+    /// Writes the reference of `mesh`, in a world whose axes mean what `space` says, as PLY: `radiance_r/g/b`,
+    /// `variance_r/g/b` and `sampled` per vertex; `comment` as [`Origin::comment`].
     ///
     /// # Errors
     /// As [`ply::write`].
-    pub fn write(&self, path: &Path, mesh: &SurfaceMesh, comment: String) -> Result<()> {
+    pub fn write(&self, path: &Path, mesh: &SurfaceMesh, space: Option<Space>, comment: String) -> Result<()> {
         let radiance = [0, 1, 2].map(|c| channel(&self.radiance, c));
         let variance = [0, 1, 2].map(|c| channel(&self.variance, c));
         let sampled: Vec<f32> = self.sampled.iter().map(|&s| if s { 1.0 } else { 0.0 }).collect();
         let names = [&ply::RADIANCE[..], &ply::VARIANCE, &[ply::SAMPLED]].concat();
         let values = radiance.iter().chain(&variance).chain([&sampled]).map(Vec::as_slice);
         let properties: Vec<(&str, &[f32])> = names.into_iter().zip(values).collect();
-        ply::write_with_comments(path, &mesh.export(&properties), &[comment])
+        ply::write_with_comments(path, &Mesh { space, ..mesh.export(&properties) }, &[comment])
     }
 }
 

@@ -176,7 +176,7 @@ impl<'a> Study<'a> {
                 let stage = self.progress.stage(&format!("reference {isovalue}"), count);
                 let result = reference(scene, &tracer, &mesh, c, &settings, &|n| stage.tick(n))?;
                 stage.end()?;
-                result.write(&path, &mesh, Origin::comment(scene, at, &settings))?;
+                result.write(&path, &mesh, None, Origin::comment(scene, at, &settings))?;
             }
             let mesh = ReferenceMesh::from_ply(&ply::read(&path)?).map_err(|e| e.in_file(&path))?;
             out.push(mesh);

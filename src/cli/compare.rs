@@ -13,6 +13,7 @@ use crate::illumination_grid::GridSize;
 use crate::progress::{Progress, say};
 use crate::reference::{self, Origin};
 use crate::scene_file::Inputs;
+use crate::volume::Space;
 use glam::DVec3;
 use std::path::PathBuf;
 
@@ -20,8 +21,8 @@ use std::path::PathBuf;
 #[command(after_help = "\
 Without references, all isosurfaces of the sweep are looked at: as many random points for each isovalue, over each isosurface
 evenly by area, against two independent sets of paths, whose noise cancels but where colours reach white, which few paths make
-darker; and points of the grid, which interpolation has no part
-in. If those are much better, a finer --grid helps; if not, more directions, light points, photons or rays do.
+darker; and points of the grid, which interpolation has no part in. If those are much better, a finer --grid helps; if not,
+more directions, light points, photons or rays do.
 
 Colours are linear radiance × π / (largest albedo × E0), clamped to [0, 1]; percent_rms = 100 sqrt(mean |difference|²) over the
 reference's vertices, the squared Euclidean norm over three channels (BB09's printed formula leaves the square out).
@@ -128,7 +129,7 @@ impl Compare {
             print!("{}", text(&accuracy));
         }
         if let Some(output) = &self.output {
-            write_errors(output, &references[0], &errors)?;
+            write_errors(output, &references[0], baked.space, &errors)?;
             if progress.is_shown() {
                 say!("{}: error-coloured mesh", output.display());
             }
@@ -277,7 +278,7 @@ fn text(a: &Accuracy) -> String {
         shown(a.percent_rms_without_noise),
         shown(a.percent_rms_sqrt3),
         shown(a.percent_rms_area),
-        shown(a.percent_rms_lit),
+        if a.lit > 0.0 { shown(a.percent_rms_lit) } else { format!("{:>8}", "–") },
         100.0 * a.lit,
         a.noise_floor,
         a.mean,
@@ -296,7 +297,7 @@ fn few(points: usize) -> Option<&'static str> {
 }
 
 #[allow(clippy::cast_possible_truncation, reason = "files hold f32")]
-fn write_errors(path: &std::path::Path, mesh: &ReferenceMesh, errors: &[f64]) -> Result<()> {
+fn write_errors(path: &std::path::Path, mesh: &ReferenceMesh, space: Space, errors: &[f64]) -> Result<()> {
     let values: Vec<f32> = errors.iter().map(|&e| e as f32).collect();
     // Black, red, yellow, white at 0, ⅓, ⅔ and 1 of 10 %; unsampled vertices grey.
     let ramp = |e: f64, k: f64| (30.0 * e - k).clamp(0.0, 1.0) as f32;
@@ -311,6 +312,7 @@ fn write_errors(path: &std::path::Path, mesh: &ReferenceMesh, errors: &[f64]) ->
         triangles: &mesh.triangles,
         colours: Some(&colours),
         properties: &properties,
+        space: Some(space),
         ..Mesh::default()
     };
     ply::write(path, &mesh)

@@ -88,8 +88,9 @@ impl ReferenceArgs {
             return Err(Error::Invalid("--photons, --photons-per-estimate: are for --integrator photon".into()));
         }
         let options = SceneOptions { wanted: Some(self.isovalue), ..self.scene.clone() };
-        let Opened { scene, baked, .. } = open_scene(&self.input, &options, self.field.as_deref())?;
+        let Opened { scene, baked, volume } = open_scene(&self.input, &options, self.field.as_deref())?;
         let of_bake = baked.is_some();
+        let space = volume.map(|v| v.space).or_else(|| baked.as_ref().map(|b| b.space));
         baked.map_or(Ok(()), |b| b.whole()).map_err(|e| e.in_file(&self.input))?;
         // Alone, if the scene's volumes give each other no light.
         let scene = scene.lit(scene.number());
@@ -111,7 +112,7 @@ impl ReferenceArgs {
         let begun = Instant::now();
         let (mesh, result, inside) = self.compute(&scene, isovalue, &settings, progress)?;
         let seconds = begun.elapsed().as_secs_f64();
-        result.write(&self.output, &mesh, Origin::comment(&scene, self.isovalue, &settings))?;
+        result.write(&self.output, &mesh, space, Origin::comment(&scene, self.isovalue, &settings))?;
         let count = result.sampled.iter().filter(|s| **s).count();
         if self.json {
             let numbers = serde_json::json!({
