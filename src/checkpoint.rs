@@ -79,10 +79,10 @@ impl Saved<'_> {
     /// Of a stage that nobody saves.
     pub const NOWHERE: Saved<'static> = Saved { checkpoint: None, number: 0, first: 0 };
 
-    /// The same stage, its blocks counted from number `first` on.
+    /// The same stage, its blocks counted from number `first` of it on.
     #[must_use]
     pub fn starting_at(self, first: usize) -> Self {
-        Self { first, ..self }
+        Self { first: self.first + first, ..self }
     }
 
     fn key(&self, block: usize) -> Key {

@@ -260,7 +260,7 @@ fn check_exposure(exposure: f64) -> Result<()> {
 }
 
 fn expect_extension(path: &Path, known: &[&str]) -> Result<()> {
-    let found = path.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
+    let found = files::extension(path);
     if known.contains(&found.as_str()) {
         return Ok(());
     }

@@ -99,7 +99,7 @@ const CANDIDATES: u64 = 64;
 /// What a bake shows of the outside.
 #[derive(Clone, Copy)]
 pub struct Shown<'a> {
-    /// Its grid, and what that stands on.
+    /// Its grid.
     pub grid: &'a IlluminationGrid,
     /// The grid's lattice, over the volume's.
     pub lattice: &'a Lattice,

@@ -1,5 +1,6 @@
 //! Light at a grid's own points.
 
+use super::BakeSettings;
 use super::bands::Band;
 use crate::brdf::reflected;
 use crate::checkpoint::Saved;
@@ -19,7 +20,7 @@ use glam::Vec3;
 use rayon::prelude::*;
 use std::f64::consts::PI;
 
-/// Places around a point without a level set of its own; as many random numbers are every point's.
+/// Places around a point without a level set of its own, and keys of random numbers that belong to every point.
 pub(super) const STAND_INS: usize = 4;
 
 /// The points of a grid that hold light of their own level set.
@@ -106,14 +107,14 @@ impl<'a> GridPoints<'a> {
         self.set.len()
     }
 
-    /// Darkness on one side; `smoothing`: whether what is gathered will be smoothed; `split`: whether light will be.
-    pub(super) fn dark(&self, smoothing: bool, split: bool) -> PointLight {
+    /// Darkness on one side, with room for what `settings` want kept.
+    pub(super) fn dark(&self, settings: &BakeSettings) -> PointLight {
         let n = self.lattice.len();
         let (radiance, std_error, mask) = (vec![[0.0; 3]; n], vec![0.0; n], vec![Mask::Empty; n]);
         PointLight {
             grid: IlluminationGrid { radiance, std_error, mask, split: None },
-            halves: smoothing.then(|| vec![Packed::NONE; self.set.len()]),
-            direct: split.then(|| vec![[0.0; 3]; n]),
+            halves: settings.smooths().then(|| vec![Packed::NONE; self.set.len()]),
+            direct: settings.split.then(|| vec![[0.0; 3]; n]),
         }
     }
 

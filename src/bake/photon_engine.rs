@@ -113,7 +113,7 @@ pub(super) fn light(jobs: &[Job], context: Context) -> Result<Lit> {
     drop(sources);
 
     let clock = Clock::start();
-    let stage = progress.stage("interpolate", fields.iter().map(FieldLight::interpolation).sum());
+    let stage = progress.stage("interpolate", fields.iter().map(|field| field.interpolation(settings)).sum());
     for field in fields {
         let sides = field.finish(settings, &|n| stage.tick(n));
         lit.fields.push(sides);
@@ -170,7 +170,7 @@ impl<'a> FieldLight<'a> {
                 let gathers = settings.gather_rays > 0;
                 let contacts = Contacts::new(scene, lattice, |o| gathers && masks[o] == Mask::Valid);
                 let sides = sides.map(|side| {
-                    let at_points = points.dark(settings.smooths(), settings.split);
+                    let at_points = points.dark(settings);
                     GridSide { side, at_points, at_beside: beside.dark() }
                 });
                 let sides = sides.collect();
@@ -198,8 +198,13 @@ impl<'a> FieldLight<'a> {
     }
 
     /// Ticks of [`FieldLight::finish`].
-    fn interpolation(&self) -> u64 {
-        2 * (self.job.lattice.len() * self.sides()) as u64
+    fn interpolation(&self, settings: &BakeSettings) -> u64 {
+        let passes = match (&self.sampled, settings.interpolation) {
+            // The samples' errors are blended, too.
+            (Sampled::Scattered(..), Interpolation::Fit) => 3,
+            _ => 2,
+        };
+        passes * (self.job.lattice.len() * self.sides()) as u64
     }
 
     /// Samples the isovalues of a band, on all sides.
@@ -299,7 +304,7 @@ fn scattered_grid(
             let mut grid = blended();
             let free = NodeSet::new(lattice.len(), |o| grid.mask[o] != Mask::Empty);
             let errors = errors(&samples);
-            let blended = shepard(&scene.field, lattice, masks, &errors, settings.neighbours, &|_| tick(0)).radiance;
+            let blended = shepard(&scene.field, lattice, masks, &errors, settings.neighbours, tick).radiance;
             drop(errors);
             GridFit::new(&scene.field, lattice, &free, tick).improve(&mut grid, samples, &blended);
             grid

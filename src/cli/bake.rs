@@ -296,7 +296,7 @@ impl Bake {
             }
             found => found.is_some(),
         };
-        // Had this bake been begun, a checkpoint would be there, or of a series the first frame.
+        // A bake that was begun has a checkpoint, or of a series the first frame; unless it ended before its first.
         if first && another && checkpoint.held()? == Held::Nothing {
             return Err(Error::invalid(
                 &self.output,

@@ -10,9 +10,11 @@ use std::path::{Path, PathBuf};
 
 #[derive(clap::Args, Debug)]
 #[command(after_help = "\
+The folders of these files must be there.
+
 Examples:
-  isolume completions bash > ~/.local/share/bash-completion/completions/isolume      in folders that
-  isolume completions zsh > ~/.zfunc/_isolume                                        exist: mkdir -p
+  isolume completions bash > ~/.local/share/bash-completion/completions/isolume
+  isolume completions zsh > ~/.zfunc/_isolume
   isolume completions fish > ~/.config/fish/completions/isolume.fish")]
 pub(super) struct Completions {
     /// The shell

@@ -3,6 +3,7 @@
 use super::{SceneOptions, VolumeSource, Volumes, parse};
 use crate::atomic::followed;
 use crate::error::{Error, Result};
+use crate::files;
 use crate::series;
 use crate::volume::{metaimage, nrrd};
 use std::path::{Path, PathBuf};
@@ -92,7 +93,7 @@ impl Inputs {
 
 /// The file that holds the samples of `path`, if that is a header that names one.
 fn data_file(path: &Path) -> Option<PathBuf> {
-    match path.extension()?.to_str()?.to_ascii_lowercase().as_str() {
+    match files::extension(path).as_str() {
         "nhdr" | "nrrd" => nrrd::data_file(path),
         "mhd" | "mha" => metaimage::data_file(path),
         _ => None,

@@ -297,7 +297,7 @@ pub fn bakes(engine: Engine, count: u64, device: &Device, progress: Progress) ->
     let reference = bits(&baked(&base, engine, 1, device)?);
     let changes = changes();
     // Several changes × 8 octants; Student's t with few seeds is wider than a normal, so the level is 1e-3 of that.
-    let limit = student_limit(sidak(1e-3, 8 * (changes.len() + 1)), 2 * count - 2);
+    let limit = student_limit(sidak(1e-3, 2 * 8 * (changes.len() + 1)), 2 * count - 2);
     let mut cases = Vec::new();
     // Nothing but other seeds: what the statistic is when nothing can matter.
     let control = Change { name: "nothing but other seeds", ..SAME };

@@ -190,7 +190,8 @@ fn cell(family: usize, index: u64) -> (Cell, f32, DVec3, DVec3) {
     (Cell { s }, c, p, d)
 }
 
-/// Judges what the walk does in a cell: signs on the faces, the cubic, its first crossing.
+/// Judges what the walk does in a cell: signs on the faces, the cubic, its first crossing. The ray from `p`, in the
+/// unit cube, along `d` goes into the cell.
 pub fn judge_cell(cell: &Cell, c: f32, p: DVec3, d: DVec3) -> Result<f64, String> {
     judge_cell_by(Cubic::first_crossing, cell, c, p, d)
 }
