@@ -7,7 +7,7 @@ use crate::error::{Error, Result};
 use crate::export::bake_file::BakedVolume;
 use crate::export::picture::Picture;
 use crate::final_gather::{FinalGather, FinalGatherSettings, seen};
-use crate::flattened::{FlattenedHit, FlattenedRay, Target};
+use crate::flattened::{Departure, FlattenedHit, FlattenedRay, Target};
 use crate::progress::Progress;
 use crate::rng::{Sobol, Stage};
 use crate::scene::Scene;
@@ -165,7 +165,7 @@ pub fn trace_picture<T: Tracer>(
 ) -> Result<Picture> {
     let [forward, right, down] = camera.basis().map(|[f, r, u]| [f, r, -u])?;
     let ([width, height], samples) = (camera.size, camera.samples);
-    let eye = scene.lattice().to_index(camera.eye).as_vec3();
+    let bounds = scene.bounds();
     let mut picture = Picture::new(width, height);
     let stage = progress.stage("picture", (width * height) as u64);
     picture.rgb.par_iter_mut().enumerate().with_min_len(64).for_each(|(i, pixel)| {
@@ -178,7 +178,8 @@ pub fn trace_picture<T: Tracer>(
             let [x, y] = set.point2(s, 0);
             let (x, y) = ((i % width) as f64 + x - 0.5 * width as f64, (i / width) as f64 + y - 0.5 * height as f64);
             let direction = (forward + right * x + down * y).normalize();
-            let ray = scene.ray(eye, direction, c, crate::flattened::Departure::Free);
+            let start = camera.eye + approach(bounds, camera.eye, direction) * direction;
+            let ray = scene.ray(scene.lattice().to_index(start).as_vec3(), direction, c, Departure::Free);
             if let Some(hit) = tracer.intersect(&ray) {
                 sum += shade(&ray, hit, direction, i as u64 * u64::from(samples) + u64::from(s));
             }
@@ -187,6 +188,19 @@ pub fn trace_picture<T: Tracer>(
     });
     stage.end()?;
     Ok(picture)
+}
+
+/// Cameras farther away than so many diagonals of the scene have rays that begin one diagonal before it.
+const FAR: f64 = 16.0;
+
+/// How far along the unit direction `d` from `o` a picture's ray begins: 32-bit floats tell the place of a hit as
+/// roughly as it is far, so that rays from afar, as telephoto views have them, would end beside surfaces.
+fn approach([lo, hi]: [DVec3; 2], o: DVec3, d: DVec3) -> f64 {
+    let (a, b) = ((lo - o) / d, (hi - o) / d);
+    // An axis that the ray does not move along says nothing, or NaN.
+    let near = a.min(b).to_array().into_iter().filter(|t| t.is_finite()).fold(0.0, f64::max);
+    let diagonal = (hi - lo).length();
+    if near > FAR * diagonal { near - diagonal } else { 0.0 }
 }
 
 /// Headlight shading, already exposed: ρ (0.15 + 0.85 |cos|).
@@ -209,4 +223,48 @@ fn local(scene: &Scene, ray: &FlattenedRay, hit: FlattenedHit, direction: DVec3)
         }
     };
     albedo * (0.15 + 0.85 * normal.map_or(0.0, |n| n.dot(direction).abs()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::Field;
+    use crate::flattened::Side;
+    use crate::scene::{Boundary, Surface, cornell_box};
+    use crate::volume::{Lattice, Samples};
+
+    /// Telephoto views from farther and farther away show the same places of a ball, on its surface.
+    #[test]
+    fn far_cameras_see_surfaces_where_they_are() {
+        let lattice = Lattice::aligned([24; 3], DVec3::splat(-1.0), DVec3::splat(2.0 / 23.0)).unwrap();
+        let samples = (0..lattice.len()).map(|o| lattice.to_world(lattice.point(o)).length_squared() as f32).collect();
+        let field = Field::made(lattice, Samples::F32(samples), 0.0, 1.0);
+        let walls = cornell_box(field.lattice(), 0.1).unwrap();
+        let surface = Surface { outside: Side::Higher, ..Surface::default() };
+        let scene = Scene::new(field, surface, Boundary::Open, walls).unwrap();
+        let device = Device::new(1).unwrap();
+        let tracer = GraphTracer::new(&device, &scene).unwrap();
+        let towards = DVec3::new(0.3, -1.0, 0.2).normalize();
+        for distance in [4.0, 1e3, 1e6, 1e9] {
+            let camera = Camera {
+                eye: distance * towards,
+                target: DVec3::ZERO,
+                up: DVec3::Z,
+                fov: 2.0 * (1.5 / distance).atan().to_degrees(),
+                size: [32; 2],
+                samples: 1,
+            };
+            let shade = |ray: &FlattenedRay, hit: FlattenedHit, _: DVec3, _: u64| match hit.target {
+                Target::Surface(_) => DVec3::new(1.0, (scene.field.value(ray.at(hit.t)) - 0.49).abs(), 0.0),
+                _ => DVec3::ZERO,
+            };
+            let picture = trace_picture(&scene, &tracer, 0.49, &camera, &shade, Progress::Quiet).unwrap();
+            let hits = picture.rgb.iter().filter(|rgb| rgb[0] > 0.0).count();
+            let off = picture.rgb.iter().fold(0f32, |most, rgb| most.max(rgb[1]));
+            println!("{distance:e}: {hits} hits, off by {off:e}");
+            // A disk of radius 0.7 of a square of 3, in 1024 pixels; nearer, it looks larger.
+            assert!((150..200).contains(&hits), "{distance}: {hits}");
+            assert!(off < 2e-5, "{distance}: {off}");
+        }
+    }
 }
